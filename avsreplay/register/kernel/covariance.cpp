@@ -41,15 +41,14 @@ Six congruence(const Six& W, const Six& B) {
   return A;
 }
 
-// Whether an eigenvalue of W' N_p W exceeds DOMINANT. Their sum is the trace. Where that does not decide, DOMINANT I - W' N_p W
+// Whether an eigenvalue of W' N_p W exceeds DOMINANT, with W W' = `inverse`. Their sum is the trace. Where that does not decide, DOMINANT I - W' N_p W
 // is factorised: all eigenvalues are below DOMINANT where every pivot is positive.
-bool dominates(const double* Np, const Six& W) {
-  const Six B = product(Np, W);
+bool dominates(const double* Np, const Six& W, const Six& inverse) {
   double trace = 0;
-  for (int j = 0; j < 6; ++j)
-    for (int k = 0; k < 6; ++k) trace += W.v[k][j] * B.v[k][j];
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) trace += Np[6 * i + j] * inverse.v[i][j];
   if (!(trace > DOMINANT)) return false;
-  Six L = congruence(W, B);
+  Six L = congruence(W, product(Np, W));
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < 6; ++j) L.v[i][j] = (i == j ? DOMINANT : 0) - L.v[i][j];
   for (int j = 0; j < 6; ++j) {
@@ -85,10 +84,9 @@ std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double,
     double largest = trace;  // of the powers of A
     for (int n = 1; largest > LEAST_TERM; ++n, largest *= trace) {
       std::array<double, 6> next{};
-      for (size_t i = 0; i < 6; ++i) {
-        for (size_t k = 0; k < 6; ++k) next[i] += A.v[i][k] * term[k];
-        out[i] += next[i] *= (2 * n - 1) / (2.0 * n);
-      }
+      for (size_t k = 0; k < 6; ++k)
+        for (size_t i = 0; i < 6; ++i) next[i] += A.v[k][i] * term[k];
+      for (size_t i = 0; i < 6; ++i) out[i] += next[i] *= (2 * n - 1) / (2.0 * n);
       term = next;
     }
     return out;
@@ -161,7 +159,7 @@ struct Part {
   std::vector<std::array<double, 18>> blocks;  // sums of the displacements' columns of the normals
 };
 
-void add(const PatchTable& t, const Systematic& errors, int64_t p, int64_t block, Part& to) {
+void add(const PatchTable& t, const Systematic& errors, int64_t p, Part& to) {
   double T[3][6];
   Coupling A;
   strains(t, p, T);
@@ -174,7 +172,7 @@ void add(const PatchTable& t, const Systematic& errors, int64_t p, int64_t block
     for (int k = 0; k < AMPLITUDES; ++k) left -= A[i][k] * errors.amplitudes[k], to.coupling[i][k] += A[i][k];
     to.gradients.push_back(left);
     to.sum[i] += g[i];
-    for (int a = 0; a < 3; ++a) to.blocks[(size_t)block][(size_t)(3 * i + a)] += N[6 * i + 3 + a];
+    for (int a = 0; a < 3; ++a) to.blocks[(size_t)t.block[(size_t)p]][(size_t)(3 * i + a)] += N[6 * i + 3 + a];
   }
 }
 
@@ -220,14 +218,13 @@ bool determines(Six N) {
 }
 
 // Normalised squared difference of the poses from the patches below the median of `along`, and from the others.
-double difference(const PatchTable& t, const Systematic& errors, const std::vector<int64_t>& block, int64_t blocks,
-                  const std::vector<double>& along) {
+double difference(const PatchTable& t, const Systematic& errors, const std::vector<double>& along) {
   std::vector<double> sorted = along;
   std::sort(sorted.begin(), sorted.end());
   const double middle = 0.5 * (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]);
   Part parts[2];
-  for (Part& part : parts) part.blocks.resize((size_t)blocks);
-  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], parts[along[(size_t)p] < middle ? 0 : 1]);
+  for (Part& part : parts) part.blocks.resize((size_t)t.blocks);
+  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, parts[along[(size_t)p] < middle ? 0 : 1]);
   double d[6] = {}, value = 0;
   Six C;
   Effect effect;
@@ -254,18 +251,19 @@ Six total(const double* normals, int64_t m, const uint8_t* keep) {
   Six N;
   for (int64_t k = 0; k < m; ++k)
     if (!keep || keep[k])
-      for (int i = 0; i < 36; ++i) N.v[i / 6][i % 6] += normals[36 * k + i];
+      for (int i = 0; i < 6; ++i)
+        for (int j = 0; j < 6; ++j) N.v[i][j] += normals[36 * k + 6 * i + j];
   return N;
 }
 
 void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep) {
   for (;;) {
-    const Six W = pseudo_root(total(normals, m, keep));
+    const Six N = total(normals, m, keep), inverse = pseudo_inverse(N), W = pseudo_root(N);
     std::vector<uint8_t> left(keep, keep + m);
     int64_t points = 0, dropped = 0;
     for (int64_t k = 0; k < m; ++k) {
       if (!keep[k]) continue;
-      if (dominates(normals + 36 * k, W)) {
+      if (dominates(normals + 36 * k, W, inverse)) {
         left[(size_t)k] = 0, ++dropped;
         continue;
       }
@@ -308,15 +306,14 @@ Estimated sandwich(const double* normals, const double* gradients, int64_t m) {
 }
 
 Estimated covariance(const PatchTable& t, const Systematic& errors) {
-  std::vector<int64_t> block;
   Part all;
-  all.blocks.resize((size_t)number_blocks(t, block));
-  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], all);
+  all.blocks.resize((size_t)t.blocks);
+  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, all);
   Estimated out = sandwich(t.normals, all.gradients.data(), t.m);
   const Six random = out.P;
   Six& P = out.P;
   Effect effect;
-  effect.add(all, pseudo_inverse(total(t.normals, t.m)), 1);
+  effect.add(all, t.inverse, 1);
   effect.add_to(errors, P);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
@@ -325,7 +322,7 @@ Estimated covariance(const PatchTable& t, const Systematic& errors) {
 }
 
 std::array<double, 2> size_error(const PatchTable& t) {
-  const Six inverse = pseudo_inverse(total(t.normals, t.m));
+  const Six& inverse = t.inverse;
   std::vector<std::array<double, 6>> a((size_t)t.m);  // sums of J times the residual per unit of size
   std::vector<double> f((size_t)t.m), e((size_t)t.m);  // sums of its square, and of its product with the residual
   double A[6] = {}, g[6] = {}, pose_of_size[6] = {}, pose[6] = {}, F = 0, free = 0, size = 0, squares = 0;
@@ -368,8 +365,6 @@ std::array<double, 2> size_error(const PatchTable& t) {
 }
 
 double split(const PatchTable& t, const Systematic& errors, const double* across, int64_t k) {
-  std::vector<int64_t> block;
-  const int64_t blocks = number_blocks(t, block);
   double worst = t.m && k ? 0 : std::numeric_limits<double>::quiet_NaN();
   for (int64_t d = 0; d < k && t.m; ++d) {
     std::vector<double> along((size_t)t.m);
@@ -377,7 +372,7 @@ double split(const PatchTable& t, const Systematic& errors, const double* across
       const double *a = across + 3 * d, *x = t.places + 3 * p;
       along[(size_t)p] = a[0] * x[0] + a[1] * x[1] + a[2] * x[2];
     }
-    const double found = difference(t, errors, block, blocks, along);
+    const double found = difference(t, errors, along);
     if (!(found <= worst)) worst = found;
     if (std::isnan(found)) break;
   }

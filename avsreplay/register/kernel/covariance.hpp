@@ -19,7 +19,15 @@ struct PatchTable {
   const int64_t* counts;
   double centre[3];     // about which the strain is taken
   double extent, side;  // of the model, and of a patch [m]
+
+  // What follows from these, see `complete`.
+  Six total, inverse;              // of the normals, and its pseudo-inverse
+  std::vector<int64_t> block = {}; // the number of the block of each patch, in the order of the blocks' places
+  int64_t blocks = 0;
 };
+
+// Fills in what follows from the sums.
+void complete(PatchTable& patches);
 
 struct Systematic {
   double block = 0, smooth[AMPLITUDES] = {}, amplitudes[AMPLITUDES] = {}, fit[6] = {};
@@ -57,7 +65,5 @@ Six total(const double* normals, int64_t m, const uint8_t* keep = nullptr);
 void strains(const PatchTable& patches, int64_t patch, double (&T)[3][6]);
 // A: sums over a patch of J times the residual per amplitude, with T of the same patch.
 void couple(const PatchTable& patches, int64_t patch, const double (&T)[3][6], Coupling& A);
-// The number of the block of each patch, in the order of the blocks' places; returns how many there are.
-int64_t number_blocks(const PatchTable& patches, std::vector<int64_t>& number);
 
 }  // namespace avs

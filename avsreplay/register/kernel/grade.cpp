@@ -103,8 +103,9 @@ bool is_bounded(const Six& P, double extent) {
 void measure(const Arrays& sums, const GradeRule& rule, Grade& out) {
   const int64_t directions = (int64_t)rule.across.size() / 3;
   const double* c = out.centre;
-  const PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
-                         sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side};
+  PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
+                   sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side, {}, {}};
+  complete(table);
   Systematic errors;
   if (rule.systematic || directions) errors = systematic_errors(table);
   out.covariance = rule.systematic ? covariance(table, errors) : sandwich(table.normals, table.gradients, table.m);

@@ -30,7 +30,7 @@ struct Equations {
 
 // The observable combinations of the amplitudes, from the sum of N over all patches.
 void observable(const PatchTable& t, const Joined& all, Equations& out) {
-  const Six inverse = pseudo_inverse(total(t.normals, t.m));
+  const Six& inverse = t.inverse;
   double points = 0, free[AMPLITUDES][AMPLITUDES];
   for (int64_t p = 0; p < t.m; ++p) points += (double)t.counts[p];
   for (int r = 0; r < AMPLITUDES; ++r)
@@ -113,98 +113,106 @@ double inner(const Joined& A, const Joined& B) {
   return sum;
 }
 
-// out += the covariance of the gradients of a patch: g g' enlarged by its leverage.
-void add_spread(const Row& g, double enlarge, Joined& out) {
-  for (int i = 0; i < JOINED; ++i)
-    for (int j = 0; j < JOINED; ++j) out.v[i][j] += g[i] * g[j] * enlarge;
+// The displacements' rows of a symmetric matrix.
+using Three = std::array<Row, 3>;
+
+Three displacements(const Joined& N) {
+  Three out;
+  for (int a = 0; a < 3; ++a)
+    for (int k = 0; k < JOINED; ++k) out[a][k] = N.v[3 + a][k];
+  return out;
 }
 
-double squares(const Joined& N) {
+// Sum of the entries, in their order.
+double sum(const Row& x) {
+  double all = 0;
+  for (const double value : x) all += value;
+  return all;
+}
+
+// out += a b'.
+void add_outer(double factor, const Row& a, const Row& b, Joined& out) {
+  for (int i = 0; i < JOINED; ++i) {
+    const double f = factor * a[i];
+    for (int j = 0; j < JOINED; ++j) out.v[i][j] += f * b[j];
+  }
+}
+
+double squares(const Three& n) {
   double sum = 0;
-  for (int i = 3; i < 6; ++i)
-    for (int j = 3; j < 6; ++j) sum += N.v[i][j] * N.v[i][j];
+  for (int i = 0; i < 3; ++i)
+    for (int j = 3; j < 6; ++j) sum += n[i][j] * n[i][j];
   return sum;
 }
-
-// Rows of the displacements, or three columns.
-using Three = std::array<Row, 3>;
 
 // What the gradients of one scan say of displacements common to the patches of a block: sums over blocks, less those over
 // patches, of the squared displacements' gradients (`found`), of their expectation for a unit variance (`expected`), and of
 // what the fit of pose and amplitudes changes in both. With N the normal equations of a patch, n its displacements' rows,
 // S = g g' the covariance of independent gradients and Q that of all, the fit adds K Q K' - 2 K S' to the covariance of the
-// displacements' gradients, K = n N^+. The sums of n' n, n' S and n' n n_block are kept, so that the products with N^+ are
-// made once.
+// displacements' gradients, K = n N^+. The sums of n' n, n' S and n' n (N^+ n_block) are kept, so that the products with N^+
+// are made once.
 struct Moments {
   double found = 0, expected = 0;
-  Joined square, spread, moved;
+  Joined square, spread;
+  Row moved{};
 
-  // `spread`: rows of the covariance; `own`: columns of the block's normal equations.
-  void add(double weight, const Joined& N, const Row& g, const Three& rows, const Three& own) {
-    found += weight * (g[3] * g[3] + g[4] * g[4] + g[5] * g[5]), expected += weight * squares(N);
-    Three n = {}, through = {};  // n' n_own, as columns
-    for (int i = 0; i < 3; ++i)
-      for (int k = 0; k < JOINED; ++k) n[i][k] = weight * N.v[3 + i][k];
-    for (int i = 0; i < 3; ++i)
-      for (int k = 0; k < JOINED; ++k)
-        for (int a = 0; a < 3; ++a) through[a][k] += n[i][k] * N.v[3 + i][3 + a];
-    for (int k = 0; k < JOINED; ++k)
-      for (int j = 0; j < JOINED; ++j) {
-        square.v[k][j] += n[0][k] * N.v[3][j] + n[1][k] * N.v[4][j] + n[2][k] * N.v[5][j];
-        spread.v[k][j] += n[0][k] * rows[0][j] + n[1][k] * rows[1][j] + n[2][k] * rows[2][j];
-        moved.v[k][j] += through[0][k] * own[0][j] + through[1][k] * own[1][j] + through[2][k] * own[2][j];
-      }
+  // `own`: N^+ times the displacements' columns of the block.
+  void add(double weight, const Three& n, const Row& g, const Three& own) {
+    found += weight * (g[3] * g[3] + g[4] * g[4] + g[5] * g[5]), expected += weight * squares(n);
+    for (int k = 0; k < JOINED; ++k) {
+      const double x = weight * n[0][k], y = weight * n[1][k], z = weight * n[2][k];
+      for (int j = 0; j < JOINED; ++j) square.v[k][j] += x * n[0][j] + y * n[1][j] + z * n[2][j];
+    }
+    for (int a = 0; a < 3; ++a) {
+      const double x = weight * n[0][3 + a], y = weight * n[1][3 + a], z = weight * n[2][3 + a];
+      for (int k = 0; k < JOINED; ++k) moved[k] += (x * n[0][k] + y * n[1][k] + z * n[2][k]) * own[a][k];
+    }
   }
 };
 
-// The displacements' columns of N.
-Three columns(const Joined& N) {
-  Three out;
-  for (int a = 0; a < 3; ++a)
-    for (int k = 0; k < JOINED; ++k) out[a][k] = N.v[k][3 + a];
-  return out;
-}
-
 // Variance of the displacements of blocks by the method of moments, and its effect M on the gradients. The products of
 // the gradients of different patches of a block, summed, have no contribution of errors within patches. `enlarge`: see
-// add_spread; the fit correlates the gradients. `all`: the covariances of all patches, summed.
+// take_fit; the fit correlates the gradients. `all`: the covariances of all patches, summed.
 double block_variance(const PatchTable& t, const Equations& q, const std::vector<double>& enlarge, const Joined& all,
                       const Joined& inverse, Joined& M) {
   struct Block {
-    Joined whole;
-    Three rows{}, columns{};
+    Three n{}, own{}, spread{};
     Row g{};
     double points = 0;
   };
-  std::vector<int64_t> block;
-  std::vector<Block> blocks((size_t)number_blocks(t, block));
+  std::vector<Block> blocks((size_t)t.blocks);
   for (int64_t p = 0; p < t.m; ++p) {
-    Block& b = blocks[(size_t)block[p]];
+    Block& b = blocks[(size_t)t.block[p]];
     b.points += (double)t.counts[p];
-    add(q.N[p], b.whole);
-    for (int i = 0; i < JOINED; ++i) b.g[i] += q.g[p][i];
-    for (int a = 0; a < 3; ++a)
-      for (int k = 0; k < JOINED; ++k) b.rows[a][k] += enlarge[p] * q.g[p][3 + a] * q.g[p][k];
+    const Row& g = q.g[p];
+    for (int a = 0; a < 3; ++a) {
+      const double f = enlarge[p] * g[3 + a];
+      for (int k = 0; k < JOINED; ++k) b.n[a][k] += q.N[p].v[3 + a][k], b.spread[a][k] += f * g[k];
+    }
+    for (int i = 0; i < JOINED; ++i) b.g[i] += g[i];
   }
   Moments sums;
   double moved = 0;
   for (Block& b : blocks) {
-    b.columns = columns(b.whole);
-    for (int i = 0; i < JOINED; ++i)
-      for (int j = 0; j < JOINED; ++j)
-        M.v[i][j] += b.columns[0][i] * b.columns[0][j] + b.columns[1][i] * b.columns[1][j] + b.columns[2][i] * b.columns[2][j];
-    sums.add(1 / b.points, b.whole, b.g, b.rows, b.columns);
-    moved += squares(b.whole) / b.points;
+    for (int a = 0; a < 3; ++a) {
+      add_outer(1, b.n[a], b.n[a], M), add_outer(1 / b.points, b.n[a], b.spread[a], sums.spread);
+      for (int i = 0; i < JOINED; ++i)
+        for (int j = 0; j < JOINED; ++j) b.own[a][j] += inverse.v[i][j] * b.n[a][i];
+    }
+    sums.add(1 / b.points, b.n, b.g, b.own);
+    moved += squares(b.n) / b.points;
   }
   for (int64_t p = 0; p < t.m; ++p) {
-    const Block& b = blocks[(size_t)block[p]];
-    Three rows;
-    for (int a = 0; a < 3; ++a)
-      for (int k = 0; k < JOINED; ++k) rows[a][k] = enlarge[p] * q.g[p][3 + a] * q.g[p][k];
-    sums.add(-1 / b.points, q.N[p], q.g[p], rows, b.columns);
+    const Block& b = blocks[(size_t)t.block[p]];
+    const Three n = displacements(q.N[p]);
+    const Row& g = q.g[p];
+    Row along;
+    for (int k = 0; k < JOINED; ++k) along[k] = g[3] * n[0][k] + g[4] * n[1][k] + g[5] * n[2][k];
+    add_outer(-enlarge[p] / b.points, along, g, sums.spread);
+    sums.add(-1 / b.points, n, g, b.own);
   }
   const Joined square = about(inverse, sums.square);
-  const double expected = sums.expected + inner(square, M) - 2 * inner(sums.moved, inverse);
+  const double expected = sums.expected + inner(square, M) - 2 * sum(sums.moved);
   if (!(expected > LEAST_DETERMINED * moved)) return 0;
   return std::max(0.0, (sums.found - inner(square, all) + 2 * inner(sums.spread, inverse)) / expected);
 }
@@ -245,11 +253,11 @@ double common_variance(const double* values, const Joined& P, int first, int siz
 std::vector<double> take_fit(Equations& q, const Joined& inverse, const double* fit) {
   std::vector<double> enlarge(q.N.size());
   for (size_t p = 0; p < enlarge.size(); ++p) {
-    double leverage = 0;
     Row& g = q.g[p];
+    Row leverage{};
     for (int i = 0; i < JOINED; ++i)
-      for (int j = 0; j < JOINED; ++j) g[i] -= q.N[p].v[i][j] * fit[j], leverage += q.N[p].v[i][j] * inverse.v[i][j];
-    enlarge[p] = 1 / std::max(1 - leverage / q.n, 0.5);
+      for (int j = 0; j < JOINED; ++j) g[j] -= q.N[p].v[i][j] * fit[i], leverage[j] += q.N[p].v[i][j] * inverse.v[i][j];
+    enlarge[p] = 1 / std::max(1 - sum(leverage) / q.n, 0.5);
   }
   return enlarge;
 }
@@ -277,8 +285,8 @@ void couple(const PatchTable& t, int64_t p, const double (&T)[3][6], Coupling& A
   }
 }
 
-// The number of the block of each patch, in the order of the blocks' places; returns how many there are.
-int64_t number_blocks(const PatchTable& t, std::vector<int64_t>& number) {
+void complete(PatchTable& t) {
+  t.total = total(t.normals, t.m), t.inverse = pseudo_inverse(t.total);
   std::vector<std::array<double, 3>> cube((size_t)t.m);
   std::vector<int64_t> order((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
@@ -286,13 +294,11 @@ int64_t number_blocks(const PatchTable& t, std::vector<int64_t>& number) {
     order[p] = p;
   }
   std::sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return cube[a] < cube[b]; });
-  number.resize((size_t)t.m);
-  int64_t n = 0;
+  t.block.resize((size_t)t.m);
   for (int64_t k = 0; k < t.m; ++k) {
-    if (k && cube[order[k]] != cube[order[k - 1]]) ++n;
-    number[order[k]] = n;
+    t.blocks += k == 0 || cube[order[k]] != cube[order[k - 1]];
+    t.block[order[k]] = t.blocks - 1;
   }
-  return t.m ? n + 1 : 0;
 }
 
 Systematic systematic_errors(const PatchTable& t) {
@@ -311,7 +317,7 @@ Systematic systematic_errors(const PatchTable& t) {
   for (int i = 0; i < JOINED; ++i)
     for (int j = 0; j < JOINED; ++j) fit[i] += reduced.v[i][j] * g[j], all[i] += inverse.v[i][j] * g[j];
   const std::vector<double> enlarge = take_fit(q, inverse, all);
-  for (int64_t p = 0; p < t.m; ++p) add_spread(q.g[p], enlarge[p], spread);
+  for (int64_t p = 0; p < t.m; ++p) add_outer(enlarge[p], q.g[p], q.g[p], spread);
   out.block = block_variance(t, q, enlarge, spread, inverse, M);
   for (int i = 0; i < JOINED; ++i)
     for (int j = 0; j < JOINED; ++j) spread.v[i][j] += out.block * M.v[i][j];
