@@ -16,7 +16,7 @@ from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.neighbourhood import Neighbourhood
-from avsreplay.register.restarts import Restarter
+from avsreplay.register.restarts import Budget, Restarter
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 SCENARIO = """
@@ -197,7 +197,7 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
     neighbourhood = Registrar(surface)._neighbourhood
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
     turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
-    moved = neighbourhood.along_valley(scan, turned.inverse())
+    moved = neighbourhood.along_valley(scan, turned.inverse(), Budget(len(scan)))
     assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
 
 
@@ -232,7 +232,7 @@ def test_a_pose_with_one_point_on_the_model_has_no_valley():
     surface, T_ac = boxes(), example_pose()
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
     scan[1:] += [0.0, 0.0, 50.0]
-    kept = Registrar(surface)._neighbourhood.along_valley(scan, T_ac.inverse())
+    kept = Registrar(surface)._neighbourhood.along_valley(scan, T_ac.inverse(), Budget(len(scan)))
     assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
 
 

@@ -38,9 +38,9 @@ LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to t
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-HEALTHY_WORK, HEALTHY_PASSES = 22_000, 3.5  # an ordinary registration: point searches in all, and besides per point
+HEALTHY_WORK, HEALTHY_PASSES = 17_000, 2.5  # an ordinary registration: point searches in all, and besides per point
 FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
-ALIGN_WORK, WITHIN_WORK = (60_000, 25), (40_000, 18)  # most of an alignment and per point, also with a fixed gate
+ALIGN_WORK, WITHIN_WORK = (40_000, 15), (30_000, 15)  # most of an alignment and per point, also with a fixed gate
 
 
 @value_class
@@ -132,9 +132,17 @@ class HornBackend:
         return sums.sum_d2 + (sums.points - sums.inliers) * self._gate**2
 
     def align_within(
-        self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False, most: int = MOST_WITHIN
+        self,
+        points: NDArray[Any],
+        guess: Pose,
+        gate_m: float,
+        near: bool = False,
+        most: int = MOST_WITHIN,
+        most_work: int = 2**62,
     ) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most ``most``.
+
+        After ``most_work`` point searches it ends, not converged.
 
         ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
         first: they would end further from the result than it is.
@@ -143,7 +151,7 @@ class HornBackend:
         rule = self._rules[facing]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        return self._with(points, guess, within, _most(WITHIN_WORK, len(points)))
+        return self._with(points, guess, within, max(1, min(most_work, _most(WITHIN_WORK, len(points)))))
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
         rule = rules[self._visibility.camera_c(self._index, points, guess) is not None]
@@ -266,7 +274,9 @@ def _state(name: str) -> Availability:
         return Availability(name, False, "", f"cannot be imported: {error}", "reinstall the package that provides it")
 
 
-def aligned(name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
+def aligned(
+    name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None, most_work: int
+) -> Fit | str:
     """Run a back end. An exception, or a result of a wrong type, is returned as the text of a failure.
 
     Args:
@@ -275,10 +285,12 @@ def aligned(name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_
         scan: (n, 3) points in {A} [m].
         guess: T_ca to begin with.
         width_m: rejection distance from the first pass on [m], for a back end with ``align_within``; None for its own.
+        most_work: point searches after which it ends, for a back end with ``align_within`` and a given ``width_m``.
     """
     within = None if width_m is None else getattr(backend, "align_within", None)
+    rule = {"near": True, "most_work": most_work}
     try:
-        fit = backend.align(scan, guess) if within is None else within(scan, guess, width_m, near=True)
+        fit = backend.align(scan, guess) if within is None else within(scan, guess, width_m, **rule)
         if not isinstance(fit, Fit):
             return f"back end '{name}' returned {type(fit).__name__}, not Fit"
         finite = bool(np.isfinite(fit.T_ca.matrix).all())

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Fit
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
-from avsreplay.register.sampling import attitudes, directions, sample_evenly, thin_to, without_sparse_points
+from avsreplay.register.sampling import attitudes, directions, sample_evenly, scan_axes, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
@@ -48,8 +47,8 @@ FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; f
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
 LOOK_UPS, ROUND_WORK = 4, 35_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
 SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
-APART = 0.6  # usual share of the starts of the second selection that are different poses
-REGISTERED_WORK = 100  # usual cost of registering the last poses, for each point with which they are measured
+REGISTERED_SHARE, FAR = 0.7, 1.5  # of the work left, for the last poses; time of a search at wrong poses over others
+APART, REGISTERED_WORK = 0.6, 40  # usual share of different starts; usual cost of the last poses for each fine point
 CELL_OF_EXTENT, LEAST_COSINE = 0.02, 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
 
@@ -109,7 +108,7 @@ class GlobalSearch:
         if "symmetries" not in kept:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
-        self._spent, self._registered = 0, REFINED_POINTS  # work of the round so far; points for the last poses
+        self._spent, self._most, self._registered = 0, 0, REFINED_POINTS  # work of the round, its limit; points
         coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
@@ -149,8 +148,9 @@ class GlobalSearch:
                 partly outside the scan or hidden; 2 does not assume the position of the camera.
             before: result of another round for the same points, whose poses are compared as well.
             known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
-            left: work that is left, in point searches.
+            left: work that is left, in point searches; after most of it no pose is registered.
         """
+        self._most = int(REGISTERED_SHARE * left)
         self._spent = self._looked(len(points), number)
         self._registered = REFINED_POINTS // (2 if left < SHORT * self.work(len(points), number) else 1)
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
@@ -173,7 +173,7 @@ class GlobalSearch:
         return [
             ([sight], none, known),
             ([sight], np.cos(turn) * u + np.sin(turn) * v, known),
-            ([sight, *_axes(few)], none, False),
+            ([sight, *scan_axes(few)], none, False),
         ]
 
     def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array, thinned: int = 1) -> Array:
@@ -240,13 +240,13 @@ class GlobalSearch:
         Also returned: the least cost after the few passes, also of other poses if it is given (``least``).
         """
         part = np.ascontiguousarray(fine[:: max(1, len(fine) // self._registered)])
-        brief = [self._counted(self._brief.align_within(part, T_ca, width_m)) for T_ca in poses]
+        brief = [self._ended(self._brief, part, T_ca, width_m) for T_ca in poses]
         found = [self._measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
         least = min(least, float(costs.min(initial=np.inf)))
         order = [k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER]
         last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
-        ended = [self._counted(self._refine.align_within(part, found[k].T_ca, width_m, near=True)) for k in last]
+        ended = [self._ended(self._refine, part, found[k].T_ca, width_m, True) for k in last]
         others = [found[k].T_ca for k in order if k not in last]
         return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
@@ -262,11 +262,15 @@ class GlobalSearch:
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
         distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)
-        self._spent += work
+        self._spent += int(FAR * work)
         return Candidate(T_ca, distance)
 
-    def _counted(self, fit: Fit) -> Pose:
-        self._spent += fit.work
+    def _ended(self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False) -> Pose:
+        """The pose registered to the model; the pose itself where the work of the round is spent."""
+        if self._spent >= self._most:
+            return T_ca
+        fit = horn.align_within(points, T_ca, width_m, near)
+        self._spent += int(FAR * fit.work)
         return fit.T_ca
 
     def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
@@ -342,9 +346,3 @@ class VisibleCentroids:
         """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
         centroid: Array = self._centroids[np.argmax(direction_c @ self._directions.T, axis=-1)]
         return centroid
-
-
-def _axes(points: Array) -> list[Array]:
-    """Both directions of each principal axis of a scan: one of them is near the direction to the camera."""
-    axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
-    return [*axes, *-axes]

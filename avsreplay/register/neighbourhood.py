@@ -35,13 +35,13 @@ from avsreplay.register.restarts import (
     Restarter,
 )
 
-VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
+VALLEY_STEPS, VALLEY_POINTS = 8, 250  # steps of half a gate each way along the two least certain directions; points
 VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
 POINTS, DIRECTIONS = 300, 3  # points that are registered from displaced poses; directions, each both ways
 DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, is not compared; usual rms radius
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
-NOT_COMPARED = "the scan shows a part of the target, and no work is left to compare the poses near this one"
+NOT_COMPARED = "no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
 BIAS_POINTS = 1000  # of the simulated scan by which the bias of the noise is found
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
@@ -140,13 +140,20 @@ class Neighbourhood:
             found, message=f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma) only"
         )
 
-    def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
+    def along_valley(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Pose | None:
         """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
 
         Args:
             points: (n, 3) in {A} [m].
             T_ca: registered pose.
+            budget: work that is left.
+
+        Returns:
+            None if the work for the comparison is not left.
         """
+        if not budget.allows(VALLEY_WORK):
+            return None
+        budget.spend(VALLEY_WORK)
         few, target = points[:: max(1, len(points) // VALLEY_POINTS)], self._target
         weak = self._weak(few, T_ca, 2)
         if weak is None:

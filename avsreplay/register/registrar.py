@@ -18,19 +18,18 @@ from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
-from avsreplay.register.neighbourhood import VALLEY_WORK, Neighbourhood
+from avsreplay.register.neighbourhood import NOT_COMPARED, Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
-from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry, prepared
+from avsreplay.register.rivals import LEAST_RAYS, NOT_TURNED, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
-LAST_SCANS, AFTER_WORK = 2, VALLEY_WORK + restarts.TEST_WORK + restarts.COMPARED_WORK  # kept for what follows a search
-LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
+LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = 2, 0.2, 0.9  # kept for the last registration; least and sure inliers
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
@@ -40,7 +39,7 @@ class Registrar:
     """Registers scans to one surface with one back end. Built once, used for every scan of a log.
 
     Attributes:
-        params: the parameters as given.
+        params, index: the parameters as given; the index of the model.
         limits: the same with every automatic length resolved for this surface.
         sided: the outer side of the faces is known.
     """
@@ -62,11 +61,11 @@ class Registrar:
         self._visibility = quality.Visibility(surface, self.params.camera)
         surface, self.sided = self._visibility.surface, self._visibility.sided
         self._cache_dir = cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
-        self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
-        self._target = Target(surface, self._index, self.limits, self._visibility)
+        self.index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
+        self._target = Target(surface, self.index, self.limits, self._visibility)
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
         self._backend = create_backend(self.params.backend, factory, self._target)
-        self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
+        self._test = PlausibilityTest(surface, self.index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
         self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter)
 
@@ -139,12 +138,14 @@ class Registrar:
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(restarts.SCATTER_WORK * len(scan))
         few, results = self._restarter.part(target), list[Alignment]()
+        none = quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse())
         whole: SearchResult | None = None
-        for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
-            if results and not budget.allows(self._symmetry.search.work(len(part), number)):
+        for part, number in islice(attempts(target, self.index.extent_m, lambda: results[0].measured), rounds):
+            if not budget.allows(self._symmetry.search_work(len(part), number)):
                 break
             before = whole if part is target else None
-            search = self._symmetry.search.search(part, number, before, known, budget.left)
+            left = budget.left - self._symmetry.after_search(len(scan))
+            search = self._symmetry.search.search(part, number, before, known, left)
             budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
@@ -157,7 +158,7 @@ class Registrar:
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
         width = max(self.limits.gate_m, 3.0 * min((restart.noise_m for _, restart in measured), default=0.0))
-        best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else results[0]
+        best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else (results or [none])[0]
         if not budget.exhausted or (measured and not self._restarter.misfit(few, best.T_ac.inverse())):
             return best
         message = "no pose of the model explains the scan, and no work is left for a longer search"
@@ -172,6 +173,8 @@ class Registrar:
         """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
+        if start.noise_m > restarts.HOPELESS * self.index.extent_m:
+            return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False
         found = self._regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
             return found, False
@@ -204,7 +207,7 @@ class Registrar:
             times_s: (n,) measurement time of each point relative to that instant [s].
             T_ac: the registered pose.
         """
-        return quality.instants(self._index, self._visibility, points, times_s, T_ac.inverse(), self.limits.gate_m)
+        return quality.instants(self.index, self._visibility, points, times_s, T_ac.inverse(), self.limits.gate_m)
 
     def distance(self, points: NDArray[Any], T_ac: Pose, most_m: float) -> Array:
         """Return the distances (n,) of points to the model [m].
@@ -214,17 +217,12 @@ class Registrar:
             T_ac: pose of the model.
             most_m: larger distances are limited to this value [m]; it is at most the reach of the index.
         """
-        return self._index.distances(points, T_ac.inverse(), most_m, False, 1, 0.0)[0]
+        return self.index.distances(points, T_ac.inverse(), most_m, False, 1, 0.0)[0]
 
     @cached_property
     def _symmetry(self) -> NearSymmetry:
         """The near-symmetries of the model and its search, prepared when a scan needs them for the first time."""
         return prepared(self._target, self._test, self.params.acquire, self._cache_dir)
-
-    @property
-    def index(self) -> SurfaceIndex:
-        """Return the index of the model."""
-        return self._index
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points)
@@ -238,12 +236,14 @@ class Registrar:
 
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
         """
-        unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self._index.extent_m)
+        unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self.index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in ACCEPTED
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found
+        if not budget.allows(work := self._symmetry.work(len(scan))):
+            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
-        budget.spend(self._symmetry.work(len(scan)))
+        budget.spend(work)
         best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
         turned = found if best is T_ca else self._graded(scan, best.inverse(), budget, None, halves, carried)
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
@@ -267,7 +267,7 @@ class Registrar:
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        if not budget.brief and budget.left > 0:
+        if not budget.brief and budget.allows(self._symmetry.search_work(len(scan), 0)):
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED)
 
@@ -278,7 +278,7 @@ class Registrar:
         few = self._restarter.part(scan)
         budget.spend(restarts.COMPARED_WORK)
         starts = self._restarter.starts(few, first, guess)
-        hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self._index.extent_m
+        hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self.index.extent_m
         tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
         final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m)
         reason = self._restarter.reason(few, final, budget, guess)
@@ -288,7 +288,7 @@ class Registrar:
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
         last = LAST_SCANS * healthy_work(len(scan))  # the best pose is registered once more
-        work = self._symmetry.search.work(len(scan), 0) + AFTER_WORK + last // LAST_SCANS if overlap else 0
+        work = self._symmetry.search_work(len(scan), 0) if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
                 known = final.T_ac.inverse() if final.measured else None
@@ -317,8 +317,9 @@ class Registrar:
         found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
         if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= restarts.LEAST_RATIO or budget.brief:
             return found
-        budget.spend(VALLEY_WORK)
-        moved = self._neighbourhood.along_valley(few, found.T_ac.inverse())
+        moved = self._neighbourhood.along_valley(few, found.T_ac.inverse(), budget)
+        if moved is None:
+            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
         again = self._graded(scan, moved.inverse(), budget, width, halves, carried)
@@ -336,13 +337,13 @@ class Registrar:
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         start = guess.inverse()
-        fit = aligned(self.params.backend, self._backend, scan, start, width_m)
+        fit = aligned(self.params.backend, self._backend, scan, start, width_m, budget.left)
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         options = (self.params, halves, self._accuracy, not carried, start, sized)
-        found = quality.grade(self._index, self._visibility, scan, fit, limits, *options)
-        budget.registered(fit, found)
+        found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)
+        budget.registered(fit, found, sized is None)
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found

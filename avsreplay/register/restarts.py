@@ -39,6 +39,7 @@ SCATTER_WORK = 10  # cost per point of leaving out scattered points
 TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
 PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
 COMPARED_WORK = 4 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about four times
+HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise at the result of a search it is not registered to the whole scan
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
@@ -74,10 +75,13 @@ class Budget:
         """Subtract work that was done."""
         self.left -= searches
 
-    def registered(self, fit: Fit, found: Alignment) -> None:
-        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated."""
+    def registered(self, fit: Fit, found: Alignment, sized: bool) -> None:
+        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated.
+
+        ``sized``: the size is fitted where many points are off the model.
+        """
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        size = SIZE_WORK if found.inlier_ratio < LEAST_RATIO else 0
+        size = SIZE_WORK if sized and found.inlier_ratio < LEAST_RATIO else 0
         self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK + size)
 
     def allows(self, searches: int, kept: int = 0) -> bool:

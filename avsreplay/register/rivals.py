@@ -23,12 +23,14 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import Target, healthy_work
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
+from avsreplay.register.neighbourhood import VALLEY_WORK
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import EMPTY, PlausibilityTest, Rays
 from avsreplay.register.quality import view_directions
+from avsreplay.register.restarts import TEST_WORK
 from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
@@ -46,6 +48,7 @@ OFF = 2.0  # a point farther from the model than this many widths is off it
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
+NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 STEPS, LONGEST_STEP = 24, 0.05  # steps from a mark towards the camera; the longest, over the extent
@@ -135,6 +138,15 @@ class NearSymmetry:
         rays = STEPS * len(self._marks)
         measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
         return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + rays) + measured
+
+    def after_search(self, points: int) -> int:
+        """Return the usual cost of what follows a search for a scan of so many points, in point searches."""
+        turned = self.work(points, FINALISTS) if self.marked else 0
+        return VALLEY_WORK + TEST_WORK + healthy_work(points) + turned
+
+    def search_work(self, points: int, number: int) -> int:
+        """Return the usual cost of round ``number`` of the search and of what follows it."""
+        return self.search.work(points, number) + self.after_search(points)
 
     def decided(
         self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool

@@ -137,6 +137,12 @@ def without_scattered_points(points: Array) -> Array:
     return points[distance < SCATTERED * float(np.quantile(distance, DENSE_QUANTILE))]
 
 
+def scan_axes(points: Array) -> list[Array]:
+    """Return both directions of each principal axis of points (n, 3); without axes, those of the frame."""
+    axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
+    return [*axes, *-axes]
+
+
 def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Iterator[tuple[Array, int]]:
     """Yield what is searched and by which round of the search: the whole scan, its parts, then with other starts.
 

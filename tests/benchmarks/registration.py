@@ -331,7 +331,7 @@ def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 
 def _graded(one: Registrar, scan: Array, fit: Fit, rest: tuple[Any, ...]) -> tuple[Array, int]:
-    found = quality.grade(one._index, one._visibility, scan, fit, *rest)
+    found = quality.grade(one.index, one._visibility, scan, fit, *rest)
     return found.T_ac.inverse().matrix, found.iterations
 
 

@@ -77,7 +77,7 @@ def difference(registrar: Registrar, points: Array, T_ac: Pose, half: Array) -> 
 
 def cost(registrar: Registrar, points: Array, T_ac: Pose) -> tuple[float, float]:
     """Processor time of the systematic errors, and of the test of halves, over that of a registration."""
-    target, extent = registrar._target, registrar._index.extent_m
+    target, extent = registrar._target, registrar.index.extent_m
     found = quality.evidence(target.index, target.visibility, points, T_ac.inverse(), registrar.limits.gate_m)
     shares = []
     for _ in range(5):
