@@ -48,6 +48,18 @@ def fits(model: Surface, noise: float, seeds: range) -> list[tuple[SizeError, fl
     return out
 
 
+def test_faces_in_coordinate_planes_do_not_enlarge_the_standard_error() -> None:
+    """Patches of the measured points would divide such a face by the sign of its noise."""
+    model, sigmas = boxes(), []
+    for shift in (
+        (1.0, 0.8, 1.2),
+        (0.13, 0.21, 0.37),
+    ):  # three faces of the largest box are in coordinate planes, or none
+        moved = replace(model, vertices=model.vertices + np.array(shift))
+        sigmas.append(np.array([found.sigma for found, _ in fits(moved, 0.0005, range(20))]))
+    assert np.median(sigmas[0] / sigmas[1]) < 1.15
+
+
 def test_patch_sums_give_the_size_of_least_squares_over_points() -> None:
     """Every patch a point: the fit is exact, and the standard error the cluster-robust one."""
     rng = np.random.default_rng(5)

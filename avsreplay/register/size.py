@@ -42,6 +42,7 @@ WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used;
 LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
 LEAST_INFORMATION = 1e-3  # least share of n . p not explained by the pose: three faces of a box give no size
 PATCHES_OF_EXTENT = (0.05, 0.15)  # sides of the patches; the larger of the two standard errors counts
+OFF_PLANES = 0.381966  # share of a patch from its boundary to a coordinate plane
 LEAST_LEFT = 0.2  # leverage is limited to 0.8 where it enlarges the residual of a patch
 OBSERVABLE = 0.05  # an amplitude that the pose and the size explain to all but this share of its norm is not fitted
 CAUCHY, CAUCHY_VARIANCE = 2.0, 1.56  # width of the weights in standard deviations; variance over the weighted one
@@ -253,8 +254,13 @@ def robust_weights(e: Array) -> tuple[Array, float]:
 
 
 def _clustered(rows: _Rows, side_m: float) -> float:
-    """Standard error of delta from the sums over patches, each enlarged by its leverage."""
-    cell = np.floor(rows.p / side_m).astype(np.int64)
+    """Standard error of delta from the sums over patches, each enlarged by its leverage.
+
+    A point belongs to the patch in which its projection onto its face lies, so that noise does not divide a face. The
+    boundaries of the patches are not at the coordinate planes, so that rounding does not divide a face in one of them.
+    """
+    on = rows.p - np.einsum("ij,ij->i", rows.normal, rows.p - rows.foot)[:, None] * rows.normal
+    cell = np.floor(on / side_m + OFF_PLANES).astype(np.int64)
     span = cell.max(axis=0) - cell.min(axis=0) + 1
     cell = cell - cell.min(axis=0)
     patch = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[1]
