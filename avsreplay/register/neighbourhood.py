@@ -55,7 +55,7 @@ class Neighbourhood:
         self._extent, self._horn = target.surface.extent, HornBackend(target)
 
     def best(
-        self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
+        self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
     ) -> tuple[Restart | None, AlignStatus, str]:
         """Return a better minimum around a pose; the status of the better of both, and why it is not accepted.
 
@@ -63,7 +63,7 @@ class Neighbourhood:
         camera.
 
         Args:
-            points: (n, 3) in {A} [m], part of the scan.
+            scan: (n, 3) in {A} [m].
             guess: predicted T_ac.
             found: the alignment.
             budget: work that is left.
@@ -74,6 +74,7 @@ class Neighbourhood:
         T_ca, aligned = found.T_ac.inverse(), found.status is AlignStatus.ALIGNED
         if not (aligned or found.status is AlignStatus.DEGENERATE) or not self._moved(T_ca, guess):
             return None, found.status, ""
+        points = self._restarter.part(scan)
         if not (self._test.turned_away(points, T_ca) or (aligned and self._test.partial(points, T_ca))):
             return None, found.status, ""
         if not budget.allows((1 + 2 * DIRECTIONS) * FAR_WORK * self._restarter.work(self._restarter.narrow_m) * POINTS):
@@ -116,9 +117,10 @@ class Neighbourhood:
             found: the alignment.
             budget: work that is left; it need not suffice.
         """
-        P, target, T_ca = found.covariance, self._target, found.T_ac.inverse()
+        P, target = found.covariance, self._target
         if P is None or found.rms_m <= POOR_OF_GATE * target.limits.gate_m:
             return found
+        T_ca = found.T_ac.inverse()
         few = scan[:: max(1, len(scan) // BIAS_POINTS)]
         width = self._restarter.width(self._restarter.measure(few, T_ca))
         camera_c = target.visibility.camera_c(target.index, few, T_ca)

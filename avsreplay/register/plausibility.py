@@ -89,7 +89,7 @@ class PlausibilityTest:
         self._index, self._visibility, self._gate, self._extent = index, visibility, gate_m, surface.extent
         self._points, self._normals = sample(surface, SURFACE_POINTS)
         self._points = self._points[:: max(1, len(self._points) // SURFACE_POINTS)]
-        self._normals = self._normals[: len(self._points)]
+        self._normals, self._columns = self._normals[: len(self._points)], np.ascontiguousarray(self._points.T)
 
     def refused(self, scan: NDArray[Any], points: int, guess: Pose | None = None) -> Alignment | None:
         """Return the alignment of a scan that is not registered at all; None for others.
@@ -136,11 +136,8 @@ class PlausibilityTest:
         """
         if not self._visibility.may_be_camera(T_ca):
             return False
-        image = _Image(points)
-        spans = [
-            np.ptp(ACROSS.T @ image.plane(each).T, axis=1) for each in (points, T_ca.inverse().apply(self._points))
-        ]
-        return bool((spans[0] < PARTIAL * spans[1]).any())
+        image, T_ac = _Image(points), T_ca.inverse()
+        return bool((image.spans(points.T) < PARTIAL * image.spans(T_ac.R @ self._columns + T_ac.t[:, None])).any())
 
     def turned_away(self, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether most points (n, 3) in {A} are on faces that face away from a camera at the origin."""
@@ -281,6 +278,11 @@ class _Image:
         """Return the coordinates (n, 2) of points (n, 3) in {A} in the tangent plane."""
         turned = points @ self._axes.T
         return np.asarray(turned[:, :2] / turned[:, 2:])
+
+    def spans(self, points: NDArray[Any]) -> Array:
+        """Return the extents of points (3, n) along the directions ``ACROSS`` in the tangent plane."""
+        turned = self._axes @ points
+        return np.asarray(np.ptp(ACROSS.T @ (turned[:2] / turned[2]), axis=1))
 
     def cells(self, points: Array) -> NDArray[np.int64]:
         """Return the number of the cell of each point (n, 3); a cell has about ``POINTS_PER_CELL`` of them."""

@@ -253,14 +253,15 @@ class Registrar:
         self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget, halves: bool, carried: bool
     ) -> Alignment:
         """The best of the minima around a pose of a part of the target; not accepted if another is as good."""
-        few = self._restarter.part(scan)
-        best, status, doubt = self._neighbourhood.best(few, guess, found, budget)
-        found = found if best is None else self._regraded(scan, few, best, budget, halves, carried)
+        best, status, doubt = self._neighbourhood.best(scan, guess, found, budget)
+        if best is not None:
+            found = self._regraded(scan, self._restarter.part(scan), best, budget, halves, carried)
         return replace(found, status=status, covariance=None, message=doubt) if doubt else found
 
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
-        if not found.measured or (angle := float(geometry.angle((guess.inverse() @ found.T_ac).q))) <= TURNED_RAD:
+        angle = float(geometry.angle(geometry.multiply(geometry.conjugate(guess.q), found.T_ac.q)))
+        if not found.measured or angle <= TURNED_RAD:
             return False
         free = found.status is AlignStatus.DEGENERATE
         return angle > FAR_RAD or (not free and len(self._symmetry.search.symmetries) > 0)
