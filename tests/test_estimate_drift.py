@@ -158,6 +158,16 @@ def test_a_random_torque_and_force_are_no_drift(density: float, seed: int) -> No
     assert result.track.manoeuvres == ()
 
 
+@pytest.mark.slow
+def test_after_a_false_report_of_a_torque_the_density_of_the_random_one_is_kept() -> None:
+    """The torque is random. Estimated anew from none, its density fell to 4e-7 once a constant torque was known."""
+    case = surprises.Case("random", random=(1e-4, 1e-4), seconds=70.0)
+    track = surprises.run(case, 2).track
+    assert track is not None
+    assert track.drift is not None
+    assert 3e-5 < track.levels.torque < 3e-4
+
+
 def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
     """Against the truth of another integrator, DOP853, pushed in small steps."""
     pushed, free = (surprises.Case("t", torque=torque, seconds=40.0) for torque in (2e-4, 0.0))

@@ -138,7 +138,9 @@ class DisturbanceSchedule:
             claimed, best, widths = self.params.adapt is Adaptation.OFF, found.hypotheses[0], found.widths
             forced = bool(best.fitted.u[3:].any())  # a constant force would count as a random one
             seen = None if forced else _positions(track, best.fitted.chart)
-            levels = yield from levels_of(best.fitted, track.levels, widths, claimed, self.params.disturbances, seen)
+            first = replace(track.levels, torque=0.0, force=0.0)  # the acceleration may have caused these disturbances
+            before = first if begun is None else track.levels
+            levels = yield from levels_of(best.fitted, before, widths, claimed, self.params.disturbances, seen)
             motions = []
             for h in found.hypotheses:
                 motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)

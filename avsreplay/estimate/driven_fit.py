@@ -138,7 +138,7 @@ def levels_of(
 
     Args:
         fitted: the fit.
-        levels: the last estimate, of which the disturbances are not used: the acceleration may have caused them.
+        levels: the last estimate.
         widths: (6,) prior 1 sigma of the acceleration.
         claimed: the noise of the poses is as claimed; only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
@@ -147,9 +147,8 @@ def levels_of(
     old, kinds = fitted.problem, np.flatnonzero(fitted.u)
     points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS)
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
-    begin = replace(levels, torque=0.0, force=0.0)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
-    return (yield from estimate_levels(points, problem, begin, claimed, fixed, unknowns, positions))
+    return (yield from estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions))
 
 
 def drift_unknowns(
