@@ -194,9 +194,11 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     Raises:
         ValueError: times that do not ascend from 0.
     """
+    if not isinstance(belief, DrivenBelief):
+        return grasp_forecast(belief, times_s, torque, force)
     times_s = ascending(times_s)
     most = max(map(abs, belief.x.w_b.tolist())) * float(times_s.max(initial=0.0))
-    if not isinstance(belief, DrivenBelief) or most > MOST_RAD or not len(times_s):
+    if most > MOST_RAD or not len(times_s):
         return grasp_forecast(belief, times_s, torque, force)
     states, Phi, by_u, steps = driven_steps(belief, times_s, torque, None)
     rotations = geometry.matrix(np.array([x.q_ab for x in states]))

@@ -283,7 +283,7 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
 def ascending(times_s: Array) -> Array:
     """Return times (n,) [s] as numbers. Raises ValueError where they do not ascend from 0."""
     times = np.asarray(times_s, dtype=np.float64)
-    if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
+    if times.ndim != 1 or (times[:1] < 0.0).any() or (times[1:] < times[:-1]).any():
         raise ValueError("times must ascend from 0")
     return times
 

@@ -177,10 +177,11 @@ class Estimator:
             found = driven_forecast(track.belief, times_s, *noise)
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
-        turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
-        turn = np.minimum(np.hypot(found.rot_1s_rad, turns), 2.0 * ANY_HALF_RAD)  # at most an arbitrary attitude
-        position = np.hypot(np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), moves)
-        return replace(found, pos_1s_m=position, rot_1s_rad=turn)
+        turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
+        if track.undetermined.size:
+            turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
+            turn, position = np.hypot(turn, turns), np.hypot(position, moves)
+        return Forecast(found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD))
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
