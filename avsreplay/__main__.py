@@ -1,5 +1,6 @@
 """``avsreplay`` and ``python -m avsreplay``: pin the arithmetic, then run the command line."""
 
+import gc
 import sys
 
 from avsreplay import arithmetic
@@ -9,6 +10,7 @@ def main() -> None:
     """Entry point of the command."""
     try:
         arithmetic.pin()  # before anything imports numpy
+        gc.set_threshold(10_000)  # objects between two searches for cycles, of which there are few
         from avsreplay import cli
     except KeyboardInterrupt:
         print("avsreplay: interrupted", file=sys.stderr)  # noqa: T201
