@@ -1,4 +1,4 @@
-"""The data types that the stages exchange: frozen dataclasses with read-only float64 arrays.
+"""The data types that the stages exchange: value classes with read-only float64 arrays.
 
 Frames: {A} camera (inertial), {B} principal axes at the target's centre of mass, {C} grapple fixture, which is
 also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and radians; instants are ``t_ns`` [ns].
