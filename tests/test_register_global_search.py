@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
+import trimesh
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
@@ -297,3 +299,22 @@ def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
     found = rays.decided(np.concatenate([points, missing]), T_ac.inverse(), [], True)
     np.testing.assert_array_equal(found[0].matrix, expected[0].matrix)
     np.testing.assert_array_equal(rays.decided(missing, T_ac.inverse(), None, True)[0].matrix, T_ac.inverse().matrix)
+
+
+def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
+    """Two faces of a wedge fit an L-bracket; they determine no size, and other faces of the bracket are missing."""
+    parts = [trimesh.creation.box((2.0, 0.3, 1.0)), trimesh.creation.box((0.3, 1.5, 1.0))]
+    parts[1].apply_translation((-0.85, 0.7, 0.0))
+    bracket = _mesh(trimesh.util.concatenate(parts))
+    corners = [[0, 0, 0], [1.6, 0, 0], [1.6, 1.4, 0], [0, 1.4, 0], [0, 0, 0.8], [0, 1.4, 0.8]]
+    wedge = _mesh(trimesh.convex.convex_hull(np.array(corners)))
+    registrar = Registrar(bracket)
+    for seed in (78600, 78601):
+        points = scenes.view(scenes.grown(wedge, bracket.extent / wedge.extent), 2000, seed).points
+        found = registrar.acquire(points)
+        assert found.inlier_ratio > 0.95
+        assert found.status in (AlignStatus.IMPLAUSIBLE, AlignStatus.BUDGET_EXHAUSTED)
+
+
+def _mesh(body: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(body.vertices), np.array(body.faces, dtype=np.int32), "", "")

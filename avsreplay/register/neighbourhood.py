@@ -34,6 +34,7 @@ from avsreplay.register.restarts import (
     Restart,
     Restarter,
 )
+from avsreplay.register.size import SIZE_UNSEEN
 
 VALLEY_STEPS, VALLEY_POINTS = 8, 250  # steps of half a gate each way along the two least certain directions; points
 VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
@@ -188,6 +189,11 @@ class Neighbourhood:
         centre = T_ca.apply(few[on]).mean(axis=0)
         info, radius = scaled_information(sums.info, sums.inliers, centre)
         return centre, radius, np.linalg.eigh(info)[1][:, :count].T, at, camera_c
+
+
+def of_many(found: Alignment) -> bool:
+    """Return whether a view shows faces of many bodies: they do not determine the pose, or no error of the size."""
+    return found.status is AlignStatus.DEGENERATE or found.message.startswith(SIZE_UNSEEN)
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:

@@ -27,7 +27,7 @@ from avsreplay.register.covariance import (
 )
 from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import Camera, RegisterParams, RegistrationLimits
-from avsreplay.register.size import LEAST_ERROR, SIGMAS, UNSEEN_ERROR, SizeError, normal_jacobian, size_error
+from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error, size_remark
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 
 CLEARANCE_OF_EXTENT = 0.25
@@ -275,9 +275,7 @@ def _other_size(found: PoseQuality) -> bool:
 def _message(settled: bool, size: SizeError | None, size_1s: float) -> str:
     if not settled:
         return "the back end reports convergence, but its pose is not at a minimum of the distances"
-    if size is not None or SIGMAS * size_1s <= UNSEEN_ERROR:
-        return "" if size is None else size.message
-    return f"the view does not show an error of the size below {100.0 * SIGMAS * size_1s:.1f} %"
+    return size_remark(size, size_1s)
 
 
 def _same(T_ca: Pose, guess: Pose | None) -> bool:

@@ -18,7 +18,7 @@ from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
-from avsreplay.register.neighbourhood import NOT_COMPARED, Neighbourhood
+from avsreplay.register.neighbourhood import NOT_COMPARED, Neighbourhood, of_many
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
@@ -195,7 +195,7 @@ class Registrar:
         if rivals:
             words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
-        elif found.status is AlignStatus.DEGENERATE and self._visibility.sided and not at.covered:
+        elif of_many(found) and self._visibility.sided and not at.covered:
             found = replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
         return found, alone
 

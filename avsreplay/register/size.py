@@ -37,6 +37,7 @@ MOST_OF_MODEL = 1.3  # diameter of a scan over that of the model above which mor
 GROUPED = 3000  # points of a scan in which connected groups are looked for
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
+SIZE_UNSEEN = "the view does not show an error of the size"  # the message of such a view begins with it
 UNSEEN_ERROR = 0.03  # a view in which a larger error would not be significant does not determine the size
 WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used; times that the points are matched
 LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
@@ -72,6 +73,13 @@ class SizeError:
         """The text of the row's message."""
         larger = "larger" if self.delta > 0.0 else "smaller"
         return f"the scan fits a target {100.0 * abs(self.delta):.1f} % {larger} than the model"
+
+
+def size_remark(size: SizeError | None, size_1s: float) -> str:
+    """Return what a row says about the size: its error, or that the view does not show one of 3 %; "" for neither."""
+    if size is not None or SIGMAS * size_1s <= UNSEEN_ERROR:
+        return "" if size is None else size.message
+    return f"{SIZE_UNSEEN} below {100.0 * SIGMAS * size_1s:.1f} %"
 
 
 def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: Array | None) -> SizeError | None:
