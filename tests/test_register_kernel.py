@@ -497,13 +497,17 @@ def test_matches_of_the_alignment_do_not_change_the_evidence(target: Surface, fa
             assert np.asarray(getattr(plain, name)).tobytes() == np.asarray(getattr(begun, name)).tobytes(), name
 
 
-def test_looks_counts_the_points_on_faces_that_face_the_camera(target: Surface) -> None:
+@pytest.mark.parametrize("beyond", [-0.4, -0.01, 0.01, 0.4])
+def test_the_share_of_points_on_faces_towards_the_camera_is_compared_with_the_least(
+    target: Surface, beyond: float
+) -> None:
+    """A quarter of the points decides at 0.4, all of them nearer to their share."""
     model = SurfaceIndex.build(target, 0.4)
     scan, T = scan_of(soup(600, seed=14), 700, 25), Pose(exp([0.1, 0.0, 0.2]), [0.3, -2.0, 0.1])
-    found = model.closest(T.apply(scan[::3]))
+    found = model.closest(T.apply(scan))
     near = found.id >= 0
-    facing = np.sum(found.normal[near] * (T.t - found.foot[near]), axis=1) > 0.0
-    assert model.looks(scan, T, 3) == (np.count_nonzero(near), np.count_nonzero(facing))
+    share = np.mean(np.sum(found.normal[near] * (T.t - found.foot[near]), axis=1) > 0.0)
+    assert model.faces_camera(scan, T, len(scan), float(share + beyond)) is (beyond < 0.0)
 
 
 @pytest.mark.parametrize("count", [150, 1000, 1700])

@@ -78,10 +78,8 @@ class Visibility:
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
-        if not self.may_be_camera(T_ca):
-            return None
-        matched, facing = index.looks(points, T_ca, max(1, len(points) // TESTED_POINTS))
-        return T_ca.t if facing >= LEAST_FACING * matched else None
+        faces = self.may_be_camera(T_ca) and index.faces_camera(points, T_ca, TESTED_POINTS, LEAST_FACING)
+        return T_ca.t if faces else None
 
     def distances(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, most_m: float) -> tuple[Array, int]:
         """Return the distances (n,) [m] of a scan to the faces that the camera sees, at most ``most_m``; the work."""

@@ -281,10 +281,9 @@ class SurfaceIndex:
         found: tuple[Array, int] = self._index.distances(_points(points), T_ca.matrix, most_m, *sight)
         return found
 
-    def looks(self, points: NDArray[Any], T_ca: ArrayLike | Pose, stride: int) -> tuple[int, int]:
-        """Count every ``stride``-th point (n, 3) with a closest point, and those on a face towards the camera."""
-        found: tuple[int, int] = self._index.looks(_points(points), _rigid(T_ca), stride)
-        return found
+    def faces_camera(self, points: NDArray[Any], T_ca: Pose, tested: int, least: float) -> bool:
+        """Return whether at least a share of the faces closest to about ``tested`` points (n, 3) face the camera."""
+        return bool(self._index.faces_camera(_points(points), T_ca.matrix, tested, least))
 
 
 def kernel_module() -> Any:

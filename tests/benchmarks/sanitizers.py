@@ -85,7 +85,7 @@ def use(index, rng: np.random.Generator) -> None:  # type: ignore[no-untyped-def
         lambda: index.icp(points, T, 6, 2, gate, 3.0, 0.001, 1e-6, 1e-6, 1, facing, facing, facing, 0),
         lambda: index.normal_equations(points, T, gate, 1, facing),
         lambda: index.evidence(points, T, gate, side, 6, facing, 1),
-        lambda: index.looks(points, T, int(rng.integers(-1, 5))),
+        lambda: index.faces_camera(points, T, int(rng.integers(-1, 500)), float(rng.random())),
     )
     for call in calls:
         _tried(call)

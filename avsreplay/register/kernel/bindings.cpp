@@ -272,17 +272,13 @@ class Index {
     return nb::make_tuple(found, work);
   }
 
-  nb::tuple looks(nb::handle points, const Doubles& T_ca, int64_t stride) const {
-    require(stride > 0, "the stride must be positive");
+  bool faces_camera(nb::handle points, const Doubles& T_ca, int64_t tested, double least_facing) const {
+    require(tested > 0, "the number of points must be positive");
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
-    Looks found;
-    {
-      nb::gil_scoped_release release;
-      found = avs::looks(store_, code(), v, T.v, stride);
-    }
-    return nb::make_tuple(found.matched, found.facing);
+    nb::gil_scoped_release release;
+    return avs::faces_camera(store_, code(), v, T.v, tested, least_facing);
   }
 
   // Faces with an area, or points.
@@ -615,7 +611,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("threads") = 1, nb::arg("matches").none() = nb::none())
       .def("distances", &Index::distances, nb::arg("points"), nb::arg("T_ca"), nb::arg("most_m"), nb::arg("camera"),
            nb::arg("tested"), nb::arg("least_facing"))
-      .def("looks", &Index::looks, nb::arg("points"), nb::arg("T_ca"), nb::arg("stride"))
+      .def("faces_camera", &Index::faces_camera, nb::arg("points"), nb::arg("T_ca"), nb::arg("tested"), nb::arg("least_facing"))
       .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)

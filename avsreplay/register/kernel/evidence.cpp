@@ -56,7 +56,7 @@ void onto_face(Match& m) {
   for (int a = 0; a < 3; ++a) m.p[a] -= m.e * m.n[a];
 }
 
-constexpr int64_t BLOCK = 32;  // chunks whose matches are held at a time
+constexpr int64_t BLOCK = 8;  // chunks whose matches are held at a time
 
 // The inliers of some chunks, sorted by the patches: those of a patch in the order of the scan.
 class Sorted {
@@ -127,8 +127,7 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
   const Matcher matcher(s, code, v, T, rule, matches);
   const int64_t chunks = matcher.chunks();
   std::vector<Part> parts((size_t)chunks);
-  std::vector<double> errors;
-  errors.reserve((size_t)v.n);
+  std::vector<double> errors((size_t)v.n);
   Sorted sorted(std::min(chunks, BLOCK));
   Numbers numbers;
   Evidence out;
@@ -147,13 +146,15 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
     });
     for (int64_t k = 0; k < many; ++k) {
       const Part& part = parts[(size_t)(first + k)];
+      double* to = errors.data() + out.inliers;
+      for (int i = 0; i < part.inliers; ++i) to[i] = std::fabs(sorted.chunk(k)[i].e);
       out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
       for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
-      for (int i = 0; i < part.inliers; ++i) errors.push_back(std::fabs(sorted.chunk(k)[i].e));
     }
     sorted.add(code, parts.data() + first, many, 1 / rule.side, numbers, out.patches);
   }
   for (double& x : out.centre) x = out.inliers ? x / (double)out.inliers : 0;
+  errors.resize((size_t)out.inliers);
   out.median = median(errors);
   if (out.patches.size() > (size_t)rule.least) return out;
   out.patches.clear();  // too few cubes: every point is a patch
@@ -166,6 +167,17 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
   return out;
 }
 
+namespace {
+
+constexpr double CLEAR = 0.3;  // a share this far from the least one is that of the other points as well
+constexpr int64_t QUARTER = 4;
+
+// Points with a closest point, and those of them on a face that faces t of T.
+struct Looks {
+  int64_t matched = 0, facing = 0;
+};
+
+// Of every `stride`-th point.
 Looks looks(const Store& s, const Code& code, const View& v, const double* T, int64_t stride) {
   Looks found;
   const View few{v.data, (v.n + stride - 1) / stride, v.row * stride, v.column, v.single};
@@ -181,6 +193,17 @@ Looks looks(const Store& s, const Code& code, const View& v, const double* T, in
     }
   }
   return found;
+}
+
+}  // namespace
+
+bool faces_camera(const Store& s, const Code& code, const View& v, const double* T, int64_t tested, double least_facing) {
+  const int64_t stride = std::max<int64_t>(1, v.n / tested);
+  const Looks few = looks(s, code, v, T, QUARTER * stride);
+  const double beyond = (double)few.facing - least_facing * (double)few.matched;
+  if (2 * QUARTER * few.matched >= tested && std::fabs(beyond) > CLEAR * (double)few.matched) return beyond > 0;
+  const Looks all = looks(s, code, v, T, stride);
+  return (double)all.facing >= least_facing * (double)all.matched;
 }
 
 namespace {

@@ -22,11 +22,9 @@ struct PatchRule {
 Evidence evidence(const Store& store, const Code& code, const View& points, const double* T, const PatchRule& rule,
                   Team& team, const Matches* matches);
 
-// How many of every `stride`-th point have a closest point, and how many of those lie on a face that faces t of T.
-struct Looks {
-  int64_t matched = 0, facing = 0;
-};
-Looks looks(const Store& store, const Code& code, const View& points, const double* T, int64_t stride);
+// Whether t of T may be the camera: of about `tested` points of the scan that have a closest point, at least this share has it on
+// a face that faces t. A quarter of them decides where their share is far from the least one.
+bool faces_camera(const Store& store, const Code& code, const View& points, const double* T, int64_t tested, double least_facing);
 
 // Whether only faces that face the camera count: where t of T may be it (`known`), and of about `tested` points that have a
 // closest point at least this share has it on a face that faces t.

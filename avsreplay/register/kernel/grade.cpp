@@ -119,10 +119,7 @@ void measure(const Arrays& sums, const GradeRule& rule, Grade& out) {
 Grade grade(const Store& s, const Code& code, const View& v, const double* T, const GradeRule& rule, Team& team,
             const Matches* matches) {
   PatchRule patches = rule.patches;
-  if (patches.facing) {
-    const Looks seen = looks(s, code, v, T, std::max<int64_t>(1, v.n / rule.tested));
-    patches.facing = (double)seen.facing >= rule.least_facing * (double)seen.matched;
-  }
+  patches.facing = patches.facing && faces_camera(s, code, v, T, rule.tested, rule.least_facing);
   const Evidence e = evidence(s, code, v, T, patches, team, matches);
   const double nan = std::numeric_limits<double>::quiet_NaN();
   Grade out;
