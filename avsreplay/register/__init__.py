@@ -60,7 +60,7 @@ BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 _PLACE_EVERY, _LEAST_PLACES = 2, 12  # scans of which one gives a place, and places that give the size
-_BLOCKS = 6  # of consecutive places, for the jackknife
+_PLACE_POINTS, _BLOCKS = 500, 6  # points of each, and blocks of consecutive places, for the jackknife
 _LEAST_EXPLAINED = 0.5  # least share, explained by the size, of what a uniform motion leaves of the places
 _DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
 _DURATION_POINTS = 800
@@ -171,7 +171,7 @@ class ModelCheck:
         if (self._placed - 1) % self._stride:
             return
         T_ca = T_ac.inverse()
-        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, POINTS)], dtype=np.float64))
+        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, _PLACE_POINTS)], dtype=np.float64))
         found = _place_of_size(self._registrar.index, p, T_ca.t if self._registrar.sided else None)
         if found is None:
             return
