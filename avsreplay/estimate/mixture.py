@@ -23,7 +23,7 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import MOST_RAD, forecast_of, torque_density, translation
-from avsreplay.estimate.error_state import DIM, rotation
+from avsreplay.estimate.error_state import DIM, definite, rotation
 from avsreplay.estimate.noise import BOUND, cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
@@ -147,9 +147,8 @@ def carried(
             pair,
             weight,
         )
-        found.append(
-            (Component(c.weight, c.quadrature, t_ns, Chart(chart), P, c.share, Chart(reference)), chi2 + log_det)
-        )
+        after = Component(c.weight, c.quadrature, t_ns, Chart(chart), definite(P), c.share, Chart(reference))
+        found.append((after, chi2 + log_det))
     best = min(value for _, value in found)
     weights = [c.weight * math.exp(0.5 * (best - value)) for c, value in found]
     total = sum(weights)
