@@ -19,13 +19,14 @@ checked before a run (``preflight``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
@@ -69,7 +70,7 @@ _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Place:
     """Position (3,) of the origin of {C} in {A} [m] at ``t_ns``, its change (3,) with the size, its attitude (3, 3).
 
