@@ -35,16 +35,14 @@ from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import allowed_scans
 from avsreplay.register.sampling import without_scattered_points
 from avsreplay.register.size import (
-    LEAST_RESIDUALS,
     MOST_OF_MODEL,
     SIGMAS,
-    WIDTH_OF_EXTENT,
     diameter,
     fitted_duration,
     fitted_size,
+    matched_points,
     noise_bias,
     normal_jacobian,
-    robust_weights,
 )
 from avsreplay.register.surface_index import SurfaceIndex
 
@@ -163,9 +161,8 @@ class ModelCheck:
         block = np.arange(len(y)) * _BLOCKS // len(y)
         delta, left = _last_unknown(A, y)
         without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(_BLOCKS)])
-        spread = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((without - without.mean()) ** 2)))
         uniform = _last_unknown(A[:, :, :9], y)[1]
-        return (1.0 + delta, spread) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
+        return (1.0 + delta, _spread(without)) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
 
     def _add_place(self, scan: Scan, T_ac: Pose) -> None:
         self._placed += 1
@@ -299,13 +296,11 @@ def _place_of_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> tup
     Returns the translation (3,) of the origin of {C} [m], its change (3,) with delta [m], both in {C}, and the standard
     error of the translation [m]; None with fewer than 50 residuals.
     """
-    found = index.closest(p, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
-    near = np.isfinite(found.d2)
-    if np.count_nonzero(near) < LEAST_RESIDUALS:
+    matched = matched_points(index, p, camera_c)
+    if matched is None:
         return None
-    n, q = found.normal[near], p[near]
-    e = np.einsum("ij,ij->i", n, q - found.foot[near])
-    weight, noise = robust_weights(e)
+    near, n, _, e, weight, noise = matched
+    q = p[near]
     J, a = weight[:, None] * normal_jacobian(q, n), weight * np.einsum("ij,ij->i", q, n)
     of_e, of_a = np.linalg.lstsq(J, np.column_stack([weight * e, a]), rcond=1e-6)[0].T
     return of_e[3:], -of_a[3:], noise * float(np.sqrt(np.trace(np.linalg.pinv(J.T @ J)[3:, 3:])))
@@ -324,6 +319,10 @@ def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:
     """Weighted mean of values, its standard error, and the weights, at most ``MOST_WEIGHT`` times their median."""
     weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
     without = (weight @ values - weight * values) / (weight.sum() - weight)
-    n = len(values)
-    spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-    return float(weight @ values / weight.sum()), spread, weight
+    return float(weight @ values / weight.sum()), _spread(without), weight
+
+
+def _spread(without: Array) -> float:
+    """Standard error of an estimate by the jackknife: from its values (n,) without one of n parts of the data each."""
+    n = len(without)
+    return float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))

@@ -52,11 +52,8 @@ from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 LEAST_FOR_BIAS = 30  # with fewer points on the model no scan is simulated
 BIAS_ROUNDS, SMALL_STEP = 4, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
-RAY_STEPS, GRAZING, ON_SURFACE = (
-    2,
-    0.05,
-    0.002,
-)  # steps along a ray to the model; least cosine; distance over the extent
+RAY_STEPS, GRAZING = 2, 0.05  # steps along a ray to the model; least cosine between the ray and the normal
+ON_SURFACE = 0.002  # distance over the extent within which these steps end on the model
 
 
 @value_class

@@ -236,14 +236,10 @@ def _step(
 
     ``motion``: (n, 3) displacement of the points by a unit of the parameter; None: the parameter is the size.
     """
-    found = index.closest(q, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
-    near = np.isfinite(found.d2)
-    if np.count_nonzero(near) < LEAST_RESIDUALS:
+    if (matched := matched_points(index, q, camera_c)) is None:
         return None
-    n, q, foot = found.normal[near], q[near], found.foot[near]
-    centre = q.mean(axis=0)
-    e = np.einsum("ij,ij->i", n, q - foot)
-    weight, noise = robust_weights(e)
+    near, n, foot, e, weight, noise = matched
+    q, centre = q[near], q[near].mean(axis=0)
     moving = q - centre if motion is None else motion[near]
     J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, moving)
     of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
@@ -255,10 +251,21 @@ def _step(
     return _Rows(q, foot, n, J, free, left, weight, noise, step, Pose.identity()), of_e - step * of_a, centre
 
 
-def robust_weights(e: Array) -> tuple[Array, float]:
-    """Return the square roots (k,) of the Cauchy weights of residuals e (k,) [m], and their robust 1 sigma [m]."""
+def matched_points(
+    index: SurfaceIndex, p: Array, camera_c: Array | None
+) -> tuple[NDArray[np.bool_], Array, Array, Array, Array, float] | None:
+    """Return a mask (n,) of the points p (n, 3) near the model, and what follows for these k; None for fewer than 50.
+
+    Normals and closest points (k, 3), residuals and square roots of their Cauchy weights (k,), their robust 1 sigma.
+    """
+    found = index.closest(p, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
+    near = np.isfinite(found.d2)
+    if np.count_nonzero(near) < LEAST_RESIDUALS:
+        return None
+    n, foot = found.normal[near], found.foot[near]
+    e = np.einsum("ij,ij->i", n, p[near] - foot)
     noise = max(float(np.median(np.abs(e))) / NORMAL_QUANTILE, np.finfo(float).tiny)
-    return 1.0 / np.sqrt(1.0 + (e / (CAUCHY * noise)) ** 2), noise
+    return near, n, foot, e, 1.0 / np.sqrt(1.0 + (e / (CAUCHY * noise)) ** 2), noise
 
 
 def _clustered(rows: _Rows, side_m: float) -> float:
