@@ -378,7 +378,7 @@ struct Table {
     require(places.ndim() == 2 && places.shape(0) == m && places.shape(1) == 3, "places must be (m, 3)");
     require(extent > 0 && side > 0, "extent and patch size must be positive");
     table = {(int64_t)m, normals.data(), gradients.data(), offsets.data(), errors.data(), places.data(), counts.data(),
-             {centre[0], centre[1], centre[2]}, extent, side, {}, {}};
+             {centre[0], centre[1], centre[2]}, extent, side, {}};
     complete(table);
   }
 };

@@ -73,6 +73,15 @@ Six pseudo_root(Six N) {
   return V;
 }
 
+// W W'.
+Six squared(const Six& W) {
+  Six A;
+  for (int k = 0; k < 6; ++k)
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) A.v[i][j] += W.v[i][k] * W.v[j][k];
+  return A;
+}
+
 // (I - A)^-1/2 x with A = W' N_p W: with residuals of independent noise, the sum of its squares over the patches has
 // the identity times the variance as its mean (bias-reduced linearisation).
 std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double, 6> x) {
@@ -258,7 +267,7 @@ Six total(const double* normals, int64_t m, const uint8_t* keep) {
 
 void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep) {
   for (;;) {
-    const Six N = total(normals, m, keep), inverse = pseudo_inverse(N), W = pseudo_root(N);
+    const Six W = pseudo_root(total(normals, m, keep)), inverse = squared(W);
     std::vector<uint8_t> left(keep, keep + m);
     int64_t points = 0, dropped = 0;
     for (int64_t k = 0; k < m; ++k) {

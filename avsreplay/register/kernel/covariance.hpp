@@ -21,8 +21,8 @@ struct PatchTable {
   double extent, side;  // of the model, and of a patch [m]
 
   // What follows from these, see `complete`.
-  Six total, inverse;              // of the normals, and its pseudo-inverse
-  std::vector<int64_t> block = {}; // the number of the block of each patch, in the order of the blocks' places
+  Six inverse;                      // pseudo-inverse of the sum of the normals
+  std::vector<int64_t> block = {};  // the number of the block of each patch, in the order of the blocks' places
   int64_t blocks = 0;
 };
 

@@ -104,7 +104,7 @@ void measure(const Arrays& sums, const GradeRule& rule, Grade& out) {
   const int64_t directions = (int64_t)rule.across.size() / 3;
   const double* c = out.centre;
   PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
-                   sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side, {}, {}};
+                   sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side, {}};
   complete(table);
   Systematic errors;
   if (rule.systematic || directions) errors = systematic_errors(table);

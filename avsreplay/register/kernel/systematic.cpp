@@ -286,7 +286,7 @@ void couple(const PatchTable& t, int64_t p, const double (&T)[3][6], Coupling& A
 }
 
 void complete(PatchTable& t) {
-  t.total = total(t.normals, t.m), t.inverse = pseudo_inverse(t.total);
+  t.inverse = pseudo_inverse(total(t.normals, t.m));
   std::vector<std::array<double, 3>> cube((size_t)t.m);
   std::vector<int64_t> order((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
