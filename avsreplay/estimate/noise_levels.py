@@ -18,7 +18,6 @@ The density of a disturbance is the mean over all candidates, none among them, w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -146,14 +145,14 @@ def _expected(log_odds: Array) -> float:
     return math.pow(mean, 2.0 / 3.0)
 
 
-def _marginal(theta: Array, k: int, parts: Sequence[Array], data: _Residuals) -> tuple[float, Array]:
+def _marginal(theta: Array, k: int, parts: _Components, data: _Residuals) -> tuple[float, Array]:
     """Log likelihood of the poses without disturbance k, and its increase (n,) with the squares of ``_DENSITIES``.
 
     It is marginal over the initial values, without its constant.
     """
     without = theta.copy()
     without[k] = 0.0
-    return _density_odds(_covariance(without, parts), parts[k], data)
+    return _density_odds(_covariance(without, parts), parts.effects[k - 4], data)
 
 
 def _position_odds(theta: Array, rows: PositionRows) -> Array:
@@ -164,11 +163,11 @@ def _position_odds(theta: Array, rows: PositionRows) -> Array:
 
 def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array]:
     """``_marginal`` for a disturbance with these ``effects`` (m, k) beside noise V; one decomposition gives it."""
-    root = np.linalg.cholesky(V)
-    inverse, prior = np.linalg.inv(root), np.linalg.cholesky(data.info).T
-    columns = np.vstack([inverse @ effects, np.zeros((len(prior), effects.shape[1]))])
-    Q, R = np.linalg.qr(np.vstack([inverse @ data.J, prior]))
-    e = np.concatenate([inverse @ data.e, prior @ data.off])
+    root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
+    white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
+    columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
+    Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
+    e = np.concatenate([white[:, -1], prior @ data.off])
     left = e - Q @ (Q.T @ e)
     values, vectors = np.linalg.eigh(columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns))
     along = vectors.T @ (columns.T @ left)
@@ -178,10 +177,10 @@ def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Ar
     return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
 
 
-def _slack(e: Array, theta: Array, parts: Sequence[Array]) -> float:
+def _slack(e: Array, theta: Array, parts: _Components) -> float:
     """Mean square of the residuals over that of the pose errors, with a margin for the largest."""
     n = len(e) // 6
-    noise = np.concatenate([np.tile(np.diagonal(theta[b] * parts[b] + theta[2 + b] * parts[2 + b]), 3) for b in (0, 1)])
+    noise = np.concatenate([np.diagonal(block) for block in _pose_errors(theta, parts)])
     return 1.0 + _LARGEST * max(float(np.sum(e * e / noise)) / (6 * n) - 1.0, 0.0)
 
 
@@ -228,10 +227,23 @@ class _Residuals:
     off: Array
 
 
+@value_class
+class _Components:
+    """The six components at unit factors.
+
+    Attributes:
+        C: their covariances; of the errors of attitude and position (3n, 3n), of the disturbances (6n, 6n).
+        effects: (6n, 3(n - 1)) of torque and of force, the roots of their covariances.
+    """
+
+    C: tuple[Array, ...]
+    effects: tuple[Array, Array]
+
+
 def _linearised(
     points: Poses, problem: Problem, others: tuple[Array, Array] | None = None
-) -> tuple[_Residuals, Sequence[Array]]:
-    """Residuals about the chart of ``problem``, and the covariances of the six components."""
+) -> tuple[_Residuals, _Components]:
+    """Residuals about the chart of ``problem``, and the six components."""
     e, H = problem.core.rows()
     J = np.ascontiguousarray((H @ to_errors(problem.chart)).transpose(1, 0, 2)).reshape(6 * len(points), -1)
     info, off = problem.prior.info, problem.chart.minus(problem.prior.mean)
@@ -243,31 +255,29 @@ def _linearised(
     return _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, info, off), _components(points, problem, H)
 
 
-def _covariance(theta: Array, parts: Sequence[Array]) -> Array:
+def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
+    """Covariances (3n, 3n) of the errors of the poses, attitude and position."""
+    return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(BLOCKS)]
+
+
+def _covariance(theta: Array, parts: _Components) -> Array:
     """V (6n, 6n) of the residuals."""
-    n = len(parts[0])
-    V = np.zeros((6 * n, 6 * n))
-    for density, columns in zip(theta[4:], parts[4:], strict=True):
+    V, half = np.zeros_like(parts.C[4]), len(parts.C[0])
+    V[:half, :half], V[half:, half:] = _pose_errors(theta, parts)
+    for density, C in zip(theta[4:], parts.C[4:], strict=True):
         if density > 0.0:
-            V += density * (columns @ columns.T)
-    for axis in range(6):
-        b, here = axis // 3, slice(axis * n, axis * n + n)
-        V[here, here] += theta[b] * parts[b] + theta[2 + b] * parts[2 + b]
-    return np.asarray(V)
+            V += density * C
+    return V
 
 
-def _components(points: Poses, problem: Problem, H: Array) -> Sequence[Array]:
-    """The six components at unit factors.
-
-    For the errors of the poses their covariance (n, n), the same for three axes; for the disturbances columns
-    (6n, 3(n - 1)), their covariance being columns columns'.
-    """
+def _components(points: Poses, problem: Problem, H: Array) -> _Components:
     n = len(points)
-    white, common = error_parts(points)
+    white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
     f = problem.factors**-2.0
-    torque, force = _disturbances(points.times_s, problem.chart, H)
-    columns = [np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in (torque, force)]
-    return (white * f[0], white * f[1], common * f[0], common * f[1], *columns)
+    found = _disturbances(points.times_s, problem.chart, H)
+    torque, force = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in found)
+    noise = white * f[0], white * f[1], common * f[0], common * f[1]
+    return _Components((*noise, torque @ torque.T, force @ force.T), (torque, force))
 
 
 def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]:
@@ -286,27 +296,19 @@ def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]
     return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1)
 
 
-def _improved(theta: Array, open_: NDArray[np.bool_], parts: Sequence[Array], data: _Residuals, points: Poses) -> Array:
+def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: _Residuals, points: Poses) -> Array:
     """Variance components (6,) after one step of average information from theta (6,)."""
-    n = len(points)
     inverse = np.linalg.inv(_covariance(theta, parts))
     VJ = inverse @ data.J
     G = np.linalg.inv(data.J.T @ VJ + data.info)
     moved = -G @ (VJ.T @ data.e + data.info @ data.off)
     left = data.e + data.J @ moved
     P, Py = inverse - VJ @ G @ VJ.T, inverse @ left
-    applied, traces = np.zeros((6, 6 * n)), np.zeros(6)
-    for k in range(6):
-        if not open_[k]:
-            continue
-        if k >= 4:
-            applied[k] = parts[k] @ (parts[k].T @ Py)
-            traces[k] = float(np.sum(parts[k] * (P @ parts[k])))
-            continue
-        for axis in range(3 * (k % 2), 3 * (k % 2) + 3):
-            here = slice(axis * n, axis * n + n)
-            applied[k, here] = parts[k] @ Py[here]
-            traces[k] += float(np.sum(P[here, here] * parts[k]))
+    applied, traces, half = np.zeros((6, len(Py))), np.zeros(6), len(parts.C[0])
+    for k in np.flatnonzero(open_).tolist():
+        here, C = slice(None) if k >= 4 else slice(half * (k % 2), half * (k % 2) + half), parts.C[k]
+        applied[k, here] = C @ Py[here]
+        traces[k] = float(np.sum(C * P[here, here]))
     score = 0.5 * (applied @ Py - traces)
     info = 0.5 * (applied @ P @ applied.T)
     for k, (dof, size) in enumerate(_priors(points)):
@@ -318,8 +320,7 @@ def _improved(theta: Array, open_: NDArray[np.bool_], parts: Sequence[Array], da
 
 def _priors(points: Poses) -> list[tuple[float, float]]:
     """Degrees of freedom and mean of what is known of the first four components besides the normal points."""
-    out = []
-    share = mean_share(points)
+    out, share = [], mean_share(points)
     for b in range(BLOCKS):
         dof, total = _CLAIMED_DOF, _CLAIMED_DOF
         if points.within is not None:
