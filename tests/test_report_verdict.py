@@ -40,10 +40,11 @@ def test_a_good_run_passes(make_rows):
 
 
 def test_no_healthy_scan_fails(make_rows):
-    rows = _good(make_rows, gamma=0, reason="not_aligned", nis=None, converged=False)
+    rows = _good(make_rows, gamma=0, reason="not_aligned", nis=None, converged=False, pos_err_m=7.0, rot_err_deg=90.0)
     found = _judged(rows)
     assert found.grade is Grade.FAIL
     assert "none of the 100 scans was used (mostly not aligned)" in found.line
+    assert not any("error" in reason.text for reason in found.reasons)  # errors of a start that nothing corrected
 
 
 def test_one_used_scan_of_35_fails(make_rows):

@@ -124,7 +124,7 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
     found = (
         _use(rows, summary),
-        _errors(rows, extent_m),
+        _errors(rows, extent_m) if summary.healthy else (),  # without a used scan there is no estimate to judge
         _faults(summary, extent_m),
         _filter(rows, summary),
         _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
