@@ -24,11 +24,11 @@ Importing the package loads no other module; the public names are loaded when th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # the command starts this package twice, and the module typing would be loaded for nothing
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+    from typing import Any
 
     from avsreplay.config import RunConfig
     from avsreplay.errors import AvsError

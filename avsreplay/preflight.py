@@ -53,8 +53,12 @@ def _faces(surface: Surface | None) -> list[Advice]:
 
 def _sampled(source: Source) -> list[Scan]:
     """A few scans, spread evenly over the log."""
-    wanted = np.unique(np.linspace(0, len(source) - 1, SCANS).astype(int)).tolist() if len(source) else []
-    return [source.scan_at(seq) for seq in wanted]
+    return [source.scan_at(seq) for seq in _spread(len(source), SCANS)]
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most ``most`` of the numbers below ``count``, spread evenly."""
+    return sorted({int(k) for k in np.linspace(0, count - 1, most)}) if count else []
 
 
 def _contents(
@@ -74,8 +78,7 @@ def _contents(
 
 def _poses(source: Source, surface: Surface | None) -> list[Advice]:
     """Measured poses: how many of a sample are valid, where their covariance comes from, and the size of the target."""
-    wanted = np.unique(np.linspace(0, len(source) - 1, _POSES).astype(int)).tolist() if len(source) else []
-    found = [source.scan_at(seq) for seq in wanted]
+    found = [source.scan_at(seq) for seq in _spread(len(source), _POSES)]
     bad = [scan for scan in found if scan.pose is None]
     out = [Advice("ok", "poses", f"{len(source)} measured poses")]
     if bad:

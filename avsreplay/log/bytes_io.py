@@ -12,6 +12,7 @@ from avsreplay.errors import UnreadableInput
 # C0 and C1 control characters, bidirectional marks, zero-width characters and lone surrogates.
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _SMALL, _BLOCK = 256, 1 << 16  # small reads (record heads) are served from one cached block
+ROS1_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"SQLite format 3\x00"  # first bytes of the files of ROS bags
 _PER_THREAD = threading.local()  # a decompressor is expensive to create and may serve one thread at a time
 
 

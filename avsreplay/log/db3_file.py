@@ -15,7 +15,6 @@ from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import Recording, Sink, canonical_type
 from avsreplay.log.options import Loss
 
-SQLITE_MAGIC = b"SQLite format 3\x00"
 # ValueError: an error message of sqlite may contain bytes that are not UTF-8.
 _SQLITE = (sqlite3.Error, OverflowError, ValueError)
 _HEAD = 64  # the first bytes of a cloud message contain its header stamp

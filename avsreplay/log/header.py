@@ -13,11 +13,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import logging
 import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -141,7 +141,6 @@ def _to_belief(values: Any) -> Belief | None:
 
 MAX_BYTES = 512 << 20
 LEAST_EXTENT_M = 1e-6  # squares of a part of it must not underflow
-_SILENT = logging.NullHandler()
 _FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
 MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
 # Exceptions that trimesh raises for malformed files.
@@ -276,13 +275,21 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
             raise BadFile(f"declares {promised} triangles in a file of {len(data)} bytes")
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
     # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
-    logging.getLogger("trimesh").addHandler(_SILENT)  # trimesh logs tracebacks before it tries another way
+    _silence_trimesh()
     with np.errstate(all="ignore"):
         loaded: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
     vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
         raise BadFile("no triangles in three dimensions")
     return _merged(vertices, faces)
+
+
+@cache
+def _silence_trimesh() -> None:
+    """Discard the tracebacks that trimesh logs before it tries another way."""
+    import logging
+
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:

@@ -12,15 +12,13 @@ import numpy as np
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import streams
-from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
+from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
 from avsreplay.log.header import HEADER_RECORD, decode_header, in_metres, octahedron, parse_surface, read_surface
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, MessageClouds, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
 from avsreplay.log.options import Loss, SourceOptions, TopicInfo
 from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
-from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
 from avsreplay.log.writer import TRUTH_TOPIC
@@ -240,8 +238,12 @@ def _open_recording(path: Path, limit: int, sinks: dict[str, Sink], upto: int | 
 def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
     head = _head(path)
     if head.startswith(ROS1_MAGIC):
+        from avsreplay.log.ros1_bag import Ros1Bag
+
         return Ros1Bag(path, limit, sinks)
     if head == SQLITE_MAGIC:
+        from avsreplay.log.db3_file import Db3File
+
         return Db3File(path, limit, sinks)
     if head.startswith(b"#ROSBAG"):
         raise UnreadableInput("a ROS bag older than format 2.0", where=shown(path), hint="migrate it with rosbag fix")
@@ -317,11 +319,8 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
 def _pose_file(path: Path) -> Path | None:
     found = sorted({p for pattern in ("*.conf", "*.tum", "poses.txt") for p in path.glob(pattern) if p.is_file()})
     if len(found) > 1:
-        raise UsageError(
-            f"several pose files: {', '.join(shown(p.name) for p in found)}",
-            where=shown(path),
-            hint="choose one with --truth",
-        )
+        names = ", ".join(shown(p.name) for p in found)
+        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth")
     return found[0] if found else None
 
 
