@@ -8,12 +8,12 @@ units, a search for the pose decides.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.log import SourceOptions
 from avsreplay.log.header import scaled
@@ -48,7 +48,7 @@ _UNITS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Advice:
     """One finding.
 

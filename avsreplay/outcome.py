@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 
 from avsreplay.errors import value_class
@@ -168,7 +168,7 @@ class Outcome:
     plan: Plan | None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class PoseError:
     """Difference of two poses: distance of their origins [m] and angle between their attitudes [deg]."""
 
@@ -176,7 +176,7 @@ class PoseError:
     angle_deg: float
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class CaptureError:
     """Gripper against true grasp point at the planned instant; NaN where the truth is not known at that instant."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.files import STDOUT
 from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
@@ -45,7 +45,7 @@ class RecordOptions:
     fault_seed: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Recorded:
     """What a recording contains.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -24,7 +23,7 @@ Value = Callable[[Outcome, Score], T]
 """Takes the value of a column from an outcome and its score."""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Column:
     """Metadata of a row field.
 

@@ -16,6 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from avsreplay.errors import value_class
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
@@ -194,7 +196,7 @@ def given(value: float | None) -> float:
     return value
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Entry:
     """One setting of a tree of tables: full dotted key, declaration, type and default (MISSING: must be given)."""
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.settings import Entry, SettingError, dump, entries
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Document:
     """A parsed TOML text; ``origins`` names the source of keys that do not come from this text."""
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from avsreplay.cli.options import PATH, check_outputs, read_result
-from avsreplay.errors import DataLost, UsageError
+from avsreplay.errors import DataLost, UsageError, value_class
 from avsreplay.files import output_text
 from avsreplay.report import gate as gates
 from avsreplay.report.compare import METRICS, metrics
@@ -147,7 +147,7 @@ def _check_sources(runs: Sequence[Result]) -> None:
             raise DataLost(what, where="--gate", hint="run again")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Group:
     """A result, or several (one per seed or log) in a folder."""
 

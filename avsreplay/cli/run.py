@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import click
 from avsreplay.cli.config import run_settings, take_run_settings
 from avsreplay.cli.options import PATH, StartMode, check_outputs, given_paths, log_file, pose_options, read_options
 from avsreplay.cli.options import run_source_options as source_options
-from avsreplay.errors import CheckFailed, DataLost, UsageError
+from avsreplay.errors import CheckFailed, DataLost, UsageError, value_class
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -113,7 +113,7 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
         _report_losses(run)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value_class(kw_only=True, eq=True)
 class Wanted:
     """The options that select the outputs of a run."""
 
@@ -177,7 +177,7 @@ class Outdated(Exception):
     """What was recorded later changes rows of a log that has grown: it is replayed again."""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Finished:
     """Result of a replay; ``record`` is the content of ``run.json``."""
 

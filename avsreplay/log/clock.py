@@ -17,10 +17,11 @@ Scans are ordered by log time, then by file order. The rules for ``ClockChoice.H
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.log.options import ClockChoice, ClockSummary
 
 _FLOOR_NS = 500_000_000
@@ -30,7 +31,7 @@ _CONFIRM = 3
 _FOLLOW = 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Placed:
     """A time on the chosen clock, and the reason if it is not the stamp of the scan."""
 

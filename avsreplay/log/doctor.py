@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.files import check_output, output_path
 from avsreplay.geometry import Array
 from avsreplay.log.bytes_io import BadMessage, shown
@@ -40,7 +40,7 @@ class Severity(Enum):
     ERROR = "error"  # part of the log cannot be read
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Finding:
     """One finding: severity, subject, text, and the file offsets or scan numbers that it refers to."""
 

@@ -6,10 +6,11 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Protocol
 
+from avsreplay.errors import value_class
 from avsreplay.log.bytes_io import BadMessage, ByteFile
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -22,7 +23,7 @@ _KNOWN, _MOST_FOREIGN = frozenset(range(1, 16)), 10_000  # a chunk of zeros is m
 _SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Channel:
     """A channel with the name, encoding and text of its schema."""
 
@@ -35,7 +36,7 @@ class Channel:
     metadata: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ChunkHead:
     """The fields before a chunk's data; ``data_at`` is the offset of the data from the record's opcode."""
 
@@ -160,7 +161,7 @@ _SEARCHED = 4 << 20
 _FOOTER_HEAD = b"\x02\x14\x00\x00\x00\x00\x00\x00\x00"
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class SummarySection:
     """The summary section.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
+from avsreplay.errors import value_class
 from avsreplay.settings import Settings, setting
 
 ASSUMED_HZ = 1.0  # rate of scans or poses without times
@@ -163,7 +164,7 @@ class SourceOptions(Settings):
         return start, min(end, start + self.duration_s) if self.duration_s is not None else end
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Loss:
     """A part of a log that could not be read.
 
@@ -187,7 +188,7 @@ class Loss:
     file: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class TopicInfo:
     """A topic of a log with its message type, encoding and count, and its first and last time on the log clock [ns]."""
 
@@ -206,7 +207,7 @@ class TopicInfo:
         return (self.count - 1) / ((self.last_ns - self.first_ns) * 1e-9)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ClockSummary:
     """How the times of the scans were determined.
 
@@ -238,7 +239,7 @@ class ClockSummary:
         return self.unset + self.jumps + self.equal + self.back
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class LogInfo:
     """The description of a source that ``avsreplay info`` prints.
 

@@ -23,7 +23,7 @@ _TYPES = {
 _MAX_HEADER = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Property:
     name: str
     kind: str

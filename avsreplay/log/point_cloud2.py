@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,7 @@ _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity")
 _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Field:
     """A PointField: name, byte offset, numpy type (``f4``) and count."""
 
@@ -32,7 +32,7 @@ class Field:
     count: int
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Layout:
     """The description of a cloud and its undecoded points.
 

@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from avsreplay.binary_files import read_limited
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import MeasuredPose, Pose, matrix, normalise
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.pose_messages import pose_of_numbers
@@ -27,7 +26,7 @@ _MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
 _MAX_METRES = 1e9
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class TimedPoses:
     """Poses in file order, with their times [ns] if the format has times."""
 
@@ -145,7 +144,7 @@ def _bmesh_pose(words: list[str], where: str) -> Pose:
     return Pose(q_ac, -matrix(q_ac) @ values[:3])
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class MeasuredFile:
     """The measured poses of a file, in its order.
 
@@ -200,7 +199,7 @@ def read_measured(path: Path) -> MeasuredFile:
     return MeasuredFile(tuple(poses), tuple(times) or None)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Columns:
     """Where a CSV with a header has time and pose, and the factor from its unit of length to metres."""
 

@@ -6,11 +6,11 @@ import math
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, MeasuredPose, Pose, frozen
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
@@ -20,7 +20,7 @@ from avsreplay.records import State
 _MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Transform:
     """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an Odometry message.
 

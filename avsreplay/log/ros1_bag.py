@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from avsreplay.log.bytes_io import BadMessage, ByteFile
+from avsreplay.errors import value_class
+from avsreplay.log.bytes_io import ROS1_MAGIC, BadMessage, ByteFile
 from avsreplay.log.index import ChunkStore, Recording, Sink, canonical_type
 from avsreplay.log.mcap_format import ChunkHead, Fields
 from avsreplay.log.options import Loss
 
-ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
 _FIRST_WINDOW, _WINDOW, _MARGIN = 1 << 12, 1 << 20, 128
@@ -25,7 +25,7 @@ _MAX_CANDIDATES, _MAX_LOSSES = 20_000, 10_000
 _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Record:
     """The header fields of a record and the position of its data."""
 

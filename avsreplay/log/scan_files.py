@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.binary_files import BadFile, parse_npy, read_members
-from avsreplay.errors import MissingBackend, UnreadableInput
+from avsreplay.errors import MissingBackend, UnreadableInput, value_class
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
 
@@ -147,7 +146,7 @@ _MAX_HEADER = 1 << 16
 _MAX_RATIO = 256  # three bytes of LZF decompress to at most 264
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Header:
     names: tuple[str, ...]
     kinds: tuple[str, ...]

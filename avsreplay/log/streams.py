@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from avsreplay.binary_files import BadFile
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import MessageClouds, Recording, Sink
@@ -186,7 +186,7 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 """(time [ns], number of the scan, frame of the cloud) -> T_ac or None."""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class GroundTruth:
     """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track.
 

@@ -54,7 +54,7 @@ class Gramian:
     scale: Array
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Observability:
     """The Gramian in numbers.
 

@@ -215,7 +215,7 @@ class ConsistencyTrack:
     white: Array
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ConsistencyReport:
     """The window in numbers, None before there are enough scans.
 
@@ -279,7 +279,7 @@ class Consistency:
         return self._bands[n]
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ConvergenceTrack:
     """The state of the test.
 

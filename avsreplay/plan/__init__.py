@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +39,7 @@ Motion = Callable[[Array], tuple[Array, Array, Array]]
 """Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4) of {C} in {A}."""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Miss:
     """Error of a plan at its planned end against ground truth.
 
@@ -200,7 +200,7 @@ def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     return at
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Flights:
     """Results of whole flights with replanning.
 

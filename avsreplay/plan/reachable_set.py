@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 
 Vector = list[float]
@@ -33,7 +34,7 @@ _GAUSS = tuple(zip(_GAUSS_S.tolist(), _GAUSS_W.tolist(), strict=True))
 _FLOOR = 1e-150
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Gauge:
     """The boundary point of K in a given direction.
 

@@ -249,7 +249,7 @@ def _first_bound(goal: SampledGoal, a_max: float) -> float:
     return min(max(by_distance, speed / pull), goal.end)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Margin:
     """Local behaviour of G for one normal: n0 = |P0 - P1|, n1 = |P1|, and the slope dG/dt."""
 

@@ -16,6 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan.limits import Scene
 from avsreplay.settings import Settings, setting
@@ -76,7 +77,7 @@ class SupervisorParams(Settings):
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value_class(kw_only=True, eq=True)
 class Facts:
     """Input of the supervisor after one scan.
 
@@ -105,7 +106,7 @@ class Facts:
     margin: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class SupervisorMemory:
     """State of the supervisor carried from scan to scan.
 
@@ -129,7 +130,7 @@ class SupervisorMemory:
     attempts: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Decision:
     """The selected action and the name of the rule that selected it."""
 
@@ -137,7 +138,7 @@ class Decision:
     rule: str
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Condition:
     """``measure compare bound``; a bound given as text is the name of a parameter."""
 
@@ -146,7 +147,7 @@ class Condition:
     bound: float | str
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Rule:
     """An action, the conditions that must all hold for it, and the reason in words."""
 

@@ -38,7 +38,7 @@ class Tolerance:
                 raise ValueError(f"{name} is {value}, must be a finite number above 0")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Band:
     """Mean, standard deviation, 5 % and 95 % quantile over the futures."""
 
@@ -48,7 +48,7 @@ class Band:
     p95: float
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Spread:
     """Distribution of capture time and terminal errors over the belief.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -196,7 +196,7 @@ def meshed(made: Reconstruction) -> tuple[Surface, float]:
     return surface, float(area[kept > 1.5 * made.spacing_m].sum() / max(area.sum(), 1e-30))
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Region:
     """A part of the target that differs from its CAD model.
 

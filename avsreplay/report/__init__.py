@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import compress, pairwise
 from operator import not_
 from typing import Any
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
@@ -40,7 +41,7 @@ _STATES = ("t_ns", "t_s", "gamma", "fault", "status", "reason", "cauchy_weight",
 _TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL, *Capture.COLUMNS, *VelocityChange.COLUMNS)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Errors:
     """Position [m] and rotation [deg] errors over the same scans; None without truth."""
 
@@ -48,7 +49,7 @@ class Errors:
     rotation_deg: Statistics | None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Share:
     """A chi-square statistic: its median and the shares of scans inside and above the two-sided 95 % band."""
 
@@ -60,7 +61,7 @@ class Share:
     high: float
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ObservabilitySummary:
     """The Gramian at the last scan, and the time of the first scan at which its rank was 20 (None: never)."""
 
@@ -70,7 +71,7 @@ class ObservabilitySummary:
     full_rank_s: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class ConvergenceSummary:
     """t_1: time of the first scan whose estimate the planner may use; whether it holds at the end; times withdrawn."""
 
@@ -79,7 +80,7 @@ class ConvergenceSummary:
     withdrawn: int
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Summary:
     """The results of a run as a whole.
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+from avsreplay.errors import value_class
 from avsreplay.report import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
 from avsreplay.settings import dump, entries
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Metric:
     """One metric of a run: name with its unit as suffix, unit, meaning, function (None without a value)."""
 

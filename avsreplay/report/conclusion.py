@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.report import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.charts import values
@@ -92,7 +92,7 @@ class ComparedRun(Protocol):
     def header(self) -> Mapping[str, Any]: ...  # noqa: D102
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Change:
     """One metric of two runs or groups of runs.
 
@@ -114,7 +114,7 @@ class Change:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Conclusion:
     """The comparison of a run (or a group of runs) with the baseline.
 

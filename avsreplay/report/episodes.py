@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import pairwise, takewhile
 from typing import NamedTuple
 
+from avsreplay.errors import value_class
 from avsreplay.records import Label
 from avsreplay.report.summary_parts import median
 
@@ -34,7 +35,7 @@ class Mark(NamedTuple):
     rot_err_deg: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Peak:
     """Largest position and attitude error over some scans; None without truth or without such a scan."""
 
@@ -51,7 +52,7 @@ class Peak:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Episode:
     """One injected fault.
 
@@ -85,7 +86,7 @@ class Episode:
     peak_after: Peak = field(default_factory=Peak)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class FaultAccount:
     """All labels of a log.
 
@@ -119,7 +120,7 @@ class FaultAccount:
         return max((e.recover_s for e in self.episodes if e.recover_s is not None), default=None)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Coast:
     """A run of scans with gamma 0, and the pose error at its last scan."""
 

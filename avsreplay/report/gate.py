@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from avsreplay.errors import CheckFailed, UsageError
+from avsreplay.errors import CheckFailed, UsageError, value_class
 from avsreplay.report.compare import METRICS
 from avsreplay.report.table import Table, TableCell, number
 from avsreplay.settings import Settings, setting
@@ -70,7 +70,7 @@ class GateRules(Settings):
             raise ValueError("no [[rule]] in the file")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class RuleOutcome:
     """One rule applied to one run; ``why`` states the broken limit with both numbers."""
 

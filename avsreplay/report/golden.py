@@ -7,7 +7,7 @@ difference; so is null against a value.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from operator import itemgetter
 from pathlib import Path
 from types import NoneType
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from avsreplay.errors import CheckFailed, UnreadableInput
+from avsreplay.errors import CheckFailed, UnreadableInput, value_class
 from avsreplay.report.jsonl import plain, read_records, write_rows
 from avsreplay.report.summary_parts import add_rows
 from avsreplay.report.table import Table, number
@@ -25,7 +25,7 @@ ABSENT = "(absent)"
 _Cells = Mapping[str, Sequence[Any]]  # column -> its values, ABSENT where a row has none
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Difference:
     """One cell that differs; ``column`` is "row" where a whole row is missing.
 
@@ -41,7 +41,7 @@ class Difference:
     tolerance: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class GoldenResult:
     """Result of a comparison.
 

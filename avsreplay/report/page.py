@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -35,7 +34,7 @@ MOST_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Section:
     """A heading with a paragraph, between the tables of a page."""
 
@@ -43,7 +42,7 @@ class Section:
     text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Folded:
     """Preformatted text that is shown on request."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import groupby
 from operator import attrgetter
 from typing import Any, ClassVar
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.records import State
 from avsreplay.rows import Row
 
@@ -36,7 +37,7 @@ def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
             column.extend(map(attrgetter(name), block))
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class VelocityChange:
     """A manoeuvre of the target as last reported: instant since the first scan and size, with 1 sigma.
 
@@ -88,7 +89,7 @@ class VelocityChange:
         return " and ".join(f"{value:.3g} +- {sigma:.2g} {unit}" for value, sigma, unit in clear)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Drifting:
     """A constant torque or force on the target: onset since the first scan and accelerations, with 1 sigma."""
 
@@ -153,7 +154,7 @@ def events(rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Dri
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Statistics:
     """Root mean square, mean, median, standard deviation (over n), smallest and largest of ``count`` values."""
 
@@ -184,7 +185,7 @@ def median(values: ArrayLike) -> float:
     return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Parameter:
     """An estimated constant at the last scan.
 
@@ -277,7 +278,7 @@ def _attitude(row: Row, truth: State | None) -> Parameter | None:
     return Parameter("mu", "deg", estimate, _tuple(np.degrees(geometry.log(truth.q_bc))), error, row.mu_1s_deg)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class CaptureMiss:
     """Distance, relative speed and attitude error of the gripper to the true grasp point when it closed."""
 
@@ -286,7 +287,7 @@ class CaptureMiss:
     rotation_deg: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Capture:
     """Planned instants of capture since the first scan; a replan is a row whose plan differs from the one before.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import IO, Any, Literal
 
 from rich import box
@@ -18,6 +17,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from avsreplay.errors import value_class
 from avsreplay.rows import Column, Row, columns
 
 PLAIN_WIDTH = 80
@@ -26,7 +26,7 @@ _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint"
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class TableCell:
     """A cell with a text and a style that states its meaning.
 
@@ -46,7 +46,7 @@ class TableCell:
         return " ".join(part for part in (sign, self.text) if part)
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Table:
     """A table as data.
 

@@ -7,7 +7,6 @@ named part. The limits below are stated in docs/report.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from itertools import chain, groupby
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.report import NIS_LIMIT, Summary
 from avsreplay.report.charts import values
@@ -38,7 +38,7 @@ class Grade(Enum):
     FAIL = "FAIL"
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Concern:
     """One reason against PASS: what, when and how bad, in a sentence."""
 
@@ -46,7 +46,7 @@ class Concern:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Moment:
     """An interval with a large error or without a used scan.
 
@@ -62,7 +62,7 @@ class Moment:
     cause: str
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class RunVerdict:
     """The verdict on one run.
 

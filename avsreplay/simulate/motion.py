@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 from avsreplay.settings import Settings, are_orthonormal, is_unit, setting
@@ -151,7 +151,7 @@ class Motion:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class _Instant:
     """State at the start of a step: q_ac, w_c, r_a, v_a."""
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import Label, Scan, ScanStatus
 from avsreplay.simulate.faults import DEFAULTS, MOST_STRENGTH, NS, Kind, clutter, fits, occlude
@@ -31,7 +32,7 @@ _NEIGHBOURS, _NOISE_SAMPLES = 9, 1000  # neighbours and samples for the estimate
 _LEAST_AHEAD = 0.05  # cosine to the mean direction of the points, below which a point is not in front of the scanner
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class RecordedFault:
     """A fault for recorded scans: a kind over [start_s, start_s + duration_s) after the first scan.
 

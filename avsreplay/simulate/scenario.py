@@ -12,7 +12,7 @@ import numpy as np
 import tomli_w
 
 from avsreplay import geometry, toml_document
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 from avsreplay.settings import Settings, setting
@@ -90,7 +90,7 @@ class ScenarioParams(Settings):
             raise ValueError(f"scanner.scan_s = {self.scanner.scan_s} is longer than the time between scans")
 
 
-@dataclass(frozen=True, slots=True)
+@value_class(eq=True)
 class Scenario:
     """A scenario as read.
 
