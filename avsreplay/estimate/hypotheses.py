@@ -27,8 +27,10 @@ from avsreplay.estimate.scan_window import (
     log_density,
     log_evidence,
     log_mean,
+    log_ratio,
     mixed,
     pose_difference,
+    since_each,
     window_of,
 )
 from avsreplay.estimate.track import Epoch
@@ -188,7 +190,7 @@ def _accelerated(window: Window, start: Belief, white: Array, free: float, prior
     kind, _, u = max(found, key=lambda f: f[1])
     left, size = white - M[:, kind] @ u, np.zeros(6)
     size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
-    value = log_mean([value for _, value, _ in found]) + PRIOR_ODDS
+    value = log_mean([float(value) for _, value, _ in found]) + PRIOR_ODDS
     return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), 6 * n - len(u), n, size=size)
 
 
@@ -221,10 +223,11 @@ def _located(
     share = weight / weight.sum()
     after_s, k = float(share @ instants), int(np.argmax(single))
     spread = math.hypot(math.sqrt(float(share @ (instants - after_s) ** 2)), (last - first) / _FINE / math.sqrt(12.0))
-    used = [(share[i], *log_evidence(white, free, columns[i], scale)[1:]) for i in np.flatnonzero(share > _NO_WEIGHT)]
-    total = sum(w for w, _, _ in used)
-    size = np.sum([w * u for w, u, _ in used], axis=0) / total
-    P = np.sum([w * (C + np.outer(u - size, u - size)) for w, u, C in used], axis=0) / total
+    used = share > _NO_WEIGHT
+    _, sizes, C = log_evidence(white, free, columns[used], scale)
+    held = share[used] / share[used].sum()
+    size = held @ sizes
+    P = (held[:, None, None] * (C + (sizes - size)[:, :, None] * (sizes - size)[:, None, :])).sum(axis=0)
     below = np.cumsum(share)
     ends = np.clip(np.searchsorted(below, [_TAIL, 1.0 - _TAIL]) + np.array([-1, 1]), 0, len(instants) - 1)
     at_best = _changes(instants[[k]], columns[[k]], white, free, scale)
@@ -235,13 +238,8 @@ def _located(
 
 def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
     """Derivatives (k, 6n, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
-    back = impulses(start.x, instants)
-    tau, n = instants[:, None, None, None], len(window.times_s)
-    M = np.empty((len(instants), n, 6, 6))
-    M[..., :3] = window.rows[:, :, :6] @ back[:, None]
-    M[..., 3:] = window.rows[:, :, VEL] - tau * window.rows[:, :, RHO]
-    M *= window.times_s[:, None, None] > tau
-    return np.asarray(window.whiten @ M.reshape(-1, 6 * n, 6))
+    late, tau = window.late[np.searchsorted(window.times_s, instants, side="right")], instants[:, None, None]
+    return np.concatenate([late[..., :6] @ impulses(start.x, instants), late[..., VEL] - tau * late[..., RHO]], axis=2)
 
 
 def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]) -> Array:
@@ -252,10 +250,8 @@ def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]
     M = used.transpose(1, 0, 2).reshape(len(white), -1)
     G, g = (M.T @ M).reshape(count, 6, count, 6), (M.T @ white).reshape(count, 6)
     at = chosen - first
-    A = G[at[:, :, None], :, at[:, None, :]].transpose(0, 1, 3, 2, 4).reshape(-1, size, size) + np.eye(size)
-    b = g[at].reshape(-1, size)
-    v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
-    return np.asarray(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
+    A = G[at[:, :, None], :, at[:, None, :]].transpose(0, 1, 3, 2, 4).reshape(-1, size, size)
+    return log_ratio(A, g[at].reshape(-1, size))
 
 
 def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> Explanation:
@@ -270,7 +266,7 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
     after_s = float(share @ instants)
     return Explanation(
         Hypothesis.MANOEUVRE,
-        value,
+        float(value),
         float(left @ left),
         len(white) - 6 * m,
         0,
@@ -312,8 +308,7 @@ def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors
     for k, (pose, R_ba) in enumerate(zip(window.poses, window.R_ba, strict=True)):
         M[k, :3, :3], M[k, 3:, 3:6] = np.eye(3), R_ba
         M[k, :3, 6] = pose.t / max(float(np.linalg.norm(pose.t)), 1e-300)
-    since = np.arange(n)[None, :] >= np.arange(1, n)[:, None]
-    columns = window.whiten @ (M * since[:, :, None, None]).reshape(n - 1, 6 * n, 7)
+    columns = since_each(window.whiten, M)[1:]
     values = free + mixed(columns, white, scale, _OFFSETS)
     onset = int(np.argmax(values)) + 1
     whitened = columns[onset - 1][:, :6]

@@ -39,6 +39,7 @@ FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are est
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
 _LONGEST = 3.0  # interval between two of them over the median
 _MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
+_MOTION = 12  # error states attitude to velocity, which a change of the velocities reaches
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -99,14 +100,16 @@ class Explanation:
 class Window:
     """Innovations y (6n,) about the trajectory predicted from the belief before the window.
 
-    ``C`` (6n, 6n) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor.
+    ``C`` (6n, 6n) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor. ``late``
+    (n + 1, 6n, 12) holds the derivatives of the whitened innovations by attitude to velocity at the start of the
+    window, if these act on the scans from each one on alone.
     """
 
     times_s: Array
     y: Array
     C: Array
     whiten: Array
-    rows: Array  # (n, 6, 20) H Phi from the start of the window
+    late: Array
     poses: tuple[Pose, ...]
     R: tuple[Array, ...]
     R_ba: tuple[Array, ...]
@@ -118,16 +121,12 @@ def window_of(
     """The scans about the trajectory from ``start``, with disturbances of these root densities."""
     n = len(epochs)
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
-    y, rows, back, poses, R_ba = np.empty((n, 6)), np.empty((n, 6, 20)), np.empty((n, 20, 20)), [], []
     states, transitions, by_u, steps = driven_steps(start, times, torque, arc)
-    for k, (epoch, step, then, Phi, t) in enumerate(zip(epochs, steps, states, transitions, times, strict=True)):
-        poses.append(measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
-        y[k] = innovation_vector(then, poses[-1])
-        H = measurement_jacobian(then)
-        rows[k], by_u[k, :6] = H @ Phi, H @ by_u[k]
-        inverse = np.linalg.inv(Phi)
-        back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # noise as errors of the start
-        R_ba.append(rotation(then.q_ab).T)
+    poses = tuple(measured_pose(e.prediction.belief.x, e.innovation.alpha) for e in epochs)
+    y = np.array([innovation_vector(x, pose) for x, pose in zip(states, poses, strict=True)])
+    H, inverse = np.array([measurement_jacobian(x) for x in states]), np.linalg.inv(transitions)
+    noise = np.array([process_noise(step, t, force) for step, t in zip(steps, times, strict=True)])
+    rows, back = H @ transitions, start.P + inverse @ noise @ np.swapaxes(inverse, 1, 2)  # errors of the start
     C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
     earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common
     C = np.where(earlier.T[:, None, :, None], C.transpose(2, 3, 0, 1), C)
@@ -135,12 +134,22 @@ def window_of(
     R = tuple(i.R for i in innovations)
     flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
     if isinstance(start, DrivenBelief):
-        seen = by_u[:, :6].reshape(6 * n, 6)
+        seen = (H @ by_u).reshape(6 * n, 6)
         across = rows.reshape(6 * n, 20) @ start.cross @ seen.T
         flat += across + across.T + seen @ start.P_u @ seen.T
     flat = 0.5 * (flat + flat.T)
     whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
-    return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
+    late = np.concatenate([since_each(whiten, rows[:, :, :_MOTION]), np.zeros((1, 6 * n, _MOTION))])
+    return Window(times, y.reshape(-1), flat, whiten, late, poses, R, tuple(rotation(x.q_ab).T for x in states))
+
+
+def since_each(whiten: Array, columns: Array) -> Array:
+    """Columns (n, 6n, m) of the whitened innovations by what acts as ``columns`` (n, 6, m) on each scan and later ones.
+
+    The sum over the scans begins with the last.
+    """
+    by_scan = whiten.reshape(len(whiten), -1, 6).transpose(1, 0, 2) @ columns
+    return np.asarray(np.cumsum(by_scan[::-1], axis=0)[::-1])
 
 
 def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors, prior: float) -> tuple[float, Array]:
@@ -193,13 +202,24 @@ def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
     return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
-def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
-    """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1)."""
-    A, b = M.T @ M * np.outer(scale, scale) + np.eye(len(scale)), scale * (M.T @ white)
+def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[Array, Array, Array]:
+    """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1), for each M."""
+    Mt, outer = np.swapaxes(M, -1, -2), np.outer(scale, scale)
+    A, b = Mt @ M * outer + np.eye(len(scale)), scale * (Mt @ white)
     inverse = np.linalg.inv(A)
-    v = inverse @ b
-    value = free + 0.5 * float(b @ v) - 0.5 * float(np.linalg.slogdet(A)[1])
-    return value, scale * v, np.outer(scale, scale) * (0.5 * (inverse + inverse.T))
+    v = (inverse @ b[..., None])[..., 0]
+    value = free + 0.5 * (b * v).sum(axis=-1) - 0.5 * np.linalg.slogdet(A)[1]
+    return np.asarray(value), scale * v, outer * (0.5 * (inverse + np.swapaxes(inverse, -1, -2)))
+
+
+def log_ratio(A: Array, b: Array) -> Array:
+    """Log evidence over none of unknowns u ~ N(0, 1), with A (..., n, n) = M' M and b (..., n) = M' white."""
+    n, bordered = b.shape[-1], np.zeros((*b.shape[:-1], b.shape[-1] + 1, b.shape[-1] + 1))
+    bordered[..., :n, :n], bordered[..., n, :n] = A + np.eye(n), b
+    bordered[..., n, n] = 1.0 + 2.0 * (b * b).sum(axis=-1)
+    root = cholesky_root(bordered)  # its last row is L^-1 b
+    logs = np.log(np.diagonal(root, axis1=-2, axis2=-1)[..., :n])
+    return np.asarray(0.5 * (root[..., n, :n] ** 2).sum(axis=-1) - logs.sum(axis=-1))
 
 
 def pose_difference(a: Pose, b: Pose, R_ba: Array) -> Array:
@@ -222,17 +242,10 @@ def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array
 
     A single prior that is wide in all directions would hide a small change of the velocity alone from few scans.
     """
-    Mt = np.swapaxes(M, 1, 2)
-    G, g = Mt @ M, Mt @ white
-    found = []
-    for kind in kinds:
-        for factor in SCALES:
-            s = factor * scale[kind]
-            A = G[:, kind, kind] * np.outer(s, s) + np.eye(len(s))
-            b = g[:, kind] * s
-            v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
-            found.append(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
-    return np.asarray(np.logaddexp.reduce(found, axis=0) - math.log(len(found)))
+    Mt, factors = np.swapaxes(M, 1, 2), np.array(SCALES)[:, None, None]
+    G, g = Mt @ M * np.outer(scale, scale), Mt @ white * scale
+    found = [log_ratio(factors[..., None] ** 2 * G[:, kind, kind], factors * g[:, kind]) for kind in kinds]
+    return np.asarray(np.logaddexp.reduce(np.concatenate(found)) - math.log(len(SCALES) * len(kinds)))
 
 
 def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:
