@@ -267,13 +267,13 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     if scan.pose is not None:
         return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
-    guess, origin = stages.estimator.in_camera(predicted.belief).x.T_ac, "predicted"
+    guess, origin = stages.estimator.frame.belief_out(predicted.belief).x.T_ac, "predicted"
     if state.last_pose is None:
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
     effort, carried = allowed_scans(state.failed), points is not scan.points
-    unknown = None if state.track is None else state.track.undetermined
+    unknown = None if state.track is None else stages.estimator.frame.motions_out(state.track.undetermined)
     found = stages.registrar.register(points, guess, scan.seq, carried, effort, unknown)
     return _measurement(stages, scan, points, found, origin)
 
@@ -294,7 +294,8 @@ def _judge(
 ) -> tuple[Prediction, Innovation | None, Verdict]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured) and the verdict."""
     if scan.times_s is not None and measurement.instants is not None:
-        predicted = with_scan_duration(predicted, measurement.instants, scan.times_s)
+        instants = stages.estimator.frame.instants_into(measurement.instants)
+        predicted = with_scan_duration(predicted, instants, scan.times_s)
     alignment = measurement.alignment
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return predicted, innovation, stages.faults.judge(scan.status, alignment, innovation, predicted.belief)
@@ -314,7 +315,7 @@ def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
     if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
-    return deskew(scan.points, scan.times_s, replace(predicted, belief=stages.estimator.in_camera(predicted.belief)))
+    return deskew(scan.points, scan.times_s, replace(predicted, belief=stages.estimator.frame.belief_out(predicted.belief)))
 
 
 Forecaster = Callable[[Array], Forecast]

@@ -151,8 +151,7 @@ class HealthyPoses:
         """
         if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
             t_ns, T_ac = outcome.scan.t_ns, state.last_pose
-            fall = self._estimator.fall
-            T_ac = T_ac if fall is None else fall.pose_into(T_ac, t_ns)
+            T_ac = self._estimator.frame.pose_into(T_ac, t_ns)
             self.fixes.append(healthy_pose(state.track, t_ns, T_ac, self._estimator.params))
 
     def reference(self) -> Reference:
@@ -167,8 +166,8 @@ def reference_motion(fixes: Sequence[PoseFix], estimator: Estimator) -> Referenc
         fixes: healthy poses as the estimator keeps them.
         estimator: that of the run.
     """
-    found, fall = reference_of(fixes, estimator.params), estimator.fall
-    return found if fall is None else replace(found, at=lambda t_ns: fall.state_out(found.at(t_ns), t_ns))
+    found = reference_of(fixes, estimator.params)
+    return replace(found, at=lambda t_ns: estimator.frame.state_out(found.at(t_ns), t_ns))
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:

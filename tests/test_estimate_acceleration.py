@@ -103,13 +103,13 @@ def test_predictions_contain_the_acceleration() -> None:
     free = Estimator(EstimatorParams(), belief, 2.0, 5_000_000_000)
     falling = Estimator(EstimatorParams(acceleration_mps2=a), belief, 2.0, 5_000_000_000)
     track = falling.initial(belief.t_ns, x.T_ac)
-    np.testing.assert_allclose(falling.in_camera(track.belief).x.r_a, x.r_a, atol=1e-12)
+    np.testing.assert_allclose(falling.frame.belief_out(track.belief).x.r_a, x.r_a, atol=1e-12)
     h = np.array([0.0, 0.5, 3.0])
     position, velocity = falling.motion(belief)(h)
     plain, steady = free.motion(belief)(h)
     np.testing.assert_allclose(position, plain + 0.5 * h[:, None] ** 2 * a, atol=1e-12)
     np.testing.assert_allclose(velocity, steady + h[:, None] * a, atol=1e-12)
-    later = falling.in_camera(falling.predict(track, belief.t_ns + 3_000_000_000).belief)
+    later = falling.frame.belief_out(falling.predict(track, belief.t_ns + 3_000_000_000).belief)
     np.testing.assert_allclose(later.x.T_ac.t, position[-1], atol=1e-9)
 
 

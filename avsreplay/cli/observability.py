@@ -83,7 +83,7 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     rows = list(run.rows([listen]))
     reference = poses.reference()
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
-    start = _in_axes_of(beliefs[inside[-1].t_ns], reference)
+    start = run.estimator.frame.state_into(_in_axes_of(beliefs[inside[-1].t_ns], reference), reference.epoch_ns)
     lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF

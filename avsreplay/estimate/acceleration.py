@@ -1,9 +1,6 @@
 """A constant acceleration of the centre of mass in {A} (gravity, thrust): known, or fitted to measured poses.
 
-Known. The estimator works in a frame that falls with the target: r' = r - a tau^2 / 2, v' = v - a tau with tau the time
-since the first scan. In that frame the motion is free, and the error states, their covariance and the innovations are
-the same as in {A}. ``FreeFall`` converts the input and the output of the estimator; no other code depends on the
-acceleration.
+Known. The estimator works in a frame that falls with the target (``frame.py``), in which the motion is free.
 
 Fitted. With measured attitudes R_k the position of the origin of {C} is linear in the unknowns,
 
@@ -19,7 +16,6 @@ the first poses that contradict it, so that an impact after a free flight has no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +24,7 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import r0_covariance
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, Belief, State, Trajectory
+from avsreplay.records import Alignment, Trajectory
 from avsreplay.settings import given
 
 _FEWEST = 8  # poses of the first fit; the noise is estimated from its residuals
@@ -37,45 +33,6 @@ _GATE = 21.1  # 99.99 % point of chi-square with 3 degrees of freedom
 _FEW = 12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
 _UNKNOWN = 1e3  # 1 sigma of the prior of all but the arm, in lengths of the arm over the duration of the poses
 _PASSES = 4
-
-
-@value_class
-class FreeFall:
-    """The frame in which a target with a constant acceleration moves freely.
-
-    Attributes:
-        acceleration: (3,) in {A} [m/s2].  epoch_ns: instant at which the frame coincides with {A}.
-    """
-
-    acceleration: Array
-    epoch_ns: int
-
-    def belief_into(self, belief: Belief) -> Belief:
-        """Return a belief in {A} as it is in the falling frame."""
-        return self._moved(belief, -1.0)
-
-    def belief_out(self, belief: Belief) -> Belief:
-        """Return a belief in the falling frame as it is in {A}."""
-        return self._moved(belief, 1.0)
-
-    def state_out(self, x: State, t_ns: int) -> State:
-        """Return a state at an instant [ns] in the falling frame as it is in {A}."""
-        away, speed = self._fallen(t_ns)
-        return replace(x, r_a=x.r_a + away, v_a=x.v_a + speed)
-
-    def pose_into(self, T_ac: Pose, t_ns: int) -> Pose:
-        """Return a pose at an instant [ns] in {A} as it is in the falling frame."""
-        return Pose(T_ac.q, T_ac.t - self._fallen(t_ns)[0])
-
-    def _moved(self, belief: Belief, sign: float) -> Belief:
-        away, speed = self._fallen(belief.t_ns)
-        x = belief.x
-        return replace(belief, x=replace(x, r_a=x.r_a + sign * away, v_a=x.v_a + sign * speed))
-
-    def _fallen(self, t_ns: int) -> tuple[Array, Array]:
-        """Displacement and velocity of the frame in {A} at an instant."""
-        tau = (t_ns - self.epoch_ns) * 1e-9
-        return 0.5 * tau * tau * self.acceleration, tau * self.acceleration
 
 
 def accelerated(free: Trajectory, acceleration: Array) -> Trajectory:

@@ -14,13 +14,14 @@ import numpy as np
 
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics
-from avsreplay.estimate.acceleration import FreeFall, accelerated
+from avsreplay.estimate.acceleration import accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast
 from avsreplay.estimate.error_state import RHO, semidefinite
+from avsreplay.estimate.frame import ZERO, EstimatorFrame
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     gate_of,
@@ -53,7 +54,9 @@ from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajector
 class Estimator:
     """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it."""
 
-    def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float, epoch_ns: int = 0) -> None:
+    def __init__(
+        self, params: EstimatorParams, start: Belief | None, extent_m: float, epoch_ns: int = 0, centre_c: Array = ZERO
+    ) -> None:
         """Create the estimator of one run.
 
         Args:
@@ -62,6 +65,7 @@ class Estimator:
             extent_m: the target's bounding diagonal [m].
             epoch_ns: instant at which the falling frame of a known acceleration coincides with {A}, and to which the
                 directions of a relative orbit belong: that of the first scan.
+            centre_c: (3,) centre of the target's bounding box in {C} [m]; the paper's method does not use it.
 
         Raises:
             UsageError: a near start is requested and none is given.
@@ -70,10 +74,10 @@ class Estimator:
         if params.start is Start.NEAR and start is None:
             hint = "use start = cold, or a log whose scenario has a [start] table"
             raise UsageError("a near start is requested and the log contains none", where="estimator.start", hint=hint)
-        known = np.array(params.acceleration_mps2)
-        self.fall = FreeFall(known, epoch_ns) if known.any() else None
+        middle = ZERO if params.start is Start.PAPER else centre_c
+        self.frame = EstimatorFrame(middle, np.array(params.acceleration_mps2), epoch_ns)
         given = start if params.start in (Start.AUTO, Start.NEAR) else None
-        self.start = given if given is None or self.fall is None else self.fall.belief_into(given)
+        self.start = None if given is None else self.frame.belief_into(given)
         self.noise = Noise(self.params, extent_m)
         self.batch = BatchSchedule(self.params, self.noise, self.start, RelativeOrbit.of(params, epoch_ns))
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
@@ -92,7 +96,7 @@ class Estimator:
         """
         if self.start is not None:
             return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
-        T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
+        T_ac = self.frame.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
         belief, any_motion = guessed_belief(t_ns, T_ac, self.params), np.eye(6)
         unknown = common_motions(any_motion, any_motion if acquired else None, self._length_m)
@@ -120,7 +124,7 @@ class Estimator:
             alignment: of this scan.
         """
         t_ns = prediction.belief.t_ns
-        T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, t_ns)
+        T_ac = self.frame.pose_into(alignment.T_ac, t_ns)
         after = turned(track, prediction.belief.x.T_ac, T_ac, alignment)
         return (track, prediction) if after is track else (after, self.predict(after, t_ns))
 
@@ -131,10 +135,9 @@ class Estimator:
             prediction: of this scan.
             alignment: a measured pose.
         """
-        x = prediction.belief.x
+        x, alignment = prediction.belief.x, self.frame.alignment_into(alignment, prediction.belief.t_ns)
         R = self.noise.of(alignment, x, prediction.window)
-        T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, prediction.belief.t_ns)
-        alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
+        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
         dof = self.noise.dof(alignment)
         found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
         return replace(found, rms_m=alignment.rms_m, free=alignment.free)
@@ -172,14 +175,14 @@ class Estimator:
             track: after the scan.
             times_s: (n,) >= 0, ascending [s after the scan].
         """
-        noise, b = self.batch.noise_levels(track), common_1s(track, self.in_camera(track.belief).x.T_ac.t)
+        noise, b = self.batch.noise_levels(track), self._common_1s(track)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
-            found = driven_forecast(track.belief, times_s, *noise)
+            found = driven_forecast(self.frame.belief_out(track.belief), times_s, *noise)
         else:
-            found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
+            found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise, self.frame.origin_c)
         turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
         if track.undetermined.size:
-            turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
+            turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(track.undetermined), 2))
             turn, position = np.hypot(turn, turns), np.hypot(position, moves)
         return Forecast(found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD))
 
@@ -241,6 +244,9 @@ class Estimator:
         gate = gate_of(innovation.dof, R, R + covariance)
         return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
 
+    def _common_1s(self, track: Track) -> Array:
+        return common_1s(track, self.frame.state_out(track.belief.x, track.belief.t_ns).r_a)
+
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
         old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
@@ -288,19 +294,10 @@ class Estimator:
         Args:
             track: after a scan.
         """
-        belief = self.in_camera(track.belief)
-        b = common_1s(track, belief.x.T_ac.t)
+        belief, b = track.belief, self._common_1s(track)
         P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc) + track.change_P
         P[RHO, RHO] += np.outer(b, b)
-        return replace(belief, P=P)
-
-    def in_camera(self, belief: Belief) -> Belief:
-        """The belief of a track or a prediction in {A}; it differs only where an acceleration is known.
-
-        Args:
-            belief: as the estimator carries it, in the frame that falls with the target.
-        """
-        return belief if self.fall is None else self.fall.belief_out(belief)
+        return self.frame.belief_out(replace(belief, P=P))
 
     def motion(self, belief: Belief) -> Trajectory:
         """The predicted path of the grasp point without disturbances.
@@ -315,7 +312,7 @@ class Estimator:
         orbit = self.batch.orbit
         path = dynamics.grasp_trajectory(belief.x, None if orbit is None else orbit.at(belief.t_ns), drive_in(belief))
         path = accelerated(path, belief.u[3:]) if isinstance(belief, DrivenBelief) else path
-        return path if self.fall is None else accelerated(path, self.fall.acceleration)
+        return accelerated(path, self.frame.acceleration) if self.frame.falls else path
 
     def attitude(self, belief: Belief) -> Callable[[Array], Array]:
         """The predicted attitudes of the fixture without disturbances.

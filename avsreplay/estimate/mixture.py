@@ -31,6 +31,7 @@ from avsreplay.records import Belief, Forecast
 
 _SMALL_EXCESS = 1.1  # largest ratio of the corrected covariance to that of the last pose
 _POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])  # half angle in {C} and position in {A} of the chart's steps
+_ORIGIN = (0.0, 0.0, 0.0)
 _MOVED = 0.5  # sum of the changes of the weights above which the mixture is not a quadrature
 
 
@@ -209,7 +210,12 @@ def _missing(values: Array, axes: Array, whiten: Array) -> Array:
 
 
 def mixture_forecast(
-    components: tuple[Component, ...], t_ns: int, times_s: Array, torque: float, force: float
+    components: tuple[Component, ...],
+    t_ns: int,
+    times_s: Array,
+    torque: float,
+    force: float,
+    origin_c: tuple[float, float, float] = _ORIGIN,
 ) -> Forecast:
     """Predicted 1 sigma of the grasp point about the published motion, each component about its own trajectory.
 
@@ -222,6 +228,7 @@ def mixture_forecast(
         times_s: (n,) >= 0, ascending [s after the present].
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
+        origin_c: (3,) the grasp point in the frame of the components' fixture [m].
     """
     times = np.asarray(times_s, dtype=np.float64)
     ahead, published = times + (t_ns - components[0].t_ns) * 1e-9, _joined(components)
@@ -238,6 +245,7 @@ def mixture_forecast(
         separated(published.chart, published.P).flat,
         force**2,
         ahead,
+        origin_c,
     )
     return forecast_of(times, moments)
 

@@ -1,10 +1,10 @@
 """Whole runs on logs made without code of avsreplay: own dynamics, ray casting by Embree, written by rosbags.
 
 python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1] [--mesh FILE]
-    [--keep FOLDER]
+    [--origin METRES] [--keep FOLDER]
 
 The target is a spacecraft of primitives of trimesh (body, two panels, dish, boom) with random sizes, or the mesh of
-FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres. Its inertia tensor and its mass centre
+FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres, with its origin METRES off the centre. Its inertia tensor and its mass centre
 are random, its motion is integrated from the full tensor with DOP853, and 80 x 80 rays with 2 mm range noise (1 sigma)
 give the scans at HZ for SECONDS. A case adds an event:
 
@@ -152,6 +152,7 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
     rng = np.random.default_rng([seed, 77])
     mesh = spacecraft(rng) if asked.mesh is None else of_file(asked.mesh)
     mm = mesh.copy()
+    mm.apply_translation((asked.origin, 0.0, 0.0))
     mm.apply_scale(1000.0)
     mm.export(folder / "model.stl")
     caster = RayMeshIntersector(mesh)
@@ -175,7 +176,7 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
                 points = np.concatenate(
                     [points, np.column_stack([rng.uniform(-4, 4, (n, 2)), 10 + 0.003 * rng.normal(size=n)])]
                 )
-            write(t_s, points, turn, place)
+            write(t_s, points, turn, place - asked.origin * turn[:, 0])
 
 
 def ray_grid(half_deg: float, count: int) -> np.ndarray:
@@ -311,6 +312,7 @@ def main() -> None:
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="mean rate of the targets [rad/s]")
     parser.add_argument("--mesh", type=Path, help="mesh of the target, in place of random spacecraft")
+    parser.add_argument("--origin", type=float, default=0.0, help="distance of the model's origin from its centre [m]")
     parser.add_argument("--keep", type=Path, help="write the logs and results to this folder and keep them")
     asked = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS), flush=True)

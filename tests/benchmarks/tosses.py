@@ -159,7 +159,7 @@ def prediction(
 ) -> tuple[float, float, float]:
     """Position error [m], attitude error [deg] and NEES of the pose predicted for sample k, its noise included."""
     belief = estimator.predict(track, EPOCH_NS + round(float(toss.times[k]) * 1e9)).belief
-    x = estimator.in_camera(belief).x
+    x = estimator.frame.belief_out(belief).x
     e, H = innovation_vector(x, toss.poses[k]), measurement_jacobian(x)
     R = np.diag(np.repeat([1e-3 * sigma[0], 0.5 * np.radians(sigma[1])], 3) ** 2)
     S = H @ belief.P @ H.T + R

@@ -428,7 +428,7 @@ Numpy impulses(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, con
 // Per instant, of a mixture: second moments of position, velocity and half-angle attitude about the motion of a chart.
 Numpy mixture_forecast_of(const Matrix<-1, CHART>& charts, const Matrix<-1, CHART>& references,
                           const Matrix<-1, DIM, DIM>& P, const Vector<-1>& weights, const Matrix<-1, 3>& torque,
-                          const Flat& published, double force, const Times& times) {
+                          const Flat& published, double force, const Times& times, const Three& origin) {
   const size_t count = charts.shape(0), n = times.shape(0);
   if (references.shape(0) != count || P.shape(0) != count || weights.shape(0) != count || torque.shape(0) != count)
     throw std::invalid_argument("charts, covariances, weights and densities must be equally many");
@@ -439,7 +439,7 @@ Numpy mixture_forecast_of(const Matrix<-1, CHART>& charts, const Matrix<-1, CHAR
     mixture_forecast(reinterpret_cast<const Chart*>(charts.data()), reinterpret_cast<const Chart*>(references.data()),
                      reinterpret_cast<const Square*>(P.data()), weights.data(),
                      reinterpret_cast<const double(*)[3]>(torque.data()), count, chart(published), force, times.data(), n,
-                     reinterpret_cast<double(*)[3]>(moments));
+                     V3{{origin[0], origin[1], origin[2]}}, reinterpret_cast<double(*)[3]>(moments));
   }
   return out;
 }
@@ -495,7 +495,8 @@ NB_MODULE(_motion, m) {
   m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
   m.def("mixture_forecast", &mixture_forecast_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"),
-        nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"));
+        nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"),
+        nb::arg("origin_c"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
   m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),

@@ -107,6 +107,6 @@ void forecast(const State& x, const Square P, double force_density, double t, co
 // ascending times: of a mixture of `count` charts, each with its weight, and its covariance in steps of `references`.
 void mixture_forecast(const Chart* charts, const Chart* references, const Square* P, const double* weights,
                       const double (*torque_density)[3], size_t count, const Chart& published, double force_density,
-                      const double* times, size_t n, double (*out)[3]);
+                      const double* times, size_t n, const V3& origin, double (*out)[3]);
 
 }  // namespace avs

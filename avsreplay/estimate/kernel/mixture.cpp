@@ -100,9 +100,25 @@ Fixture fixture(const State& x, double t, const Turn& at) {
   return {vector(x.r_a) + t * v + A * arm, v + A * cross(vector(at.w), arm), quad(at.q) * quad(x.q_bc)};
 }
 
-// The fixture of a chart at each of n ascending times after it.
-std::vector<Fixture> path_of(const Chart& chart, const double* times, size_t n) {
-  const State x = state_of(chart);
+// The state and its covariance with the fixture moved to `origin`, given in {C}: varrho + A(mu) origin, with
+// A(dmu mu) = (1 + 2 [dmu x]) A(mu).
+void move_fixture(State& x, const V3& origin, Square P) {
+  const V3 by = matrix(quad(x.q_bc)) * origin;
+  const M3 J = skew(by);  // dvarrho' = dvarrho - 2 J dmu
+  for (int i = 0; i < 3; ++i) x.c_b[i] += by.x[i];
+  for (int r = 0; r < 3; ++r)
+    for (int k = 0; k < 3; ++k)
+      for (int c = 0; c < DIM; ++c) P[14 + r][c] -= 2 * J.x[r][k] * P[17 + k][c];
+  for (int r = 0; r < 3; ++r)
+    for (int k = 0; k < 3; ++k)
+      for (int c = 0; c < DIM; ++c) P[c][14 + r] -= 2 * J.x[r][k] * P[c][17 + k];
+}
+
+// The point `origin`, given in {C}, of a chart at each of n ascending times after it.
+std::vector<Fixture> path_of(const Chart& chart, const double* times, size_t n, const V3& origin) {
+  State x = state_of(chart);
+  const V3 by = matrix(quad(x.q_bc)) * origin;
+  for (int i = 0; i < 3; ++i) x.c_b[i] += by.x[i];
   double join[3][2], t = 0;
   const Body body = body_of(x, join);
   Turn turn = turn_of(x);
@@ -205,15 +221,16 @@ void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6
 
 void mixture_forecast(const Chart* charts, const Chart* references, const Square* P, const double* weights,
                       const double (*torque_density)[3], size_t count, const Chart& published, double force_density,
-                      const double* times, size_t n, double (*out)[3]) {
-  const std::vector<Fixture> centre = path_of(published, times, n);
+                      const double* times, size_t n, const V3& origin, double (*out)[3]) {
+  const std::vector<Fixture> centre = path_of(published, times, n, origin);
   for (size_t k = 0; k < n; ++k) out[k][0] = out[k][1] = out[k][2] = 0;
   for (size_t i = 0; i < count; ++i) {
-    const std::vector<Fixture> mean = path_of(charts[i], times, n);
+    const std::vector<Fixture> mean = path_of(charts[i], times, n, origin);
     Square T, errors;
     errors_of(references[i], T);
     congruent<DIM>(T, P[i], errors);
-    const State x = state_of(references[i]);
+    State x = state_of(references[i]);
+    move_fixture(x, origin, errors);
     double join[3][2], t = 0;
     Body body = body_of(x, join);
     std::memcpy(body.push, torque_density[i], sizeof body.push);

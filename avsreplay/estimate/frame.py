@@ -1,0 +1,140 @@
+"""The coordinates of the estimator: the fixture at the centre of the model, in a frame that falls with the target.
+
+Centre. A CAD file may have its origin far from the body, and the origin of {C} is where its designer has put it. The
+pose of a point outside the body is uncertain by the error of the attitude times the distance, and the prior of the
+offset from the centre of mass would be about a point that has nothing to do with the mass. The estimator therefore
+estimates {C'}, which is {C} with its origin at the centre s of the model's bounding box, s given in {C}:
+
+    T_ac' = T_ac (1, s),    varrho' = varrho + A(mu) s,    v' = v + theta x s for d = [theta; v] in {C}.
+
+All other states are the same, so that an estimate does not depend on the origin of the model.
+
+Fall. With a known acceleration a of the centre of mass in {A}, r' = r - a tau^2 / 2, v' = v - a tau with tau the time
+since the first scan. In that frame the motion is free, and the error states and their covariance are the same.
+
+``EstimatorFrame`` converts the input and the output of the estimator; no other code depends on either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.errors import value_class
+from avsreplay.estimate.driven import DrivenBelief
+from avsreplay.estimate.error_state import DIM, DMU, VARRHO
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, Belief, State
+
+
+ZERO = geometry.frozen(np.zeros(3), 3)
+
+
+@value_class
+class EstimatorFrame:
+    """Conversion between {A}, {C} and the coordinates of the estimator.
+
+    Attributes:
+        centre_c: (3,) centre of the model in {C} [m].
+        acceleration: (3,) of the centre of mass in {A} [m/s2].
+        epoch_ns: instant at which the falling frame coincides with {A}.
+    """
+
+    centre_c: Array
+    acceleration: Array
+    epoch_ns: int
+
+    @property
+    def falls(self) -> bool:
+        """Return whether there is an acceleration."""
+        return bool(self.acceleration.any())
+
+    @property
+    def shifted(self) -> bool:
+        """Return whether the centre of the model is not the origin of {C}."""
+        return bool(self.centre_c.any())
+
+    @property
+    def origin_c(self) -> tuple[float, float, float]:
+        """Return the origin of {C} in {C'} (3,) [m]."""
+        x, y, z = (-self.centre_c).tolist()
+        return x, y, z
+
+    def pose_into(self, T_ac: Pose, t_ns: int) -> Pose:
+        """Return a pose of {C} in {A} at an instant [ns] in the estimator's coordinates."""
+        t = T_ac.t + geometry.rotate(T_ac.R, self.centre_c) if self.shifted else T_ac.t
+        return Pose(T_ac.q, t - self._fallen(t_ns)[0]) if self.falls else Pose(T_ac.q, t)
+
+    def alignment_into(self, alignment: Alignment, t_ns: int) -> Alignment:
+        """Return a registered pose of {C} in {A} at an instant [ns] in the estimator's coordinates."""
+        if not (self.falls or self.shifted):
+            return alignment
+        found = replace(alignment, T_ac=self.pose_into(alignment.T_ac, t_ns))
+        if not self.shifted:
+            return found
+        into, out, C, free = self._adjoint(1.0), self._adjoint(-1.0), alignment.covariance, alignment.free
+        return replace(
+            found,
+            info=out.T @ alignment.info @ out,
+            covariance=None if C is None else into @ C @ into.T,
+            free=None if free is None else into @ free,
+        )
+
+    def instants_into(self, instants: Array) -> Array:
+        """Return the mean instants (6, 6) by direction in {C} [s] as those by direction in {C'}."""
+        return self._adjoint(1.0) @ instants @ self._adjoint(-1.0) if self.shifted else instants
+
+    def motions_out(self, motions: Array) -> Array:
+        """Return motions d = [theta; v] of {C'} (6, k) as those of {C}."""
+        return self._adjoint(-1.0) @ motions if self.shifted else motions
+
+    def state_into(self, x: State, t_ns: int) -> State:
+        """Return a state in {A} at an instant [ns] in the estimator's coordinates."""
+        return self._moved(x, t_ns, 1.0)
+
+    def state_out(self, x: State, t_ns: int) -> State:
+        """Return a state in the estimator's coordinates at an instant [ns] as it is in {A}."""
+        return self._moved(x, t_ns, -1.0)
+
+    def belief_into(self, belief: Belief) -> Belief:
+        """Return a belief in {A} in the estimator's coordinates."""
+        return self._converted(belief, 1.0)
+
+    def belief_out(self, belief: Belief) -> Belief:
+        """Return a belief in the estimator's coordinates as it is in {A}."""
+        return self._converted(belief, -1.0)
+
+    def _moved(self, x: State, t_ns: int, sign: float) -> State:
+        r_a, v_a, c_b = x.r_a, x.v_a, x.c_b
+        if self.falls:
+            away, speed = self._fallen(t_ns)
+            r_a, v_a = r_a - sign * away, v_a - sign * speed
+        if self.shifted:
+            c_b = c_b + sign * geometry.rotate(geometry.matrix(x.q_bc), self.centre_c)
+        return replace(x, r_a=r_a, v_a=v_a, c_b=c_b) if self.falls or self.shifted else x
+
+    def _converted(self, belief: Belief, sign: float) -> Belief:
+        """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu x]) A(mu)."""
+        x = self._moved(belief.x, belief.t_ns, sign)
+        if not self.shifted:
+            return belief if x is belief.x else replace(belief, x=x)
+        J = np.eye(DIM)
+        J[VARRHO, DMU] = -2.0 * sign * geometry.skew(geometry.rotate(geometry.matrix(x.q_bc), self.centre_c))
+        P = J @ belief.P @ J.T
+        P = 0.5 * (P + P.T)
+        if isinstance(belief, DrivenBelief):
+            return replace(belief, x=x, P=P, cross=J @ belief.cross)
+        return replace(belief, x=x, P=P)
+
+    def _adjoint(self, sign: float) -> Array:
+        """(6, 6) d' = adjoint d where the origin of {C} is moved by ``sign`` s."""
+        out = np.eye(6)
+        out[3:, :3] = -sign * geometry.skew(self.centre_c)
+        return out
+
+    def _fallen(self, t_ns: int) -> tuple[Array, Array]:
+        """Displacement and velocity of the falling frame in {A} at an instant."""
+        tau = (t_ns - self.epoch_ns) * 1e-9
+        return 0.5 * tau * tau * self.acceleration, tau * self.acceleration
