@@ -315,7 +315,9 @@ def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
     if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
-    return deskew(scan.points, scan.times_s, replace(predicted, belief=stages.estimator.frame.belief_out(predicted.belief)))
+    return deskew(
+        scan.points, scan.times_s, replace(predicted, belief=stages.estimator.frame.belief_out(predicted.belief))
+    )
 
 
 Forecaster = Callable[[Array], Forecast]

@@ -28,7 +28,6 @@ from avsreplay.estimate.error_state import DIM, DMU, VARRHO
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, State
 
-
 ZERO = geometry.frozen(np.zeros(3), 3)
 
 

@@ -4,9 +4,9 @@ python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [
     [--origin METRES] [--keep FOLDER]
 
 The target is a spacecraft of primitives of trimesh (body, two panels, dish, boom) with random sizes, or the mesh of
-FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres, with its origin METRES off the centre. Its inertia tensor and its mass centre
-are random, its motion is integrated from the full tensor with DOP853, and 80 x 80 rays with 2 mm range noise (1 sigma)
-give the scans at HZ for SECONDS. A case adds an event:
+FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres, with its origin METRES off the centre.
+Its inertia tensor and its mass centre are random, its motion is integrated from the full tensor with DOP853, and 80 x
+80 rays with 2 mm range noise (1 sigma) give the scans at HZ for SECONDS. A case adds an event:
 
 clean   none                                    wall    a wall behind the target, half of all points
 push    velocity step of 10 mm/s at 44.8 s      turn    rate step of 0.01 rad/s at 44.8 s
