@@ -10,7 +10,7 @@ from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
-from avsreplay.geometry import Array, Pose, bounding_centre
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import FaultDetector
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.pipeline import Monitors, PipelineState, Stages
@@ -42,7 +42,7 @@ def stages(
     Raises:
         UsageError: the configuration requires the start of the log, and the log contains none.
     """
-    centre_c = bounding_centre(surface.vertices)
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
     estimator = config.estimator
     if config.register.backend == POSES:
@@ -52,7 +52,7 @@ def stages(
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(estimator, start, surface.extent, clock[0], centre_c),
+        estimator=Estimator(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
         guidance=Guidance(

@@ -277,12 +277,6 @@ def bounding_diagonal(points: ArrayLike) -> float:
     return float(np.linalg.norm(np.ptp(np.ascontiguousarray(np.asarray(points).T), axis=1)))  # numpy is slow along rows
 
 
-def bounding_centre(points: ArrayLike) -> Array:
-    """Return the centre (3,) [m] of the bounding box of points (n, 3) [m]."""
-    columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
-    return np.asarray(0.5 * (columns.min(axis=1) + columns.max(axis=1)))
-
-
 @value_class
 class Pose:
     """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
