@@ -102,7 +102,7 @@ void grow(Box& b, const Vec3& p, float slack) {
 
 Box no_box() {
   constexpr float inf = std::numeric_limits<float>::infinity();
-  return {{inf, inf, inf}, {-inf, -inf, -inf}};
+  return {{inf, inf, inf, 0}, {-inf, -inf, -inf, 0}};
 }
 
 Box box_of(const Store& s, uint32_t block) {

@@ -40,7 +40,7 @@ void set_grid(Store& s, const Box& box, double cell, double band) {
 }
 
 Box root_box(const Store& s) {
-  Box b{{s.nodes[0].lo[0][0], s.nodes[0].lo[1][0], s.nodes[0].lo[2][0]}, {s.nodes[0].hi[0][0], s.nodes[0].hi[1][0], s.nodes[0].hi[2][0]}};
+  Box b{{s.nodes[0].lo[0][0], s.nodes[0].lo[1][0], s.nodes[0].lo[2][0], 0}, {s.nodes[0].hi[0][0], s.nodes[0].hi[1][0], s.nodes[0].hi[2][0], 0}};
   for (int a = 0; a < 3; ++a)
     for (int k = 1; k < LANES && s.nodes[0].child[k] != NO_CHILD; ++k)
       b.lo[a] = std::min(b.lo[a], s.nodes[0].lo[a][k]), b.hi[a] = std::max(b.hi[a], s.nodes[0].hi[a][k]);

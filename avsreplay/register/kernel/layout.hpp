@@ -36,7 +36,7 @@ struct TriangleBlock {
 };
 
 struct Box {
-  float lo[3], hi[3];
+  float lo[4], hi[4];  // the last of each is not used
 };
 
 // A node covers a contiguous range of blocks. Its children cover consecutive parts of that range, in order.

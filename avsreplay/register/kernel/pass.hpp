@@ -21,51 +21,54 @@ struct Strip {
   Treat search[STRIP];
 };
 
-static inline bool finite(const double* p) { return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]); }
-
+// Reads n points and moves them by T: `c.c`, with `c.take` 1 where they are finite. The strip is filled up to a multiple of
+// four.
 template <class Number>
-static inline void read(const View& v, int64_t i, double* p) {
-  for (int k = 0; k < 3; ++k) {
-    Number x;
-    std::memcpy(&x, v.data + i * v.row + k * v.column, sizeof x);
-    p[k] = (double)x;
+static void read(const View& v, int64_t first, int n, const double* T, Strip& c) {
+  const char* from = v.data + first * v.row;
+  for (int i = 0; i < n; ++i, from += v.row)
+    for (int k = 0; k < 3; ++k) {
+      Number x;
+      std::memcpy(&x, from + k * v.column, sizeof x);
+      c.p[k][i] = (double)x;
+    }
+  for (int i = n; i % 4; ++i) c.p[0][i] = c.p[1][i] = c.p[2][i] = 0;
+  const D4 zero = d4(0), one = d4(1);
+  for (int i = 0; i < n; i += 4) {
+    const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
+    const D4 none = (p[0] - p[0]) + (p[1] - p[1]) + (p[2] - p[2]);  // zero, or not a number
+    store4(c.take + i, select(none < one, one, zero));
+    for (int k = 0; k < 3; ++k)
+      store4(c.c[k] + i, d4(T[4 * k]) * p[0] + d4(T[4 * k + 1]) * p[1] + d4(T[4 * k + 2]) * p[2] + d4(T[4 * k + 3]));
   }
 }
 
-static inline void read(const View& v, int64_t i, double* p) { v.single ? read<float>(v, i, p) : read<double>(v, i, p); }
-
-static inline void move(const double* T, const double* p, double* q) {
-  for (int k = 0; k < 3; ++k) q[k] = T[4 * k] * p[0] + T[4 * k + 1] * p[1] + T[4 * k + 2] * p[2] + T[4 * k + 3];
-}
-
-static inline Treat treat(const Kept& k, const double* q) {
-  const double x = q[0] - k.x, y = q[1] - k.y, z = q[2] - k.z, moved2 = x * x + y * y + z * z;
+static inline Treat treat(const Kept& k, const Strip& c, int i) {
+  const double x = c.c[0][i] - k.x, y = c.c[1][i] - k.y, z = c.c[2][i] - k.z, moved2 = x * x + y * y + z * z;
   if (moved2 < (double)k.radius2) return KEPT;
   return moved2 < (double)k.block2 ? IN_BLOCK : moved2 < (double)k.pair2 ? IN_PAIR : SEARCHED;
 }
 
-// Returns how many of the points are not finite.
-static int gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Strip& c) {
+// Moves a strip and decides what is searched. Returns how many of the points are not finite.
+static int gather(const Scope& o, const View& v, int64_t first, int n, const double* T, const Kept* kept, Strip& c) {
+  const Store& s = o.s;
+  v.single ? read<float>(v, first, n, T, c) : read<double>(v, first, n, T, c);
   int ignored = 0;
   for (int i = 0; i < n; ++i) {
-    double p[3], q[3];
-    read(v, first + i, p);
-    c.search[i] = finite(p) ? SEARCHED : IGNORED;
     c.list[i] = nullptr;
-    if (c.search[i] == IGNORED) {
+    if (!(c.take[i] > 0)) {
       for (int k = 0; k < 3; ++k) c.c[k][i] = 0;
-      ++ignored;
+      c.search[i] = IGNORED, ++ignored;
       continue;
     }
-    move(T, p, q);
-    for (int k = 0; k < 3; ++k) c.c[k][i] = q[k];
-    if (kept) c.search[i] = treat(kept[first + i], q);
-    if (c.search[i] != SEARCHED) continue;
-    if (const uint32_t* word = word_at(s, q[0], q[1], q[2])) {
-      c.list[i] = word;
-      fetch(word);
-    }
+    c.search[i] = kept ? treat(kept[first + i], c, i) : SEARCHED;
   }
+  const D4 low[3] = {d4(s.low.x), d4(s.low.y), d4(s.low.z)}, per_cell = d4(o.per_cell);
+  for (int i = 0; i < n; i += 4)
+    for (int k = 0; k < 3; ++k) store4(c.f[k] + i, (load4(c.c[k] + i) - low[k]) * per_cell);
+  for (int i = 0; i < n; ++i)
+    if (c.search[i] == SEARCHED)
+      if (const uint32_t* word = c.list[i] = word_at(s, c.f[0][i], c.f[1][i], c.f[2][i])) fetch(word);
   for (int i = 0; i < n; ++i) {
     c.list[i] = list_of(s, c.list[i]);
     if (c.list[i]) fetch(c.list[i]);
@@ -76,8 +79,9 @@ static int gather(const Store& s, const View& v, int64_t first, int n, const dou
 // Square of a length, with room for rounding; negative where it is not positive.
 static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
 
-static inline Kept kept_at(const Query& q, float lane, float block, float pair, int32_t nearest, uint32_t other) {
-  return {q.x, q.y, q.z, squared(lane), squared(block), squared(pair), nearest, other};
+template <class Room>
+static inline Kept kept_at(const Query& q, const Room& room, int32_t nearest) {
+  return {q.x, q.y, q.z, squared(room.lane), squared(room.block), squared(room.pair), nearest, room.other};
 }
 
 // The nearest lane of the kept neighbour's block, and of the other block where `pair`. `remember`: where what is left of
@@ -91,7 +95,7 @@ static inline int32_t keep_one(const Scope& o, const Query& q, bool pair, const 
   const float moved = 1.0001f * (float)std::sqrt(x * x + y * y + z * z);
   const auto left = [moved](float room2) { return room2 > 0.f ? std::sqrt(room2) - moved : 0.f; };
   const auto room = search.room_left({0.f, left(was.block2), left(was.pair2), was.other});
-  *remember = kept_at(q, room.lane, room.block, room.pair, search.lane(), room.other);
+  *remember = kept_at(q, room, search.lane());
   return search.lane();
 }
 
@@ -104,7 +108,7 @@ static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t*
   if (kept) {
     typename Search<Kind>::Room room{0.f, 0.f, 0.f, NO_CHILD};
     if (o.lead > 0.f) room = search.room();
-    *kept = kept_at(q, room.lane, room.block, room.pair, search.lane(), room.other);
+    *kept = kept_at(q, room, search.lane());
   }
   return search.lane();
 }
@@ -261,7 +265,7 @@ static void sum_plane(int n, const Strip& c, Fours& sums) {
 }
 
 static inline Scope scope_of(const Store& s, const Facing& facing, bool sided, double bound, float lead) {
-  return {s, facing, sided && s.mesh ? &facing.eye : nullptr, bound * bound, (float)bound, lead};
+  return {s, facing, sided && s.mesh ? &facing.eye : nullptr, bound * bound, (float)bound, lead, s.cell > 0 ? 1 / s.cell : 0};
 }
 
 template <class Kind>
@@ -276,7 +280,7 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   Strip c;
   for (int64_t at = first; at < last; at += STRIP) {
     const int n = (int)std::min<int64_t>(STRIP, last - at);
-    effort.ignored += gather(s, v, at, n, look.T, kept, c);
+    effort.ignored += gather(o, v, at, n, look.T, kept, c);
     search<Kind>(o, at, n, kept, kept, c, effort);
     settle<Kind>(o, n, plane ? Ask::NORMAL : newton ? Ask::STIFFNESS : Ask::FOOT, c);
     plane ? sum_plane(n, c, sums) : sum_point(n, c, sums);
@@ -296,7 +300,9 @@ static bool search_beyond(const Scope& o, int n, double known, Strip& c) {
   for (int i = 0; i < n; ++i) {
     if (c.search[i] <= SEARCHED || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
     const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
-    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word_at(o.s, q.x, q.y, q.z)), c.lane[i], nullptr, compared);
+    const Vec3& low = o.s.low;
+    const uint32_t* word = word_at(o.s, (q.x - low.x) * o.per_cell, (q.y - low.y) * o.per_cell, (q.z - low.z) * o.per_cell);
+    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word), c.lane[i], nullptr, compared);
     any = true;
   }
   return any;
@@ -312,7 +318,7 @@ static int match_kind(const Store& s, const View& v, int64_t first, int64_t last
   int found = 0;
   for (int64_t at = first; at < last; at += STRIP) {
     const int n = (int)std::min<int64_t>(STRIP, last - at);
-    gather(s, v, at, n, look.T, kept, c);
+    gather(o, v, at, n, look.T, kept, c);
     search<Kind>(o, at, n, kept, nullptr, c, effort);
     settle<Kind>(o, n, Ask::NORMAL, c);
     if (kept && search_beyond<Kind>(o, n, look.known, c)) settle<Kind>(o, n, Ask::NORMAL, c);
@@ -354,7 +360,7 @@ static int64_t closest_kind(const Store& s, const View& v, int64_t first, int64_
   for (int64_t at = first; at < last; at += STRIP) {
     const int n = (int)std::min<int64_t>(STRIP, last - at);
     if ((at - first) % CHUNK == 0) effort.last = -1;  // the work is that of separate chunks
-    gather(s, v, at, n, T, nullptr, c);
+    gather(o, v, at, n, T, nullptr, c);
     search<Kind>(o, at, n, nullptr, nullptr, c, effort);
     each_four<Kind>(o, n, Ask::NORMAL, c, [&](int i, const D4 (&)[3], const Four& four, D4::Mask in) {
       const D4 none = d4(nan);

@@ -110,7 +110,7 @@ struct Triangles {
     D4 fx = x, fy = y, e = zero;
     Four r{zero, {zero, zero, zero}, select(z < zero, zero - z, z), {n[0], n[1], n[2]}, d4(1), zero};
     if (any(out)) {
-      const Side side = nearest_side(length, cx, cy, x, y);
+      const Side side = nearest_side(length, cx, cy, x, y, ask == Ask::STIFFNESS);
       fx = select(out, side.x, x), fy = select(out, side.y, y), e = select(out, side.e, zero);
       if (ask == Ask::STIFFNESS) {
         const D4 u[3] = {ux, uy, uz}, w[3] = {wx, wy, wz};
@@ -133,14 +133,14 @@ struct Triangles {
     return (eye.x - t.a.x) * n.x + (eye.y - t.a.y) * n.y + (eye.z - t.a.z) * n.z > 0;
   }
 
-  // The nearest place on the three sides, its squared distance in the plane, the unit direction of its side, and whether
-  // it lies between the ends of that side.
+  // The nearest place on the three sides, and its squared distance in the plane. Where `directed`: the unit direction of its
+  // side, and whether it lies between the ends of that side.
   struct Side {
     D4 x, y, e, tx, ty;
     D4::Mask between;
   };
 
-  static Side nearest_side(D4 length, D4 cx, D4 cy, D4 x, D4 y) {
+  static inline Side nearest_side(D4 length, D4 cx, D4 cy, D4 x, D4 y, bool directed) {
     const D4 zero = d4(0), one = d4(1), bx = length - cx, rx = length - x;
     const auto unit = [&](D4 t, D4 most) { return select(t < zero, zero, select(most < t, most, t)); };
     const D4 p = unit((x * cx + y * cy) / (cx * cx + cy * cy), one), q = unit((rx * bx + y * cy) / (bx * bx + cy * cy), one);
@@ -151,9 +151,12 @@ struct Triangles {
     const D4 e12 = select(second, e2, e1);
     const D4::Mask third = e3 < e12;
     const auto of = [&](D4 ab, D4 ac, D4 bc) { return select(third, bc, select(second, ac, ab)); };
+    Side side{of(x1, x2, x3), of(zero, y2, y3), of(e1, e2, e3), zero, zero, third};
+    if (!directed) return side;
     const D4 along = of(x1 / length, p, q), tx = of(one, cx, bx), ty = of(zero, cy, zero - cy);
     const D4 inverse = one / sqrt4(tx * tx + ty * ty);
-    return {of(x1, x2, x3), of(zero, y2, y3), of(e1, e2, e3), inverse * tx, inverse * ty, both(zero < along, along < one)};
+    side.tx = inverse * tx, side.ty = inverse * ty, side.between = both(zero < along, along < one);
+    return side;
   }
 
   static void prefetch_block(const Store& s, uint32_t block) {

@@ -8,6 +8,7 @@ struct Scope {
   double bound2;    // feet at this squared distance or farther do not count [m^2]
   float bound;      // its root [m]
   float lead;       // other primitives are found up to this much beyond the nearest [m]; 0: only the nearest
+  double per_cell;  // cells of the grid along a metre
 };
 
 // Square of a distance and a lead, with room for the rounding of single precision.
@@ -24,10 +25,11 @@ static inline F8 box_distance2(const Node& n, const Query& q) {
   return x * x + y * y + z * z;
 }
 
-// Where the grid keeps the list of the cell that a place is in, or null.
+// Where the grid keeps the list of the cell that a place is in, or null. The place is relative to the corner of the grid,
+// in cells.
 static inline const uint32_t* word_at(const Store& s, double x, double y, double z) {
   if (!(s.cell > 0)) return nullptr;
-  const double inv = 1.0 / s.cell, f[3] = {(x - s.low.x) * inv, (y - s.low.y) * inv, (z - s.low.z) * inv};
+  const double f[3] = {x, y, z};
   int32_t c[3];
   for (int k = 0; k < 3; ++k) {
     if (!(f[k] >= 0 && f[k] < (double)s.size[k] * BRICK)) return nullptr;
@@ -43,8 +45,8 @@ static inline const uint32_t* list_of(const Store& s, const uint32_t* word) {
 }
 
 // Distance of a place in the grid from the centre of its cell, rounded up.
-static inline float off_centre(const Store& s, const Query& q) {
-  const double inv = 1.0 / s.cell, f[3] = {(q.x - s.low.x) * inv, (q.y - s.low.y) * inv, (q.z - s.low.z) * inv};
+static inline float off_centre(const Store& s, const Query& q, double per_cell) {
+  const double f[3] = {(q.x - s.low.x) * per_cell, (q.y - s.low.y) * per_cell, (q.z - s.low.z) * per_cell};
   double sum = 0;
   for (const double x : f) {
     const double d = x - (double)(int32_t)x - 0.5;
@@ -61,7 +63,7 @@ class Search {
  public:
   Search(const Scope& scope, const Query& q)
       : o_(scope), s_(scope.s), q_(q), best_d2_(scope.bound2),
-        p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z)},
+        p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z), 0.f},
         exact_(lenient(s_, scope.bound, 0.f)), limit_(lenient(s_, scope.bound, scope.lead)) {}
 
   // `list`: of the query's cell, or null. `seed`: a lane to begin with, -1 for none; it changes the time, never the
@@ -91,8 +93,8 @@ class Search {
   int64_t compared() const { return compared_; }
 
   // How far the query may move before another primitive (`lane`), one of another block (`block`), or one that is neither in
-  // the lane's block nor in `other` (`pair`) can be the nearest, or one come within the bound. An eye that stays within the
-  // margin of `Facing` makes no difference.
+  // the lane's block nor in `other` (`pair`) can be the nearest, or one come within the bound: half of how much farther than
+  // the nearest these are. An eye that stays within the margin of `Facing` makes no difference.
   struct Room {
     float lane, block, pair;
     uint32_t other;
@@ -142,7 +144,7 @@ class Search {
   bool in_list(const uint32_t* list, uint32_t seed) {
     constexpr int shift = 32 - DISTANCE_BITS;
     const uint32_t n = *list & (MOST_BLOCKS - 1);
-    const float radius = off_centre(s_, q_);
+    const float radius = off_centre(s_, q_, o_.per_cell);
     for (uint32_t k = 1; k <= n; ++k) {
       const float d = (float)(list[k] >> shift) * s_.step - radius;
       if (d > 0.f && !(d * d < limit_)) break;
@@ -155,12 +157,8 @@ class Search {
   }
 
   float to_box2(const Box& b) const {
-    float sum = 0;
-    for (int k = 0; k < 3; ++k) {
-      const float under = b.lo[k] - p_[k], over = p_[k] - b.hi[k], d = under > over ? under : over, out = d > 0.f ? d : 0.f;
-      sum += out * out;
-    }
-    return sum;
+    const F4 p = load4(p_), out = max4(max4(load4(b.lo) - p, p - load4(b.hi)), f4(0.f));
+    return sum3(out * out);
   }
 
   void in_tree() {
@@ -293,7 +291,7 @@ class Search {
   const Query& q_;
   int32_t lane_ = -1;                     // the best so far, with its exact squared distance and height
   double best_d2_, best_height_ = 0;
-  float p_[3];  // the query relative to the model's centre
+  float p_[4];  // the query relative to the model's centre; the last is not used
   float exact_, limit_;  // squared distances under which lanes are measured exactly, and looked at
   float least_ = FAR;   // least squared distance of a lane that counts
   float first_ = FAR, other_ = FAR, third_ = FAR;  // least of the lanes that may count, by blocks

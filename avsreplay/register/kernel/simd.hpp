@@ -20,6 +20,15 @@ struct F8 {
 #endif
 };
 
+struct F4 {
+#if AVS_VECTORS
+  typedef float Raw __attribute__((vector_size(16)));
+  Raw v;
+#else
+  float v[4];
+#endif
+};
+
 struct D4 {
 #if AVS_VECTORS
   typedef double Raw __attribute__((vector_size(32)));
@@ -43,6 +52,10 @@ static inline F8::Mask operator<(F8 a, F8 b) { return a.v < b.v; }
 static inline F8::Mask both(F8::Mask a, F8::Mask b) { return a & b; }
 static inline F8::Mask either(F8::Mask a, F8::Mask b) { return a | b; }
 static inline F8 select(F8::Mask m, F8 a, F8 b) { return {m ? a.v : b.v}; }
+static inline F4 f4(float x) { return {x - F4::Raw{}}; }
+static inline F4 operator+(F4 a, F4 b) { return {a.v + b.v}; }
+static inline F4 operator-(F4 a, F4 b) { return {a.v - b.v}; }
+static inline F4 operator*(F4 a, F4 b) { return {a.v * b.v}; }
 static inline D4 operator+(D4 a, D4 b) { return {a.v + b.v}; }
 static inline D4 operator-(D4 a, D4 b) { return {a.v - b.v}; }
 static inline D4 operator*(D4 a, D4 b) { return {a.v * b.v}; }
@@ -59,6 +72,10 @@ static inline D4 select(D4::Mask m, D4 a, D4 b) { return {m ? a.v : b.v}; }
 #define AVS_MASK8(expression) \
   F8::Mask r;                 \
   for (int k = 0; k < 8; ++k) r.v[k] = (expression) ? -1 : 0; \
+  return r;
+#define AVS_SINGLES4(expression) \
+  F4 r;                          \
+  for (int k = 0; k < 4; ++k) r.v[k] = expression; \
   return r;
 #define AVS_LANES4(expression) \
   D4 r;                        \
@@ -77,6 +94,10 @@ static inline F8::Mask operator<(F8 a, F8 b) { AVS_MASK8(a.v[k] < b.v[k]) }
 static inline F8::Mask both(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] && b.v[k]) }
 static inline F8::Mask either(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] || b.v[k]) }
 static inline F8 select(F8::Mask m, F8 a, F8 b) { AVS_LANES8(m.v[k] ? a.v[k] : b.v[k]) }
+static inline F4 f4(float x) { AVS_SINGLES4(x) }
+static inline F4 operator+(F4 a, F4 b) { AVS_SINGLES4(a.v[k] + b.v[k]) }
+static inline F4 operator-(F4 a, F4 b) { AVS_SINGLES4(a.v[k] - b.v[k]) }
+static inline F4 operator*(F4 a, F4 b) { AVS_SINGLES4(a.v[k] * b.v[k]) }
 static inline D4 operator+(D4 a, D4 b) { AVS_LANES4(a.v[k] + b.v[k]) }
 static inline D4 operator-(D4 a, D4 b) { AVS_LANES4(a.v[k] - b.v[k]) }
 static inline D4 operator*(D4 a, D4 b) { AVS_LANES4(a.v[k] * b.v[k]) }
@@ -87,6 +108,7 @@ static inline D4::Mask either(D4::Mask a, D4::Mask b) { AVS_MASK4(a.v[k] || b.v[
 static inline D4 select(D4::Mask m, D4 a, D4 b) { AVS_LANES4(m.v[k] ? a.v[k] : b.v[k]) }
 #undef AVS_LANES8
 #undef AVS_MASK8
+#undef AVS_SINGLES4
 #undef AVS_LANES4
 #undef AVS_MASK4
 #endif
@@ -97,6 +119,11 @@ static inline F8 load8(const float* p) {
   return r;
 }
 static inline void store8(float* p, F8 a) { std::memcpy(p, &a, sizeof a); }
+static inline F4 load4(const float* p) {
+  F4 r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
 static inline D4 load4(const double* p) {
   D4 r;
   std::memcpy(&r, p, sizeof r);
@@ -148,6 +175,16 @@ static inline F8 max8(F8 a, F8 b) {
   return select(b < a, a, b);
 #endif
 }
+static inline F4 max4(F4 a, F4 b) {
+#if AVS_VECTORS && defined(__SSE2__)
+  return {(F4::Raw)_mm_max_ps((__m128)a.v, (__m128)b.v)};
+#else
+  F4 r;
+  for (int k = 0; k < 4; ++k) r.v[k] = b.v[k] < a.v[k] ? a.v[k] : b.v[k];
+  return r;
+#endif
+}
+static inline float sum3(F4 a) { return a.v[0] + a.v[1] + a.v[2]; }
 static inline F8 clamp8(F8 x, F8 lo, F8 hi) { return min8(max8(x, lo), hi); }
 
 static inline F8 sqrt8(F8 a) {
