@@ -318,3 +318,24 @@ def test_closest_point_on_a_dense_mesh() -> None:
         np.testing.assert_allclose(found.foot, middle, atol=1e-9)
         np.testing.assert_allclose(found.d2, height**2, rtol=1e-6)
     assert not np.any(index.closest(middle + 0.31 * normal).id >= 0)
+
+
+def test_a_ray_ends_at_the_first_face_that_it_meets() -> None:
+    """A point p of a face has (p - eye) . n = range * ray . n there, and no other face is met before it."""
+    surface, eye = shape(), np.array([3.0, 2.0, 2.5])
+    index = SurfaceIndex.build(surface, 1.0)
+    rays = 0.5 * rng(8).standard_normal((400, 3)) - eye
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges, work = index.cast(eye, rays)
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    expected = np.full(len(rays), np.inf)
+    for k, ray in enumerate(rays):
+        M = np.stack([np.broadcast_to(-ray, a.shape), b - a, c - a], axis=-1)
+        t, u, v = np.linalg.solve(M, (eye - a)[..., None])[..., 0].T
+        expected[k] = np.min(t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)], initial=np.inf)
+    assert 100 < np.isfinite(expected).sum() < 400
+    assert np.array_equal(np.isfinite(ranges), np.isfinite(expected))
+    assert np.allclose(ranges, expected, rtol=1e-12)
+    assert work > 0
+    still, _ = index.cast(eye, np.eye(3)[:1])  # away from the model, with components that are zero
+    assert np.isinf(still).all()

@@ -22,12 +22,6 @@ error, which Ledoit and Wolf estimate from the differences between the patches. 
 they follow from Welch and Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics, Theory
 and Methods 15, 1986).
 
-Bias of the noise
-    The closest point is a nonlinear function of the measured one, so that noise near edges, thin parts and curved faces
-    moves the pose in the same way in every scan of a view. The residuals do not show this error. The pose of simulated
-    scans of the model, with noise of the same size, shows it (indirect inference, as in ``size.py``). Where the
-    fit is not close (``neighbourhood.py``), the covariance is enlarged along this error until its chi-square is 1.
-
 ``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
 their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.
 
@@ -36,7 +30,6 @@ The sums run over patches in C++ (``kernel/systematic.cpp``, ``kernel/covariance
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import lru_cache
 from statistics import NormalDist
@@ -45,15 +38,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array, Pose
-from avsreplay.register.surface_index import SurfaceIndex, kernel_module
-
-LEAST_FOR_BIAS = 30  # with fewer points on the model no scan is simulated
-BIAS_ROUNDS, SMALL_STEP = 4, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
-RAY_STEPS, GRAZING = 2, 0.05  # steps along a ray to the model; least cosine between the ray and the normal
-ON_SURFACE = 0.002  # distance over the extent within which these steps end on the model
+from avsreplay.geometry import Array
+from avsreplay.register.surface_index import kernel_module
 
 
 @value_class
@@ -207,61 +194,6 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
     return None if np.isnan(value) else value
 
 
-def bias_of_noise(
-    index: SurfaceIndex,
-    points: NDArray[Any],
-    T_ca: Pose,
-    camera_c: Array | None,
-    width_m: float,
-    P: Array,
-    register: Callable[[Array], Pose],
-) -> tuple[Array, int]:
-    """Return the error (6,) of a registered pose that the noise of its scan causes in the mean, and the work.
-
-    Sought is the true pose for which simulated scans are registered at this pose. The points are moved along their rays
-    onto the model at the true pose of the last round. Normal noise along the rays, with both signs, so that what is
-    linear in it cancels, gives the simulated points. Its size is that which gives the distances from the model that the
-    scan has. The step of a registration of these points from this pose corrects the true pose. The rounds end with a
-    small step.
-
-    Args:
-        index: of the model.
-        points: (n, 3) in {A} [m].
-        T_ca: registered pose.
-        camera_c: (3,) position of the camera in {C} [m]; None: the noise is taken along the normals.
-        width_m: rejection distance of the registration [m].
-        P: (6, 6) covariance of the pose.
-        register: returns T_ca of a scan (k, 3) in {A} [m] after a pass from the given pose.
-
-    Returns:
-        d = [theta; v] in {C}, T_ac_true = T_ac Exp(d); zero with fewer than 30 points on the model. The work is that
-        without ``register``, in point searches.
-    """
-    p = T_ca.apply(points)
-    found = index.closest(p, camera_c=camera_c, most_m=width_m)
-    near = np.isfinite(found.d2)
-    if np.count_nonzero(near) < LEAST_FOR_BIAS:
-        return np.zeros(6), len(p)
-    on, foot, normal = p[near], found.foot[near], found.normal[near]
-    along = None if camera_c is None else _Rays(index, on, camera_c, foot, normal, width_m)
-    clean, rays = (foot, normal) if along is None else along.onto_model(Pose.identity(), RAY_STEPS)
-    noise = noise_along(rays, normal, np.sqrt(found.d2[near]), np.ones(len(on)))
-    simulated = index.closest(clean + noise[:, None] * rays, camera_c=camera_c, most_m=width_m).d2
-    same = float(np.minimum(simulated, width_m**2).sum())
-    noise *= np.sqrt(float(found.d2[near].sum()) / max(same, np.finfo(float).tiny))
-    back, true, bias = T_ca.inverse(), Pose.identity(), np.zeros(6)
-    for k in range(BIAS_ROUNDS):
-        if k and along is not None:
-            clean, rays = along.onto_model(true.inverse(), 1)
-        moved = noise[:, None] * rays
-        step = register(back.apply(true.apply(np.concatenate([clean + moved, clean - moved])))) @ back
-        true = step @ true
-        bias, d = (np.concatenate([geometry.log(each.q), each.t]) for each in (true, step))
-        if d @ np.linalg.solve(P, d) < SMALL_STEP:
-            break
-    return bias, (2 + RAY_STEPS) * len(p)
-
-
 def noise_along(rays: Array, normal: Array, residual: Array, weight: Array) -> Array:
     """Return normal noise (k,) along rays [m] that gives residuals along the normals of the same mean square.
 
@@ -283,35 +215,6 @@ def _normal_numbers(count: int) -> Array:
     numbers = np.array([NormalDist().inv_cdf(float(x)) for x in share])
     numbers.flags.writeable = False
     return numbers
-
-
-class _Rays:
-    """Points (n, 3) in {C} that are moved along their rays onto the model.
-
-    Each step ends on the tangent plane at the last closest point, at most ``most_m`` from the point. ``foot`` and
-    ``normal`` (n, 3) are those of the points; where the steps do not end on the model, ``foot`` is taken.
-    """
-
-    def __init__(
-        self, index: SurfaceIndex, points: Array, camera_c: Array, foot: Array, normal: Array, most_m: float
-    ) -> None:
-        self._index, self._points, self._camera, self._most = index, points, camera_c, most_m
-        self._foot, self._nearest, self._normal = foot, foot, normal
-
-    def onto_model(self, T: Pose, steps: int) -> tuple[Array, Array]:
-        """Return the points, moved by T with the camera, on the model, and the unit rays (n, 3)."""
-        eye = T.apply(self._camera)
-        rays = T.apply(self._points) - eye
-        measured = np.linalg.norm(rays, axis=1)
-        rays /= measured[:, None]
-        for _ in range(steps):
-            cosine = np.minimum(np.einsum("ij,ij->i", self._normal, rays), -GRAZING)
-            ranges = np.einsum("ij,ij->i", self._normal, self._nearest - eye) / cosine
-            at = eye + np.clip(ranges, measured - self._most, measured + self._most)[:, None] * rays
-            found = self._index.closest(at, camera_c=eye)
-            self._nearest, self._normal = found.foot, found.normal
-        on = found.d2 < (ON_SURFACE * self._index.extent_m) ** 2
-        return np.where(on[:, None], at, self._foot), rays
 
 
 def _table_of(found: Evidence, errors: Systematic) -> Any:

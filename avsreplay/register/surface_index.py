@@ -266,20 +266,22 @@ class SurfaceIndex:
         A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most ``least_patches`` occupied cubes
         each point is a patch. ``facing``: as in :class:`IcpParams`. ``matches``: of an alignment of the same points.
         """
-        gate = min(gate_m, self.reach_m)
-        rule = (gate, patch_m, least_patches, facing, threads, matches)
+        rule = (min(gate_m, self.reach_m), patch_m, least_patches, facing, threads, matches)
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
     def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
         """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in ``kernel/grade.hpp``."""
-        found: tuple[Any, ...] = self._index.grade(_points(points), T_ca.matrix, *rule)
-        return found
+        return tuple(self._index.grade(_points(points), T_ca.matrix, *rule))
 
     def distances(self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any) -> tuple[Array, int]:
         """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``: ``kernel/evidence.hpp``."""
-        most_m = min(most_m, self.reach_m)
-        found: tuple[Array, int] = self._index.distances(_points(points), T_ca.matrix, most_m, *sight)
-        return found
+        at, work = self._index.distances(_points(points), T_ca.matrix, min(most_m, self.reach_m), *sight)
+        return at, work
+
+    def cast(self, eye_c: Array, directions: Array) -> tuple[Array, int]:
+        """Ranges (n,) [m] of the first faces of a mesh on rays (n, 3) from ``eye_c`` (3,), inf: none; and the work."""
+        ranges, work = self._index.cast(eye_c.tolist(), np.ascontiguousarray(directions))
+        return ranges, work
 
     def faces_camera(self, points: NDArray[Any], T_ca: Pose, tested: int, least: float) -> bool:
         """Return whether at least a share of the faces closest to about ``tested`` points (n, 3) face the camera."""

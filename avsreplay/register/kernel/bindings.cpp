@@ -19,6 +19,7 @@
 #include "loop.hpp"
 #include "pairs.hpp"
 #include "point_tree.hpp"
+#include "rays.hpp"
 #include "save.hpp"
 
 namespace nb = nanobind;
@@ -268,6 +269,18 @@ class Index {
     {
       nb::gil_scoped_release release;
       work = avs::distances(store_, code(), v, T.v, {known, tested, least_facing}, most, out);
+    }
+    return nb::make_tuple(found, work);
+  }
+
+  nb::tuple cast(const std::array<double, 3>& eye, const Doubles& directions) const {
+    require(store_.mesh && directions.ndim() == 2 && directions.shape(1) == 3, "a mesh, and directions (n, 3)");
+    double* out;
+    auto found = array<double>({directions.shape(0)}, &out);
+    int64_t work;
+    {
+      nb::gil_scoped_release release;
+      work = avs::cast(store_, {eye[0], eye[1], eye[2]}, directions.data(), (int64_t)directions.shape(0), out);
     }
     return nb::make_tuple(found, work);
   }
@@ -611,6 +624,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("threads") = 1, nb::arg("matches").none() = nb::none())
       .def("distances", &Index::distances, nb::arg("points"), nb::arg("T_ca"), nb::arg("most_m"), nb::arg("camera"),
            nb::arg("tested"), nb::arg("least_facing"))
+      .def("cast", &Index::cast, nb::arg("eye"), nb::arg("directions"))
       .def("faces_camera", &Index::faces_camera, nb::arg("points"), nb::arg("T_ca"), nb::arg("tested"), nb::arg("least_facing"))
       .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)
