@@ -190,12 +190,11 @@ def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Arra
     lowest = math.inf
     for k in kinds:
         if widths is None:
-            lowest = min(lowest, disturbed_likelihood(points, coarse, levels, k)[1])
+            lowest = min(lowest, disturbed_likelihood(points, coarse, levels, k))
         else:
             unknown, size = drift_unknowns(frame, points, coarse, widths, open_)
-            likely = ((scale * unknown, size / scale) for scale in _SCALES)
-            found = [disturbed_likelihood(points, coarse, levels, k, others)[0] for others in likely]
-            lowest = min(lowest, float(np.logaddexp.reduce(found)) - math.log(len(_SCALES)))
+            likely = [(scale * unknown, size / scale) for scale in _SCALES]
+            lowest = min(lowest, disturbed_likelihood(points, coarse, levels, k, likely))
         yield BUDGET // 2
     return lowest
 

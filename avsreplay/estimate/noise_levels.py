@@ -18,6 +18,7 @@ The density of a disturbance is the mean over all candidates, none among them, w
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,21 +110,24 @@ def estimate_levels(
         levels: the last estimate.
         claimed: only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
-        others: columns and size of other unknowns, as in ``disturbed_likelihood``.
+        others: effects and size of other unknowns, as in ``disturbed_likelihood``.
         positions: of more poses, from which the density of the force is found; None for those of ``points``.
     """
     n, theta = len(points), _variances(levels)
     open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
     open_[2:4] &= points.shares is not None and bool(np.any(points.shares))
     theta[4:] = [old if given is None else given**2 for old, given in zip(theta[4:], fixed, strict=True)]
-    data, parts = _linearised(points, problem, others)
+    data, parts = _linearised(points, problem)
+    data = data if others is None else _extended(data, *others)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
         theta = _improved(theta, open_, parts, data, points)
         yield n**3 // 40
     likely = theta.copy()
     for k in (k for k in (4, 5) if open_[k]):
-        alone = positions is not None and k == 5
-        odds = _position_odds(likely, positions) if alone and positions else _marginal(likely, k, parts, data)[1]
+        if positions is not None and k == 5:
+            odds = _position_odds(likely, positions)
+        else:
+            odds = _density_odds(_covariance(likely, parts, k), parts.effects[k - 4], data)[1]
         theta[k] = _expected(odds) ** 2
         yield n**3 // 40
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
@@ -145,36 +149,34 @@ def _expected(log_odds: Array) -> float:
     return math.pow(mean, 2.0 / 3.0)
 
 
-def _marginal(theta: Array, k: int, parts: _Components, data: _Residuals) -> tuple[float, Array]:
-    """Log likelihood of the poses without disturbance k, and its increase (n,) with the squares of ``_DENSITIES``.
-
-    It is marginal over the initial values, without its constant.
-    """
-    without = theta.copy()
-    without[k] = 0.0
-    return _density_odds(_covariance(without, parts), parts.effects[k - 4], data)
-
-
 def _position_odds(theta: Array, rows: PositionRows) -> Array:
-    """The increase (n,) of ``_marginal`` by a random force, from positions alone."""
+    """The increase (n,) of the log likelihood by a random force, from positions alone."""
     V = np.kron(np.eye(3), theta[1] * rows.white + theta[3] * rows.common)
     return _density_odds(V, rows.force, _Residuals(rows.e, rows.J, rows.info, np.zeros(len(rows.info))))[1]
 
 
 def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array]:
-    """``_marginal`` for a disturbance with these ``effects`` (m, k) beside noise V; one decomposition gives it."""
+    """Log likelihood of the poses with noise V, and its increase (n,) with the squares of ``_DENSITIES``.
+
+    They are marginal over the initial values, without their constant. ``effects`` (m, k) are those of the disturbance.
+    """
+    none, A, b = _likelihood(V, effects, data)
+    values, vectors = np.linalg.eigh(A)
+    along, gain = vectors.T @ b, _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
+    fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
+    return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
+
+
+def _likelihood(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array, Array]:
+    """Log likelihood of the poses with noise V, and the normal equations (k, k), (k,) of unknowns with ``effects``."""
     root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
     white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
     columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
     Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
     e = np.concatenate([white[:, -1], prior @ data.off])
     left = e - Q @ (Q.T @ e)
-    values, vectors = np.linalg.eigh(columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns))
-    along = vectors.T @ (columns.T @ left)
     none = -0.5 * float(left @ left) - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
-    gain = _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
-    fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
-    return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
+    return none, columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns), columns.T @ left
 
 
 def _slack(e: Array, theta: Array, parts: _Components) -> float:
@@ -185,25 +187,26 @@ def _slack(e: Array, theta: Array, parts: _Components) -> float:
 
 
 def disturbed_likelihood(
-    points: Poses,
-    problem: Problem,
-    levels: NoiseLevels,
-    k: int,
-    others: tuple[Array, Array] | None = None,
-) -> tuple[float, float]:
-    """Log likelihood of the poses without and with a random disturbance of unknown density, and other unknowns.
+    points: Poses, problem: Problem, levels: NoiseLevels, k: int, others: Sequence[tuple[Array, Array]] = ()
+) -> float:
+    """Log likelihood of the poses with a random disturbance of unknown density, or with other unknowns instead.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
         problem: their cost, linearised at the fit.
         levels: variance components; those of the errors of the poses and of the other disturbance are used.
         k: 0 for a random torque, 1 for a random force.
-        others: (n, 6, m) effect on the whitened residuals of each other unknown at its prior 1 sigma, and (m,) size of
-            these unknowns in the motion about which the residuals are, in 1 sigma; None for no others.
+        others: the other unknowns with each of several priors that are equally likely: (n, 6, m) effect on the whitened
+            residuals of each at its prior 1 sigma, and (m,) size in the motion about which the residuals are, in
+            1 sigma.
     """
-    data, parts = _linearised(points, problem, others)
-    none, odds = _marginal(_variances(levels), 4 + k, parts, data)
-    return none, none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
+    data, parts = _linearised(points, problem)
+    V = _covariance(_variances(levels), parts, 4 + k)
+    if others:
+        nothing = np.zeros((len(V), 0))
+        return _log_mean(np.array([_likelihood(V, nothing, _extended(data, *each))[0] for each in others]))
+    none, odds = _density_odds(V, parts.effects[k], data)
+    return none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
 
 
 def _log_mean(values: Array) -> float:
@@ -240,19 +243,24 @@ class _Components:
     effects: tuple[Array, Array]
 
 
-def _linearised(
-    points: Poses, problem: Problem, others: tuple[Array, Array] | None = None
-) -> tuple[_Residuals, _Components]:
+def _linearised(points: Poses, problem: Problem) -> tuple[_Residuals, _Components]:
     """Residuals about the chart of ``problem``, and the six components."""
     e, H = problem.core.rows()
-    J = np.ascontiguousarray((H @ to_errors(problem.chart)).transpose(1, 0, 2)).reshape(6 * len(points), -1)
-    info, off = problem.prior.info, problem.chart.minus(problem.prior.mean)
-    if others is not None:
-        m = others[0].shape[2]
-        J = np.hstack([J, np.ascontiguousarray(others[0].transpose(1, 0, 2)).reshape(-1, m)])
-        info = np.block([[info, np.zeros((20, m))], [np.zeros((m, 20)), np.eye(m)]])
-        off = np.concatenate([off, others[1]])
-    return _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, info, off), _components(points, problem, H)
+    white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
+    found = *_disturbances(points.times_s, problem.chart, H), H @ to_errors(problem.chart)
+    torque, force, J = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in found)
+    f, off = problem.factors**-2.0, problem.chart.minus(problem.prior.mean)
+    C = white * f[0], white * f[1], common * f[0], common * f[1], torque @ torque.T, force @ force.T
+    data = _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, problem.prior.info, off)
+    return data, _Components(C, (torque, force))
+
+
+def _extended(data: _Residuals, effects: Array, size: Array) -> _Residuals:
+    """The residuals with other unknowns, as in ``disturbed_likelihood``."""
+    m = len(size)
+    J = np.hstack([data.J, np.ascontiguousarray(effects.transpose(1, 0, 2)).reshape(-1, m)])
+    info = np.block([[data.info, np.zeros((len(data.info), m))], [np.zeros((m, len(data.info))), np.eye(m)]])
+    return _Residuals(data.e, J, info, np.concatenate([data.off, size]))
 
 
 def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
@@ -260,24 +268,14 @@ def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
     return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(BLOCKS)]
 
 
-def _covariance(theta: Array, parts: _Components) -> Array:
-    """V (6n, 6n) of the residuals."""
+def _covariance(theta: Array, parts: _Components, without: int | None = None) -> Array:
+    """V (6n, 6n) of the residuals, ``without`` one of the disturbances."""
     V, half = np.zeros_like(parts.C[4]), len(parts.C[0])
     V[:half, :half], V[half:, half:] = _pose_errors(theta, parts)
-    for density, C in zip(theta[4:], parts.C[4:], strict=True):
-        if density > 0.0:
-            V += density * C
+    for k in (4, 5):
+        if theta[k] > 0.0 and k != without:
+            V += theta[k] * parts.C[k]
     return V
-
-
-def _components(points: Poses, problem: Problem, H: Array) -> _Components:
-    n = len(points)
-    white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
-    f = problem.factors**-2.0
-    found = _disturbances(points.times_s, problem.chart, H)
-    torque, force = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in found)
-    noise = white * f[0], white * f[1], common * f[0], common * f[1]
-    return _Components((*noise, torque @ torque.T, force @ force.T), (torque, force))
 
 
 def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]:
