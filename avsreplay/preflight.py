@@ -14,6 +14,7 @@ from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register import Registrar
 
 SCANS = 5
+OFF_THE_MODEL = 0.25  # distance of the grasp point from the bounding box, in extents, above which it is reported
 _POSES = 200  # measured poses examined
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 
@@ -35,8 +36,8 @@ def preflight(
     info, scans = source.info(), _sampled(source)
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
     if source.options.poses:
-        return [*_poses(source, surface), *general]
-    found = [*_contents(source, scans, surface, registrar, search), *_faces(surface), *general]
+        return [*_poses(source, surface), *_grasp_point(surface), *general]
+    found = [*_contents(source, scans, surface, registrar, search), *_faces(surface), *_grasp_point(surface), *general]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
@@ -49,6 +50,18 @@ def _faces(surface: Surface | None) -> list[Advice]:
         return []
     text = f"{surface.reversed} of {len(surface.faces)} faces pointed inwards and are used reversed"
     return [Advice("ok", "faces", text)]
+
+
+def _grasp_point(surface: Surface | None) -> list[Advice]:
+    """Whether the grasp point, the origin of {C}, is far outside of the model's bounding box."""
+    if surface is None or not surface.sha256:
+        return []
+    outside = np.maximum(np.maximum(surface.vertices.min(axis=0), -surface.vertices.max(axis=0)), 0.0)
+    distance = float(np.linalg.norm(outside))
+    if distance <= OFF_THE_MODEL * surface.extent:
+        return []
+    text = f"the grasp point, the origin of the model, is {distance:.3g} m outside of the model"
+    return [Advice("check", "grasp point", text, "--grasp X,Y,Z")]
 
 
 def _sampled(source: Source) -> list[Scan]:

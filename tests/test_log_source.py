@@ -403,3 +403,21 @@ def test_an_empty_cloud_is_an_empty_scan(tmp_path: Path) -> None:
 def test_the_log_clock_can_be_chosen(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", header(np.random.Generator(np.random.PCG64(1))), CLOUDS)
     assert [s.t_ns for s in read(tmp_path / "a.mcap", clock=ClockChoice.LOG)] == [c.log_ns for c in CLOUDS]
+
+
+def test_model_and_truth_move_with_the_grasp_point() -> None:
+    log, grasp = Path(__file__).parents[1] / "fixtures" / "tumble.mcap", (0.3, -0.2, 0.5)
+    by = Pose(geometry.IDENTITY_QUAT, np.array(grasp))
+    with open_source(log) as plain, open_source(log, SourceOptions(grasp=grasp)) as moved:
+        assert plain.header.surface is not None
+        assert moved.header.surface is not None
+        np.testing.assert_allclose(moved.header.surface.vertices, plain.header.surface.vertices - grasp, atol=1e-12)
+        assert moved.header.start is None
+        for seq in (0, len(plain) - 1):
+            scan = plain.scan_at(seq)
+            before, after = plain.truth_of(scan), moved.truth_of(scan)
+            assert before.pose is not None
+            assert after.pose is not None
+            assert after.state is not None
+            np.testing.assert_allclose(after.pose.matrix, (before.pose @ by).matrix, atol=1e-12)
+            np.testing.assert_allclose(after.state.T_ac.matrix, after.pose.matrix, atol=1e-6)

@@ -138,6 +138,18 @@ def test_the_grasp_point_is_the_origin_of_the_measured_poses_moved_with_the_body
             np.testing.assert_allclose(scan.pose.T_ac.t, pose.t + geometry.matrix(pose.q) @ grasp, atol=1e-9)
 
 
+def test_true_poses_are_those_of_the_grasp_point(tmp_path, motion) -> None:
+    times, _, noisy = motion
+    log = tum(tmp_path / "a.tum", times, noisy)
+    grasp = (0.3, -0.1, 0.2)
+    with open_source(log, SourceOptions(poses=True, grasp=grasp, truth_file=log)) as source:
+        for scan in source.scans():
+            true = source.truth_of(scan).pose
+            assert scan.pose is not None
+            assert true is not None
+            np.testing.assert_allclose(true.t, scan.pose.T_ac.t, atol=1e-9)
+
+
 def test_a_bad_pose_becomes_a_row_and_the_run_continues(tmp_path, motion) -> None:
     times, _, noisy = motion
     log = tum(tmp_path / "a.tum", times[:16], noisy[:16])

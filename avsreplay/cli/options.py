@@ -121,6 +121,9 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
     given = {name: value for name, value in flags.items() if value is not None}
     if "clock" in given:
         given["clock"] = ClockChoice(given["clock"])
+    if "grasp" in given and given.get("model") == Path("auto"):
+        hint = "build the model first with 'avsreplay model', which has the same option"
+        raise UsageError("the frame of a model is not known before it is built", where="--grasp", hint=hint)
     if "model_unit" in given:
         given["model_unit"] = Unit(given["model_unit"])
     try:

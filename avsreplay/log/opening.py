@@ -164,19 +164,8 @@ def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
 
 
 def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
-    """The header of a source of measured poses: its model in the frame of the grasp point, or one of the given size.
-
-    Without a model an octahedron of the stated extent stands for the target. Start and true state of the log refer to
-    the original frame {C} and are dropped where the grasp point is another.
-    """
-    surface = header.surface
-    if surface is None:
-        surface = octahedron(options.extent_m)
-    elif options.grasp is not None:
-        surface = replace(surface, vertices=surface.vertices - np.array(options.grasp))
-    if options.grasp is not None:
-        header = replace(header, start=None, truth=None)
-    return replace(header, surface=surface)
+    """The header of a source of measured poses; without a model an octahedron of the stated extent is the target."""
+    return replace(header, surface=octahedron(options.extent_m)) if header.surface is None else header
 
 
 def _head(path: Path) -> bytes:

@@ -49,7 +49,11 @@ class SourceOptions(Settings):
         unset="the covariance of the message, else estimator.r0_pos_m and r0_rot_deg, adapted to the residuals",
     )
     grasp: tuple[float, float, float] | None = setting(
-        None, "Grasp point in the frame of the measured poses, the origin of {C}.", unit="m", unset="their origin"
+        None,
+        "Grasp point in the frame of the model, or of the measured poses. It becomes the origin of {C}; true poses are"
+        " moved with it, and a start in the log is not used.",
+        unit="m",
+        unset="the origin of that frame",
     )
     extent_m: float = setting(
         1.0,

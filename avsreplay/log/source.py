@@ -21,7 +21,7 @@ from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud, selected
-from avsreplay.log.streams import CloudStream, GroundTruth, ahead
+from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
 _BLOCK = 1 << 20
@@ -60,6 +60,8 @@ class Source:
             extra: ``profile`` and ``library`` of the file for ``info``, where it states them.
             losses: parts that could not be read, apart from those of ``clouds``.
         """
+        if options.grasp is not None:
+            header, ground_truth = about_grasp(np.array(options.grasp), header, ground_truth)
         self.path, self.header, self.options = path, header, options
         self._clouds, self._ground_truth, self._files = clouds, ground_truth, tuple(files)
         self._extra = extra or {}

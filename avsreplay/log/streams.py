@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TypeVar
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError, value_class
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import MessageClouds, Recording, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
@@ -25,6 +26,7 @@ from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
 from avsreplay.log.scan_files import read_points
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
+from avsreplay.records import LogHeader
 
 T = TypeVar("T")
 _WAIT_S = 0.1
@@ -199,6 +201,30 @@ class GroundTruth:
     sensor: Callable[[int, str], Pose | None] | None = None
     moving_in: Callable[[str], str | None] = lambda _frame: None
     frames: Sequence[str] = ()
+
+
+def about_grasp(grasp: Array, header: LogHeader, known: GroundTruth) -> tuple[LogHeader, GroundTruth]:
+    """Return model and truth with the origin of {C} at a grasp point; the start of the log is about the old origin.
+
+    Args:
+        grasp: (3,) in the frame of the model, or of the measured poses [m].
+        header: of the log.
+        known: its ground truth.
+    """
+    surface, body, lookup = header.surface, header.truth, known.truth
+    if surface is not None and surface.sha256:  # not the octahedron that stands for a target without a model
+        surface = replace(surface, vertices=surface.vertices - grasp)
+    if body is not None:
+        body = replace(body, c_b=body.c_b + geometry.matrix(body.q_bc) @ grasp)
+    header = replace(header, surface=surface, truth=body, start=None)
+    if lookup is None:
+        return header, known
+
+    def moved(t_ns: int, place: int, frame: str) -> Pose | None:
+        pose = lookup(t_ns, place, frame)
+        return pose and pose @ Pose(geometry.IDENTITY_QUAT, grasp)
+
+    return header, replace(known, truth=moved)
 
 
 @dataclass(slots=True)
