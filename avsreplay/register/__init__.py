@@ -94,6 +94,7 @@ class ModelCheck:
         """
         self._registrar, self._surface = registrar, surface
         self._aligned, self._matched, self._ambiguous = 0, False, ""
+        self._size_open = self._duration_open = True  # whether the scans so far do not exclude a value to report
         self._deltas: list[float] = []
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
@@ -118,15 +119,15 @@ class ModelCheck:
         if found.status is AlignStatus.AMBIGUOUS:
             self._ambiguous = self._ambiguous or found.free_directions
         on_model = found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_ON_MODEL
-        if (found.status is AlignStatus.ALIGNED or on_model) and not self._settled():
+        if (found.status is AlignStatus.ALIGNED or on_model) and self._size_open:
             self._add_place(scan, found.T_ac)
         if found.status is not AlignStatus.ALIGNED:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
         self._aligned += 1
-        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and not self._settled():
+        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
             self._measure(points, found)
-        if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open():
+        if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open:
             self._measure_duration(scan, scan.places, found.T_ac)
         self._last = scan.t_ns, found.T_ac
 
@@ -182,13 +183,6 @@ class ModelCheck:
         """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
         return _jackknife(np.array(self._deltas), np.array(self._weights))
 
-    def _settled(self) -> bool:
-        """Whether the scans so far exclude an error of size that would be reported."""
-        if len(self._deltas) < ENOUGH_SCANS:
-            return False
-        mean, spread, _ = self._mean()
-        return abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
-
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
         if not self._matched:
@@ -221,6 +215,9 @@ class ModelCheck:
             self._deltas.append(measured.delta)
             self._weights.append(1.0 / measured.sigma**2)
             self._points.append((p, camera_c))
+            if len(self._deltas) >= ENOUGH_SCANS:
+                mean, spread, _ = self._mean()
+                self._size_open = not abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
 
     def _measure_duration(self, scan: Scan, places: NDArray[Any], T_ac: Pose) -> None:
         if self._last is None or (period := 1e-9 * (scan.t_ns - self._last[0])) <= 0.0:
@@ -236,19 +233,16 @@ class ModelCheck:
         measured = fitted_duration(self._registrar.index, p, T_ca.t if self._registrar.sided else None, motion)
         if measured is not None and measured[1] > 0.0:
             self._durations.append((*measured, period))
+            if (count := len(self._durations)) >= _LEAST_DURATIONS:
+                mean, spread, typical = self._duration()
+                most = abs(mean) + SIGMAS * spread
+                self._duration_open = count < _MOST_DURATIONS and most > _LEAST_OF_PERIOD * typical
 
     def _duration(self) -> tuple[float, float, float]:
         """The mean duration of a scan weighted by its variance, its standard error (jackknife), the period [s]."""
         duration, sigma, period = np.array(self._durations).T
         mean, spread, _ = _jackknife(duration, 1.0 / sigma**2)
         return mean, spread, float(np.median(period))
-
-    def _duration_open(self) -> bool:
-        """Whether the scans so far do not exclude a duration that would be reported."""
-        if len(self._durations) < _LEAST_DURATIONS:
-            return True
-        mean, spread, period = self._duration()
-        return len(self._durations) < _MOST_DURATIONS and abs(mean) + SIGMAS * spread > _LEAST_OF_PERIOD * period
 
     def _duration_note(self) -> tuple[float, str] | None:
         """The duration of a scan in its standard errors, and the text; None if it is not significant."""
