@@ -28,7 +28,7 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
     Raises:
         ValueError: the values have another shape.
     """
-    array = np.array(values, dtype=np.float64, order="C")
+    array = np.array(values, np.float64, order="C")
     if shape and array.shape != shape:
         sizes = zip(shape, array.shape, strict=False)
         if len(shape) != array.ndim or any(s not in (-1, n) for s, n in sizes):
@@ -289,8 +289,7 @@ class Pose:
     t: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "q", frozen(normalise(self.q), 4))
-        object.__setattr__(self, "t", frozen(self.t, 3))
+        self.q, self.t = frozen(normalise(self.q), 4), frozen(self.t, 3)  # type: ignore[misc]
 
     @classmethod
     def identity(cls) -> Pose:

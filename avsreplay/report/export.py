@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.report import Summary
 from avsreplay.report.jsonl import field_types, plain
 from avsreplay.report.verdict import verdict_of
@@ -59,7 +59,7 @@ def stamp_text(t_ns: int) -> str:
 
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
     """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return their number."""
-    return _write_lines(path, (f"{stamp_text(t_ns)} {_text((*pose.t, *pose.q))}" for t_ns, pose in poses))
+    return _write_lines(path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses))
 
 
 def write_kitti(path: str | Path, poses: Iterable[Pose | None]) -> int:
@@ -69,12 +69,12 @@ def write_kitti(path: str | Path, poses: Iterable[Pose | None]) -> int:
     """
     listed = list(poses)
     nothing = " ".join(["nan"] * 12)
-    _write_lines(path, (nothing if pose is None else _text(pose.matrix[:3].reshape(-1)) for pose in listed))
+    _write_lines(path, (nothing if pose is None else _text(pose.matrix[:3].ravel()) for pose in listed))
     return sum(pose is not None for pose in listed)
 
 
-def _text(values: Iterable[Any]) -> str:
-    return " ".join(repr(float(v)) for v in values)
+def _text(values: Array) -> str:
+    return " ".join(map(repr, values.tolist()))
 
 
 def _write_lines(path: str | Path, lines: Iterable[str]) -> int:

@@ -56,7 +56,11 @@ def plain(value: Any) -> Any:
 
 def dump_row(row: Row) -> str:
     """One line of JSON, without the line end."""
-    return _ENCODE(dict(zip(_NAMES, map(plain, _VALUES(row)), strict=True)))
+    values = _VALUES(row)
+    try:
+        return _ENCODE(dict(zip(_NAMES, values, strict=True)))
+    except (TypeError, ValueError):  # a numpy scalar, or a float that is not finite
+        return _ENCODE(dict(zip(_NAMES, map(plain, values), strict=True)))
 
 
 class RowWriter:
