@@ -562,6 +562,7 @@ nb::tuple pair_sums(const Doubles& points, const Doubles& normals, const Doubles
 }  // namespace
 
 NB_MODULE(_kernel, m) {
+  keep_freed_memory();
   m.attr("LAYOUT") = LAYOUT;
   m.def("checksum", [](const Bytes& b) { return checksum(reinterpret_cast<const char*>(b.data()), b.size()); }, nb::arg("payload"));
   nb::class_<Matches>(m, "Matches");

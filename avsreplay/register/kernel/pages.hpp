@@ -6,8 +6,22 @@
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
 
 namespace avs {
+
+// Memory that is freed stays with the process, up to these sizes [B], which are those that the C library chooses by itself
+// once a block of 32 MB is freed. Otherwise the arrays of each scan return to the system, which clears every page again for
+// the next scan: 60 to 220 page faults and up to a seventh of the time of a registration.
+inline void keep_freed_memory() {
+#if defined(__GLIBC__)
+  constexpr int LARGEST_KEPT = 32 << 20, MOST_KEPT = 64 << 20;
+  ::mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT);
+  ::mallopt(M_TRIM_THRESHOLD, MOST_KEPT);
+#endif
+}
 
 template <class T>
 struct Pages {
