@@ -171,6 +171,18 @@ def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
     assert all((tree.query(points)[0] < 0.1).mean() > 0.9 for points in moved)
 
 
+def test_the_symmetries_of_a_body_are_exact_so_that_a_turned_part_of_it_still_fits() -> None:
+    parts = [trimesh.creation.cylinder(radius=r, height=h, sections=8) for r, h in ((1.8, 0.3), (0.6, 0.2))]
+    parts[1].apply_translation((0.0, 0.0, 0.25))
+    body = trimesh.util.concatenate(parts)
+    registrar = Registrar(_mesh(body))
+    points, _ = sample(_mesh(body), 500)
+    motions = [T for T in registrar._symmetry.search.symmetries if T[2, 2] > 0.5]  # about z: the body has a top
+    assert motions
+    for T in motions:
+        assert registrar.distance(points, Pose.from_matrix(T), 1.0).max() < 1e-4 * registrar.index.extent_m
+
+
 def test_attitudes_cover_all_rotations() -> None:
     """Every rotation is within 30 deg, less than a plane start's basin, of one of 600."""
     quaternions = attitudes(600)

@@ -105,15 +105,15 @@ class GlobalSearch:
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
         self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
         self._middle = points.mean(axis=0)
-        if "symmetries" not in kept:
-            kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
-        self.symmetries = kept["symmetries"]
-        self._spent, self._most, self._registered = 0, 0, REFINED_POINTS  # work of the round, its limit; points
+        self._spent, self._most, self._registered = 0, 2**62, REFINED_POINTS  # work of the round, its limit; points
         coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
             for passes in (FIRST_FINE, FINE_PASSES)
         )
+        if "symmetries" not in kept:
+            kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
+        self.symmetries = kept["symmetries"]
 
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
@@ -226,10 +226,10 @@ class GlobalSearch:
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         starts = np.concatenate([first.matrix[None], self.symmetries @ first.matrix])
-        turned, costs = self._field.refine(some, starts, TURNED_PASSES, 4.0 * width, *rule)
-        near = costs < costs[0] + RIVAL_WITHIN
-        near[0] = False
-        rivals = [Pose.from_matrix(T) for T in _best(turned[near], costs[near], TURNED_RIVALS)]
+        turned, costs = self._field.refine(some, starts, TURNED_PASSES, width, *rule)
+        near = 1 + np.flatnonzero(costs[1:] < costs[0] + RIVAL_WITHIN)
+        others = np.concatenate([starts[:1], _best(turned[near], costs[near], len(near))])
+        rivals = [Pose.from_matrix(T) for T in self._different(others, 1 + TURNED_RIVALS, 0.5)[1:]]
         return [*found, *self._to_the_end(fine, rivals, width, least)[0]]
 
     def _to_the_end(
@@ -251,14 +251,16 @@ class GlobalSearch:
         return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
     def _near_symmetries(self, points: Array) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, registered to it; not the identity."""
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
         rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
         poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)
         apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
-        return np.ascontiguousarray(poses[apart & (costs < SYMMETRIC)][:SYMMETRIES])
+        best = poses[apart & (costs < SYMMETRIC)][:SYMMETRIES]
+        ended = [self._ended(self._refine, points, Pose.from_matrix(T), COARSE_OF_EXTENT * self._extent) for T in best]
+        return np.array([T_ca.matrix for T_ca in ended]).reshape(-1, 4, 4)
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
         distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)
