@@ -83,12 +83,13 @@ def explain(
         left_out = first_doubtful // 2
         return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit)
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
-    n = len(epochs)
+    n, edges = len(epochs), np.append(0.0, window.times_s)
+    between = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
         _manoeuvre(window, start, white, free, priors, n),
-        _disturbed(window, start, white, free, n),
-        _accelerated(window, start, white, free, priors, n),
+        _disturbed(edges, between, white, free),
+        _accelerated(edges, between, white, free, priors),
         _sensor_bias(window, white, free, priors, n),
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
@@ -131,7 +132,7 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     single = free + mixed(columns, white, scale, _CHANGES)
     k = int(np.argmax(single))
-    found = [replace(_changes(instants[[k]], columns[[k]], white, free, scale), log_evidence=float(single[k]))]
+    found = [replace(_changes(instants[[k]], columns[[k]], white, free, scale)[0], log_evidence=float(single[k]))]
     two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array([count // 8, count - 1 - count // 8])
     total = [log_mean(single.tolist())]
     for m in range(1, len(_SPREAD)):
@@ -141,10 +142,10 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
             continue
         values = free + _joint(columns, white, scale, np.array(chosen))
         c = chosen[int(np.argmax(values))]
-        likely = _thrust_like(instants[c], columns[c], white, scale)
+        most_likely, likely = _changes(instants[c], columns[c], white, free, scale)
         total.append(log_mean(values.tolist()) if likely else -math.inf)
         if likely:
-            found.append(_changes(instants[c], columns[c], white, free, scale))
+            found.append(most_likely)
     fine, value = _located(window, start, white, free, scale, instants, single)
     total[0] = max(total[0], value - math.log(float(window.times_s[-1])))
     odds = float(np.logaddexp.reduce(np.log(_SPREAD) + total)) + PRIOR_ODDS
@@ -155,15 +156,15 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     return replace(best, log_evidence=odds, onset=onset)
 
 
-def _disturbed(window: Window, start: Belief, white: Array, free: float, n: int) -> Explanation:
+def _disturbed(edges: Array, between: Array, white: Array, free: float) -> Explanation:
     """Random torque or force beyond what is allowed for: an impulse between every two scans.
 
     ``size`` holds the most likely root density of the rate [rad/s^1.5] or of the velocity [m/s^1.5], three times each.
     A constant torque changes the velocity in every interval as well, unlike a manoeuvre.
+
+    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6n, 6) the effects of a change in each middle.
     """
-    edges = np.concatenate([[0.0], window.times_s])
-    columns = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1])) * np.sqrt(np.diff(edges))[:, None, None]
-    found = []
+    columns, found, n = between * np.sqrt(np.diff(edges))[:, None, None], [], len(between)
     for kind in _CHANGES[:2]:
         A = columns[:, :, kind].transpose(1, 0, 2).reshape(6 * n, -1)
         values, vectors = np.linalg.eigh(A.T @ A)
@@ -178,19 +179,18 @@ def _disturbed(window: Window, start: Belief, white: Array, free: float, n: int)
     return max(found, key=lambda f: f.log_evidence)
 
 
-def _accelerated(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
-    """A constant torque or force: the same change of the velocity per second in every interval.
+def _accelerated(edges: Array, between: Array, white: Array, free: float, priors: ChangePriors) -> Explanation:
+    """A constant torque or force: the same change of the velocity per second in every interval, as in ``_disturbed``.
 
     ``size`` holds the root densities of random disturbances that cause changes as large over the window.
     """
-    edges = np.concatenate([[0.0], window.times_s])
-    columns = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1])) * np.diff(edges)[:, None, None]
-    M, scale = columns.sum(axis=0), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    M, scale = np.tensordot(np.diff(edges), between, 1), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     found = [(kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2]) for kind in _CHANGES for f in SCALES]
     kind, _, u = max(found, key=lambda f: f[1])
     left, size = white - M[:, kind] @ u, np.zeros(6)
     size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
     value = log_mean([float(value) for _, value, _ in found]) + PRIOR_ODDS
+    n = len(between)
     return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), 6 * n - len(u), n, size=size)
 
 
@@ -230,7 +230,7 @@ def _located(
     P = (held[:, None, None] * (C + (sizes - size)[:, :, None] * (sizes - size)[:, None, :])).sum(axis=0)
     below = np.cumsum(share)
     ends = np.clip(np.searchsorted(below, [_TAIL, 1.0 - _TAIL]) + np.array([-1, 1]), 0, len(instants) - 1)
-    at_best = _changes(instants[[k]], columns[[k]], white, free, scale)
+    at_best, _ = _changes(instants[[k]], columns[[k]], white, free, scale)
     changes = tuple(np.unique(instants[ends]).tolist())
     found = replace(at_best, log_evidence=float(single[k]), after_s=after_s, after_1s_s=spread)
     return replace(found, size=size, P=P, changes_s=changes), value
@@ -254,8 +254,11 @@ def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]
     return log_ratio(A, g[at].reshape(-1, size))
 
 
-def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> Explanation:
-    """Changes at given instants; size and P are those of their sum, ``after_s`` their mean weighted by size."""
+def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> tuple[Explanation, bool]:
+    """Changes at given instants, and whether they may be those of a thrust or an impact.
+
+    Size and P are those of their sum, ``after_s`` their mean weighted by size.
+    """
     m = len(columns)
     M = np.hstack(list(columns))
     value, u, P = log_evidence(white, free, M, np.tile(scale, m))
@@ -264,7 +267,7 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
     share = np.linalg.norm(u.reshape(m, 6) / scale, axis=1)
     share = share / max(float(share.sum()), 1e-300)
     after_s = float(share @ instants)
-    return Explanation(
+    found = Explanation(
         Hypothesis.MANOEUVRE,
         float(value),
         float(left @ left),
@@ -276,20 +279,18 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
         joined @ P @ joined.T,
         tuple(instants.tolist()),
     )
+    return found, m > 1 and _thrust_like(instants, u, P, found)
 
 
-def _thrust_like(instants: Array, columns: Array, white: Array, scale: Array) -> bool:
-    """Return whether changes at ``instants`` (m,) may be those of a thrust or an impact.
+def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
+    """Return whether changes u (6m,) at ``instants`` (m,), with the sum ``net``, may be those of a thrust or an impact.
 
     The velocity during either lies between those before and after, give or take their difference. Changes that cancel
     displace the target further than that, or leave no change of the velocity: they imitate a wrong pose.
     """
-    m = len(instants)
-    _, u, P = log_evidence(white, 0.0, np.hstack(list(columns)), np.tile(scale, m))
-    net, joined = u.reshape(m, 6).sum(axis=0), np.tile(np.eye(6), m)
-    if net @ np.linalg.solve(joined @ P @ joined.T, net) < _A_CHANGE:
+    if net.size @ np.linalg.solve(net.P, net.size) < _A_CHANGE:
         return False
-    v, acts = u.reshape(m, 6)[:, 3:], instants[-1] - instants
+    v, acts = u.reshape(-1, 6)[:, 3:], instants[-1] - instants
     change, moved = v.sum(axis=0), acts @ v
     size = float(np.linalg.norm(change))
     early = float(np.clip(moved @ change / max(size * size, 1e-300), 0.0, acts[0]))
