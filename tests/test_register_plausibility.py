@@ -16,7 +16,7 @@ from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.quality import Visibility
 from avsreplay.register.restarts import HEALTHY_SCANS, Budget
 from avsreplay.register.sampling import segments, without_scattered_points
-from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 SEED = 7
 
@@ -189,3 +189,22 @@ def test_a_complete_visible_side_is_told_from_one_with_gaps(surface: Surface) ->
     scan = hidden_view(surface, T_ac, 3000, rng)
     assert test.check(scan, T_ac.inverse()).covered
     assert not test.check(scan[scan[:, 0] < np.median(scan[:, 0])], T_ac.inverse()).covered
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_scan_cut_along_any_direction_of_its_image_is_narrower(dtype):
+    rng = np.random.default_rng(7)
+    model = rng.uniform(-1.0, 1.0, (400, 3))
+    T_ca = Pose(geometry.exp([0.3, -1.1, 0.4]), np.array([4.0, 9.0, -6.0]))
+    scan = T_ca.inverse().apply(model).astype(dtype)
+    narrower = kernel_module().is_narrower
+    assert not narrower(scan, T_ca.matrix, model, 0.99)
+    assert narrower(scan, T_ca.matrix, model, 1.01)
+    towards = np.median(scan, axis=0) / np.linalg.norm(np.median(scan, axis=0))
+    image = scan / (scan @ towards)[:, None]
+    for turn in np.radians([0.0, 37.0, 90.0, 141.0]):
+        x = np.cross(towards, [1.0, 0.0, 0.0])
+        along = image @ (np.cos(turn) * x + np.sin(turn) * np.cross(towards, x))
+        cut = scan[along < np.median(along)]
+        assert narrower(cut, T_ca.matrix, model, 0.8)
+        assert narrower(np.repeat(cut, 2, axis=0)[::2], T_ca.matrix, model, 0.8)

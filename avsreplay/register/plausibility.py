@@ -54,8 +54,7 @@ LEAST_ALONE = 0.9  # share on the model of the points that do not hide it: missi
 BEFORE_OF_EXTENT = 0.25  # a point that hides the model is this much nearer; a part of the model is less, as a rule
 PREDICTED = 1.0  # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
 NEAR_OF_EXTENT, MOST_HIDDEN = 0.05, 0.5  # where fewer points are nearer, the noise at a predicted pose is theirs
-PARTIAL = 0.8  # a scan narrower than so much of the model, along one of the directions ``ACROSS``, shows a part of it
-ACROSS = np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])  # directions in the image
+PARTIAL = 0.8  # a scan narrower than so much of the model, in one of four directions of the image, shows a part of it
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -89,7 +88,7 @@ class PlausibilityTest:
         self._index, self._visibility, self._gate, self._extent = index, visibility, gate_m, surface.extent
         self._points, self._normals = sample(surface, SURFACE_POINTS)
         self._points = self._points[:: max(1, len(self._points) // SURFACE_POINTS)]
-        self._normals, self._columns = self._normals[: len(self._points)], np.ascontiguousarray(self._points.T)
+        self._points, self._normals = np.ascontiguousarray(self._points), self._normals[: len(self._points)]
 
     def refused(self, scan: NDArray[Any], points: int, guess: Pose | None = None) -> Alignment | None:
         """Return the alignment of a scan that is not registered at all; None for others.
@@ -136,8 +135,7 @@ class PlausibilityTest:
         """
         if not self._visibility.may_be_camera(T_ca):
             return False
-        image, T_ac = _Image(points), T_ca.inverse()
-        return bool((image.spans(points.T) < PARTIAL * image.spans(T_ac.R @ self._columns + T_ac.t[:, None])).any())
+        return bool(kernel_module().is_narrower(points, T_ca.matrix, self._points, PARTIAL))
 
     def turned_away(self, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether most points (n, 3) in {A} are on faces that face away from a camera at the origin."""
@@ -278,11 +276,6 @@ class _Image:
         """Return the coordinates (n, 2) of points (n, 3) in {A} in the tangent plane."""
         turned = points @ self._axes.T
         return np.asarray(turned[:, :2] / turned[:, 2:])
-
-    def spans(self, points: NDArray[Any]) -> Array:
-        """Return the extents of points (3, n) along the directions ``ACROSS`` in the tangent plane."""
-        turned = self._axes @ points
-        return np.asarray(np.ptp(ACROSS.T @ (turned[:2] / turned[2]), axis=1))
 
     def cells(self, points: Array) -> NDArray[np.int64]:
         """Return the number of the cell of each point (n, 3); a cell has about ``POINTS_PER_CELL`` of them."""

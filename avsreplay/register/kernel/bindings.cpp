@@ -559,6 +559,15 @@ nb::tuple pair_sums(const Doubles& points, const Doubles& normals, const Doubles
   return nb::make_tuple(matrices, sides, distances, totals);
 }
 
+bool is_narrower_at(nb::handle points, const Doubles& T_ca, const Doubles& model, double least) {
+  require(are_vectors(model, model.shape(0)), "points of the model must be (n, 3)");
+  const Cloud cloud(points);
+  const View v = cloud.view();
+  const Rows T = rows(T_ca);
+  nb::gil_scoped_release release;
+  return is_narrower(v, T.v, model.data(), (int64_t)model.shape(0), least);
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -577,6 +586,7 @@ NB_MODULE(_kernel, m) {
       .def("size_error", [](const Table& t) { return size_error(t.table); })
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
+  m.def("is_narrower", &is_narrower_at, nb::arg("points"), nb::arg("T_ca"), nb::arg("model"), nb::arg("least"));
   m.def("pair_sums", &pair_sums, nb::arg("points"), nb::arg("normals"), nb::arg("weights"), nb::arg("from_points"),
         nb::arg("to_points"), nb::arg("begin"), nb::arg("gate_m"));
   nb::class_<PointTree>(m, "PointTree")

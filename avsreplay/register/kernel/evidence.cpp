@@ -112,12 +112,19 @@ size_t narrow(std::vector<double>& x, size_t rank) {
   return rank - below;
 }
 
+// The value of a rank, or its mean with that of the rank before it.
+double value_at(std::vector<double>& x, size_t rank, bool odd) {
+  const auto at = x.begin() + (int64_t)rank;
+  std::nth_element(x.begin(), at, x.end());
+  return odd ? *at : 0.5 * (*at + *std::max_element(x.begin(), at));
+}
+
+// Of values >= 0.
 double median(std::vector<double>& x) {
   if (x.empty()) return 0;
   const bool odd = x.size() % 2;
-  const auto middle = (int64_t)narrow(x, x.size() / 2);
-  std::nth_element(x.begin(), x.begin() + middle, x.end());
-  return odd ? x[(size_t)middle] : 0.5 * (x[(size_t)middle] + *std::max_element(x.begin(), x.begin() + middle));
+  const size_t rank = narrow(x, x.size() / 2);
+  return value_at(x, rank, odd);
 }
 
 }  // namespace
@@ -204,6 +211,61 @@ bool faces_camera(const Store& s, const Code& code, const View& v, const double*
   if (2 * QUARTER * few.matched >= tested && std::fabs(beyond) > CLEAR * (double)few.matched) return beyond > 0;
   const Looks all = looks(s, code, v, T, stride);
   return (double)all.facing >= least_facing * (double)all.matched;
+}
+
+namespace {
+
+// An image in the tangent plane about a viewing direction, and the extents of points in it.
+class Image {
+ public:
+  explicit Image(const double (&direction)[3]) {
+    const double length = std::sqrt(dot(direction, direction));
+    int least = 0;
+    for (int a = 0; a < 3; ++a) {
+      towards_[a] = direction[a] / length;
+      if (std::fabs(towards_[a]) < std::fabs(towards_[least])) least = a;
+    }
+    for (int a = 0; a < 3; ++a) across_[a] = (a == least) - towards_[least] * towards_[a];
+    const double size = std::sqrt(dot(across_, across_)), *t = towards_, *u = across_;
+    for (double& x : across_) x /= size;
+    up_[0] = t[1] * u[2] - t[2] * u[1], up_[1] = t[2] * u[0] - t[0] * u[2], up_[2] = t[0] * u[1] - t[1] * u[0];
+  }
+
+  // Widens the extents along x, y, x + y and x - y by a point.
+  void add(const double* p, double (&low)[4], double (&high)[4]) const {
+    const double depth = dot(towards_, p), x = dot(across_, p) / depth, y = dot(up_, p) / depth, at[4] = {x, y, x + y, x - y};
+    for (int k = 0; k < 4; ++k) low[k] = std::min(low[k], at[k]), high[k] = std::max(high[k], at[k]);
+  }
+
+ private:
+  static double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+  double towards_[3], across_[3], up_[3];
+};
+
+}  // namespace
+
+bool is_narrower(const View& v, const double* T, const double* model, int64_t n, double least) {
+  std::vector<double> points((size_t)(3 * v.n)), x((size_t)v.n);
+  for (int64_t k = 0; k < v.n; ++k) copy_point(v, k, points.data() + 3 * k);
+  double direction[3];
+  for (size_t a = 0; a < 3; ++a) {
+    for (size_t k = 0; k < x.size(); ++k) x[k] = points[3 * k + a];
+    direction[a] = x.empty() ? 0 : value_at(x, x.size() / 2, x.size() % 2);
+  }
+  const Image image(direction);
+  constexpr double FAR = HUGE_VAL;
+  double low[2][4] = {{FAR, FAR, FAR, FAR}, {FAR, FAR, FAR, FAR}}, high[2][4] = {{-FAR, -FAR, -FAR, -FAR}, {-FAR, -FAR, -FAR, -FAR}};
+  for (int64_t k = 0; k < v.n; ++k) image.add(points.data() + 3 * k, low[0], high[0]);
+  for (int64_t k = 0; k < n; ++k) {
+    double q[3], p[3];
+    for (int a = 0; a < 3; ++a) q[a] = model[3 * k + a] - T[4 * a + 3];
+    for (int a = 0; a < 3; ++a) p[a] = T[a] * q[0] + T[4 + a] * q[1] + T[8 + a] * q[2];
+    image.add(p, low[1], high[1]);
+  }
+  for (int k = 0; k < 4; ++k)
+    if (high[0][k] - low[0][k] < least * (high[1][k] - low[1][k])) return true;
+  return false;
 }
 
 namespace {

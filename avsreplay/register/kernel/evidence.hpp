@@ -26,6 +26,10 @@ Evidence evidence(const Store& store, const Code& code, const View& points, cons
 // a face that faces t. A quarter of them decides where their share is far from the least one.
 bool faces_camera(const Store& store, const Code& code, const View& points, const double* T, int64_t tested, double least_facing);
 
+// Whether a scan, seen from the origin of {A}, is narrower than `least` of n points of the model (n, 3) at the pose T, along
+// one of four directions of the image, 45 deg apart.
+bool is_narrower(const View& points, const double* T, const double* model, int64_t n, double least);
+
 // Whether only faces that face the camera count: where t of T may be it (`known`), and of about `tested` points that have a
 // closest point at least this share has it on a face that faces t.
 struct Sight {
