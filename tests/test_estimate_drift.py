@@ -11,12 +11,13 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import FitParams
-from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors
+from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors, to_state
 from avsreplay.estimate.drift import DrivenHypothesis, find_drift
-from avsreplay.estimate.driven import DrivenBelief, drift_equivalents
-from avsreplay.estimate.driven_fit import driven_motion, without_drift
+from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, followed
+from avsreplay.estimate.driven_fit import fit_driven, residuals_along, without_drift
+from avsreplay.estimate.driven_motion import driven_motion, fit_jointly, is_gaussian
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of
+from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise_levels import NO_LEVELS
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import whole
@@ -166,6 +167,45 @@ def test_after_a_false_report_of_a_torque_the_density_of_the_random_one_is_kept(
     assert track is not None
     assert track.drift is not None
     assert 3e-5 < track.levels.torque < 3e-4
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed: int) -> None:
+    """Slow rotation at 1 Hz, where a wrong inertia explains a part of the torque."""
+    case = surprises.Case("torque", torque=1e-4, seconds=90.0, hz=1.0, speed=0.05)
+    fixes, truth = fixes_of(case, seed), surprises.world_of(case, seed)[1][0]
+    poses, widths = poses_of(fixes), np.repeat([1e-3, 0.0], 3)
+    prior = weak_prior(poses, PARAMS)
+    direction = surprises._direction(np.random.Generator(np.random.PCG64([seed, 5])))
+    u = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)])
+    begin = ((to_chart(truth), u), (to_chart(rough_state(fixes)), np.zeros(6)))
+    true, found = (whole(fit_jointly(poses, c, prior, np.ones(2), 0.0, a, widths)) for c, a in begin)
+    free = fit_driven(poses, to_chart(truth), prior, np.ones(2), 0.0, np.zeros(6))
+    assert free.cost > true.cost + 14.0
+    assert abs(found.cost - true.cost) < 1.0
+    assert whole(is_gaussian(found, widths))
+
+
+def test_the_derivatives_along_the_motion_are_those_of_differences() -> None:
+    """Residuals with a torque and a force since an instant within the poses, by chart steps, acceleration and onset."""
+    case = surprises.Case("c", seconds=20.0)
+    fixes, chart = fixes_of(case, 1), to_chart(surprises.world_of(case, 1)[1][0])
+    poses, u, onset_s = poses_of(fixes), np.array([2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -1e-3]), 7.1
+    path, x = followed(chart, u, onset_s, poses.times_s, None)[0], to_state(chart)
+    position = path.r + geometry.matrix(path.q) @ x.c_b
+    poses = replace(poses, q=geometry.multiply(path.q, x.q_bc), t=position)  # without noise: residuals of zero
+
+    def residuals(step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        then = chart.moved(step[:20])
+        path, D = followed(then, u + step[20:26], onset_s + step[26], poses.times_s, None)
+        return residuals_along(path, D, then, poses, np.ones(2))
+
+    J = residuals(np.zeros(27))[1]
+    for k in range(27):
+        step = np.zeros(27)
+        step[k] = 1e-6
+        by_difference = (residuals(step)[0] - residuals(-step)[0]) / 2e-6
+        assert np.abs(J[:, :, k] - by_difference).max() < 1e-3 * np.abs(J[:, :, k]).max()
 
 
 def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:

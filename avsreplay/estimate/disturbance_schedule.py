@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from avsreplay.errors import value_class
-from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_SPREAD, BatchSchedule
+from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_SPREAD, MOST_FIXES, BatchSchedule
 from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
-from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
+from avsreplay.estimate.driven_fit import levels_of
+from avsreplay.estimate.driven_motion import DrivenMotion, driven_motion
 from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, improved_levels, pose_count, poses_of
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -37,6 +39,7 @@ from avsreplay.settings import given
 FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
+_EARLY = 2.0  # age of the poses over that at the report of a drift, until which it is tested for as often as before
 _LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
@@ -45,7 +48,7 @@ _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at 
 
 @value_class
 class _Driven:
-    """A drift, the noise levels with it, and the motion of each hypothesis with its weight."""
+    """A drift, the noise levels with it, and the motion of each hypothesis with its weight, none where one is bent."""
 
     found: DriftFound
     levels: NoiseLevels
@@ -94,8 +97,10 @@ class DisturbanceSchedule:
     def _begun(self, track: Track) -> Track:
         """The track with a test of the noise levels, else of a drift, if one is due and none is under way.
 
-        A drift is tested for each time the poses have grown enough. From its first detection on it is part of the
-        motion that the filter predicts, and the filter improves its value; fits to all poses replace that estimate.
+        A drift is tested for each time the poses have grown enough, with all poses: those that have left the fit as
+        well, because the random disturbances that shorten it are the other explanation. From its first detection on it
+        is part of the motion that the filter predicts, and the filter improves its value; fits to all poses replace
+        that estimate.
         """
         count, last, known = pose_count(track.fixes), track.batch, track.drift
         if not self.batch.checked_poses or last is None or track.testing is not None:
@@ -108,7 +113,10 @@ class DisturbanceSchedule:
             if len(track.fixes) < FEWEST_TO_SPREAD:
                 return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
             return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
-        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
+        every = _all_poses(track) if known is None else track
+        count, epoch_ns = pose_count(every.fixes), every.fixes[0].t_ns
+        early = known is None or track.belief.t_ns - epoch_ns < _EARLY * (known.detected_ns - epoch_ns)
+        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if early else CHECK_GROWTH) * count)
         if count < FEWEST_WITH_DRIFT or track.untested <= due or track.since == 0:
             return track
         begun = None
@@ -116,7 +124,8 @@ class DisturbanceSchedule:
             if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
                 return track.changed(untested=0)
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
-        job = Computation(ComputationKind.DRIFT, (track, start, begun), (epoch_ns, track.fixes[-1].t_ns))
+        start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
+        job = Computation(ComputationKind.DRIFT, (every, start, begun), (epoch_ns, every.fixes[-1].t_ns))
         return track.changed(testing=job, untested=0)
 
     def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
@@ -145,7 +154,7 @@ class DisturbanceSchedule:
             for h in found.hypotheses:
                 motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)
                 if motion is None:
-                    return None
+                    return _Driven(found, levels, [])
                 motions.append((h.weight, motion))
             return _Driven(found, levels, motions)
         except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
@@ -156,6 +165,9 @@ class DisturbanceSchedule:
         last, now_ns, known = track.batch, track.belief.t_ns, track.drift
         if driven is None or last is None:
             return track
+        if not driven.motions:
+            return track if known is None else track.changed(levels=replace(driven.levels, count=track.levels.count))
+        track = track if known is not None else _all_poses(track, epoch_ns)
         best, count = driven.found.hypotheses[0], pose_count(track.fixes)
         later = tuple(f for f in track.fixes if f.t_ns > until_ns)
         poses = poses_of(later, epoch_ns) if later else None
@@ -177,6 +189,17 @@ class DisturbanceSchedule:
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
+
+
+def _all_poses(track: Track, since_ns: int = 0) -> Track:
+    """The track with a fit to all poses since an instant and since the last manoeuvre."""
+    last_ns = max([since_ns, *(m.t_ns for m in track.manoeuvres)])
+    begin = bisect_left(track.older, last_ns, key=_instant)
+    return track.changed(fixes=(*track.older[begin:], *track.fixes)[-MOST_FIXES:], older=track.older[:begin])
+
+
+def _instant(fix: PoseFix) -> int:
+    return fix.t_ns
 
 
 def _positions(track: Track, chart: Chart) -> PositionRows | None:

@@ -17,16 +17,16 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
-from avsreplay.estimate.chart import Chart
+from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.driven_fit import (
     DrivenFit,
-    drift_columns,
     drift_unknowns,
-    equivalents,
     fit_driven,
     without_drift,
 )
-from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
+from avsreplay.estimate.driven_motion import fit_jointly, is_gaussian
+from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
 from avsreplay.estimate.normal_points import normal_points
@@ -38,9 +38,9 @@ _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and a
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
 _CONSTANT = 6.0  # log odds over random disturbances from which it is reported
-_ROUNDS = 10  # largest number of linearisations
+_ROUNDS = 3  # largest number of joint fits with another onset or kind
 _LEAST_GAIN = 0.5  # decrease of the cost (half chi-square) above which another linearisation follows
-_PARTS = (1.0, 0.3, 0.1, 0.03)  # parts of a step, of which the first that decreases the cost is taken
+_CONFIDENCE = 3.09  # standard deviations of a normal distribution with 99.9 % below
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
@@ -74,22 +74,30 @@ def find_drift(
     onset_s, u = (0.0, _NO_DRIFT) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
-    frame, found, onsets = yield from _descended(poses, prior, factors, widths, free)
+    anew = known is None and _poor(free, factors)
+    begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
+    frame, found, onsets = yield from _improved(poses, prior, factors, widths, begin)
+    if _poor(frame, factors):  # a local minimum, or no constant acceleration at all
+        begin = free if anew else (yield from _from_sphere(fixes, poses, prior, factors, widths))
+        other = yield from _improved(poses, prior, factors, widths, begin)
+        frame, found, onsets = min((frame, found, onsets), other, key=lambda each: each[0].cost)
     best = max(found, key=lambda f: f.log_odds)
     if best.log_odds < _FOUND or not frame.u.any():
         return None
     if known is None:
         free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, _NO_DRIFT), key=lambda f: f.cost)
         yield _size(free)
-        if free.cost - frame.cost < _FOUND or not (yield from _constant(frame, free, levels, best, widths)):
+        if _poor(frame, factors) or free.cost - frame.cost < _FOUND:
+            return None
+        constant = yield from _constant(frame, free, levels, best, widths)
+        if not constant or not (yield from is_gaussian(frame, np.where(frame.u != 0.0, widths, 0.0))):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
     later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)
     if frame.onset_s == 0.0:
         return DriftFound((later,), best.width * widths, within.spread_s)
-    always, _, _ = yield from _descended(poses, prior, factors, widths, frame, np.zeros(1))
-    columns = drift_columns(frame.G, frame.points.times_s, frame.chart, best.onset_s)
-    noise = _remaining_noise(frame, columns.reshape(-1, 6), best)
+    always, _, _ = yield from _improved(poses, prior, factors, widths, frame, only=np.zeros(1))
+    noise = _remaining_noise(frame, frame.columns(best.onset_s).reshape(-1, 6), best)
     odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(within.width_s / float(poses.times_s[-1]))
     share = 1.0 / (1.0 + math.exp(min(odds, 700.0)))
     both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
@@ -137,33 +145,57 @@ class _Found:
 _NO_DRIFT = np.zeros(6)
 
 
-def _descended(
-    poses: Poses, prior: Prior, factors: Array, widths: Array, free: DrivenFit, only: Array | None = None
+def _improved(
+    poses: Poses,
+    prior: Prior,
+    factors: Array,
+    widths: Array,
+    begin: DrivenFit,
+    only: Array | None = None,
 ) -> Parts[tuple[DrivenFit, list[_Found], Array]]:
-    """The best frame of a descent from free motion, and the drifts from each onset (n,) on about it.
+    """The best joint fit with any onset and kind of acceleration, and the drifts from each onset (n,) on about it.
 
-    Free motion fits the poses of a drifting body so poorly that a full step of the linearised problem often leads away
-    from the minimum. A step is therefore taken only as far as the cost decreases. ``only``: the onsets that are tried.
+    About each fit the most likely onset and kind of the linearised problem are those of the next one. ``only``: the
+    onsets that are tried.
     """
-    frame, gain = free, math.inf
+    frame = begin
     for k in range(_ROUNDS + 1):
         onsets = _onsets(frame.points.times_s, frame.onset_s if k else None) if only is None else only
         found = _compared(frame, onsets, widths)
         best = max(found, key=lambda f: f.log_odds)
-        if best.log_odds < _FOUND or gain < _LEAST_GAIN or k == _ROUNDS:
+        same = frame.along and best.onset_s == frame.onset_s and bool(np.array_equal(best.u != 0.0, frame.u != 0.0))
+        if best.log_odds < _FOUND or same or k == _ROUNDS:
             break
-        step, at, was, onset_s = best.y, frame.chart, frame.u, best.onset_s
-        tried = ((at.moved(part * step), was + part * (best.u - was)) for part in _PARTS)
-        limit, gain = (frame.cost if only is None or k else math.inf), 0.0  # a given onset may be a less likely one
-        for start, u in tried:
-            closer = fit_driven(poses, start, prior, factors, onset_s, u)
-            yield _size(closer)
-            if closer.cost < limit:
-                frame, gain = closer, frame.cost - closer.cost
-                break
-        else:
+        open_ = np.where(best.u != 0.0, widths, 0.0)
+        start = np.where(best.u != 0.0, frame.u, 0.0)
+        closer = yield from fit_jointly(poses, frame.chart, prior, factors, best.onset_s, start, open_)
+        yield _size(closer)
+        if closer.cost > frame.cost - _LEAST_GAIN and (only is None or k):  # a given onset may be a less likely one
             break
+        frame = closer
     return frame, found, onsets
+
+
+def _from_sphere(
+    fixes: tuple[PoseFix, ...], poses: Poses, prior: Prior, factors: Array, widths: Array
+) -> Parts[DrivenFit]:
+    """The joint fit of a torque since the first pose that begins with a sphere at a constant rate.
+
+    In the fit of free motion a wrong inertia explains a part of the torque. A descent from there may end in a local
+    minimum.
+    """
+    start, torque = to_chart(rough_state(fixes)), np.append(widths[:3], np.zeros(3))
+    return (yield from fit_jointly(poses, start, prior, factors, 0.0, _NO_DRIFT, torque))
+
+
+def _poor(frame: DrivenFit, factors: Array) -> bool:
+    """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
+
+    The bound is the quantile of chi-square by Wilson and Hilferty. The noise is at least as claimed.
+    """
+    dof = max(6 * len(frame.points) - DIM - 6, 6)
+    bound = dof * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
+    return 2.0 * frame.cost * min(1.0, float(factors.min())) ** 2 > bound
 
 
 def _size(fitted: DrivenFit) -> int:
@@ -240,7 +272,7 @@ def _onsets(times_s: Array, near_s: float | None = None) -> Array:
 def _compared(frame: DrivenFit, onsets: Array, widths: Array) -> list[_Found]:
     """The most likely drift from each onset on, with the claimed noise, then with that of the residuals without it."""
     n, times = len(frame.points), frame.points.times_s
-    B = equivalents(frame.chart, np.concatenate([times, onsets]))
+    B = frame.equivalents(np.concatenate([times, onsets]))
     here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
     columns = (here - frame.G.reshape(-1, 12) @ B[n:]) * late[:, :, None]
     inflation = 1.0

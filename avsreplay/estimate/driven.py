@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
-from avsreplay.estimate.chart import to_chart, to_errors, to_state
+from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
     MOST_RAD,
     NO_DRIVE,
@@ -32,11 +33,14 @@ from avsreplay.estimate.dynamics import (
     grasp_jacobian,
     process_noise,
     propagate,
+    propagate_state,
     ratios,
     seconds_to,
+    sigma_join,
     transition,
+    translated,
 )
-from avsreplay.estimate.error_state import DIM, DMU, RHO, VEL
+from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VEL, W
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import IDENTITY_QUAT, Array
 from avsreplay.records import Belief, Forecast, State
@@ -57,6 +61,28 @@ class DrivenBelief(Belief):
     u: Array
     P_u: Array
     cross: Array
+
+
+@value_class
+class DrivenHistory:
+    """The motion with a constant acceleration at n instants.
+
+    Attributes:
+        q: (n, 4) attitude q_ab.  w: (n, 3) rate in {B} [rad/s].
+        r, v: (n, 3) centre of mass [m] and its velocity [m/s].
+        Phi: (n, 20, 20) derivative of the error states by those at the start.  by_u: (n, 20, 6) by the acceleration.
+    """
+
+    q: Array
+    w: Array
+    r: Array
+    v: Array
+    Phi: Array
+    by_u: Array
+
+    def some(self, which: NDArray[np.int64]) -> DrivenHistory:
+        """The motion at some of the instants."""
+        return DrivenHistory(*(a[which] for a in (self.q, self.w, self.r, self.v, self.Phi, self.by_u)))
 
 
 def drive_of(x: State, u: Array) -> Triple:
@@ -111,6 +137,21 @@ def driven_steps(
     return moved, *_derivatives(x, u, times_s, Phi), steps
 
 
+def driven_history(x: State, u: Array, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
+    """The motion from ``x`` with a constant acceleration u (6,) to ``times_s`` (n,) [s], ascending."""
+    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times_s, drive_of(x, u))
+    centre, velocity = translated(x, times_s, arc)
+    Phi = np.zeros((len(times_s), DIM, DIM))
+    Phi[:] = np.eye(DIM)
+    Phi[:, :6, :6], Phi[:, :6, SIGMA] = S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)
+    if arc is None:
+        Phi[:, RHO, VEL] = times_s[:, None, None] * np.eye(3)
+    else:
+        Phi[:, RHO.start : VEL.stop, RHO.start : VEL.stop] = arc.transitions(times_s)
+    pushed = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
+    return DrivenHistory(q, w, *pushed, *_derivatives(x, u, times_s, Phi))
+
+
 def _pushed(x: State, u: Array, h: float) -> State:
     """A state of which the centre of mass has in addition been accelerated for h seconds."""
     return replace(x, r_a=x.r_a + 0.5 * h * h * u[3:], v_a=x.v_a + h * u[3:])
@@ -122,7 +163,7 @@ def _covariance(belief: DrivenBelief, Phi: Array, by_u: Array) -> Array:
     return np.asarray(Phi @ belief.P @ Phi.T + across + across.T + by_u @ belief.P_u @ by_u.T)
 
 
-def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array]) -> tuple[Array, Array]:
+def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array] | Array) -> tuple[Array, Array]:
     """Phi (n, 20, 20), completed by the effect of mu, and the derivative (n, 20, 6) of the states by u.
 
     u is given in {C} and acts in {B}: R(mu) u, with R(dmu mu) = (1 + 2 [dmu x]) R(mu).
@@ -210,24 +251,28 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     return forecast_of(times_s, variances.reshape(-1, 3, 3).sum(axis=2))
 
 
-def impulses(x: State, times_s: Array) -> Array:
+def impulses(x: State, times_s: Array, drive: Triple = NO_DRIVE) -> Array:
     """Errors (n, 6, 3) of (dq_v, w) at 0 that equal a unit of rate in {B} at each of ``times_s`` (n,) [s].
+
+    ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
     Raises:
         LinAlgError: an unstable spin over so long a time that its motion cannot be inverted.
     """
-    found = _motion.impulses(x.q_ab, x.w_b, ratios(x.sigma), times_s)
+    found = _motion.impulses(x.q_ab, x.w_b, ratios(x.sigma), times_s, drive)
     if not np.isfinite(found).all():
         raise np.linalg.LinAlgError("the motion cannot be inverted")
     return found
 
 
-def drift_equivalents(x: State, times_s: Array) -> Array:
+def drift_equivalents(x: State, times_s: Array, onset_s: float = 0.0, drive: Triple = NO_DRIVE) -> Array:
     """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
 
     Args:
         x: state at the epoch.
         times_s: (n,) >= 0, since the epoch [s].
+        onset_s: since then the motion has an angular acceleration [s].
+        drive: that acceleration in {B} [rad/s2].
 
     Returns:
         B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the acceleration in {A}.
@@ -235,7 +280,12 @@ def drift_equivalents(x: State, times_s: Array) -> Array:
     last = float(times_s.max())
     count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _STEP_RAD))
     grid = np.linspace(0.0, last, count + 1)
-    rate = impulses(x, grid)
+    early = int(np.searchsorted(grid, onset_s, side="right")) if any(drive) else count + 1
+    rate = impulses(x, grid[:early])
+    if early <= count:
+        at, Phi = propagate_state(x, onset_s)
+        later = impulses(at, grid[early:] - onset_s, drive)
+        rate = np.concatenate([rate, np.linalg.solve(Phi[:6, :6], later)])
     total = np.zeros((count + 1, 6, 3))
     np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
     B = np.zeros((len(times_s), 12, 6))
@@ -246,3 +296,33 @@ def drift_equivalents(x: State, times_s: Array) -> Array:
     B[:, 6:9, 3:] = -0.5 * (times_s**2)[:, None, None] * np.eye(3)
     B[:, 9:12, 3:] = times_s[:, None, None] * np.eye(3)
     return B
+
+
+def followed(
+    chart: Chart, u: Array, onset_s: float, times_s: Array, arc: OrbitArc | None
+) -> tuple[DrivenHistory, Array]:
+    """The motion from initial values with an acceleration since an instant, and its derivatives.
+
+    Args:
+        chart: initial values.
+        u: (6,) acceleration.
+        onset_s: since then [s].
+        times_s: (n,) [s], ascending.
+        arc: the orbit; None for free motion.
+
+    Returns:
+        The motion at these instants, and its derivatives (n, 20, 27) by chart steps, acceleration and onset.
+    """
+    first, T, x = int(np.searchsorted(times_s, onset_s, side="right")), to_errors(chart), to_state(chart)
+    D = np.zeros((len(times_s), DIM, DIM + 7))
+    free = driven_history(x, np.zeros(6), np.append(times_s[:first], onset_s), arc)
+    D[:first, :, :DIM], until = free.Phi[:-1] @ T, free.Phi[-1] @ T
+    if first == len(times_s):
+        return free, D
+    at = replace(x, q_ab=free.q[-1], w_b=free.w[-1], r_a=free.r[-1], v_a=free.v[-1])
+    late = driven_history(at, u, times_s[first:] - onset_s, None if arc is None else arc.shifted(onset_s))
+    missed = np.zeros(DIM)  # per second by which the onset is later
+    missed[W], missed[VEL] = -np.array(drive_of(at, u)), -u[3:]
+    D[first:, :, :DIM], D[first:, :, DIM:-1], D[first:, :, -1] = late.Phi @ until, late.by_u, late.Phi @ missed
+    parts = zip(*((p.q, p.w, p.r, p.v, p.Phi, p.by_u) for p in (free, late)), strict=True)
+    return DrivenHistory(*(np.concatenate([a[:-1], b]) for a, b in parts)), D
