@@ -1,8 +1,8 @@
 #include "rays.hpp"
 
-#include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "loop.hpp"
 
@@ -26,25 +26,28 @@ struct Ray {
     }
   }
 
-  // Where the ray enters the box of a child, infinite if it passes it.
-  double enters(const Node& n, int lane, double slack) const {
-    double first = 0, last = NEVER;
-    for (int k = 0; k < 3; ++k) {
-      const double a = ((double)n.lo[k][lane] - slack - from[k]) * inverse[k], b = ((double)n.hi[k][lane] + slack - from[k]) * inverse[k];
-      first = std::max(first, std::min(a, b)), last = std::min(last, std::max(a, b));
-    }
-    return first <= last ? first : NEVER;
+  // Where the ray enters the boxes of the children of a node, infinite if it passes them.
+  void enters(const Node& n, double slack, double (&first)[LANES]) const {
+    double last[LANES];
+    for (int i = 0; i < LANES; ++i) first[i] = 0, last[i] = NEVER;
+    for (int k = 0; k < 3; ++k)
+      for (int i = 0; i < LANES; ++i) {
+        const double low = ((double)n.lo[k][i] - slack - from[k]) * inverse[k], high = ((double)n.hi[k][i] + slack - from[k]) * inverse[k];
+        const double in = low < high ? low : high, out = low < high ? high : low;
+        first[i] = in > first[i] ? in : first[i], last[i] = out < last[i] ? out : last[i];
+      }
+    for (int i = 0; i < LANES; ++i) first[i] = first[i] <= last[i] ? first[i] : NEVER;
   }
 
-  // Range of the point of a face on the ray, infinite if there is none. A side belongs to both of its faces.
-  double meets(const Triangle& t, double tie) const {
+  // Range of the point of a face on the ray if it is below `best`, else `best`. A side belongs to both of its faces.
+  double meets(const Triangle& t, double tie, double best) const {
     const Vec3 n = t.n(), to{t.a.x - eye.x, t.a.y - eye.y, t.a.z - eye.z};
     const double slope = n.x * d.x + n.y * d.y + n.z * d.z, range = (n.x * to.x + n.y * to.y + n.z * to.z) / slope;
-    if (!(range > 0 && range < NEVER)) return NEVER;
+    if (!(range > 0 && range < best)) return best;
     const Vec3 p{range * d.x - to.x, range * d.y - to.y, range * d.z - to.z};
     const double x = p.x * t.u.x + p.y * t.u.y + p.z * t.u.z, y = p.x * t.w.x + p.y * t.w.y + p.z * t.w.z, least = -tie * t.length;
     const bool inside = y >= -tie && x * t.cy - y * t.cx >= least && (t.length - x) * t.cy - y * (t.length - t.cx) >= least;
-    return inside ? range : NEVER;
+    return inside ? range : best;
   }
 };
 
@@ -64,16 +67,17 @@ double first_face(const Store& s, const Ray& ray, int64_t& compared) {
       const uint32_t block = t.child & ~IS_BLOCK;
       const unsigned valid = block + 1 == s.blocks ? s.last_valid : 0xffu;
       for (uint32_t k = 0; k < (uint32_t)LANES; ++k)
-        if (valid >> k & 1) best = std::min(best, ray.meets(s.triangles[LANES * block + k], s.tie));
+        if (valid >> k & 1) best = ray.meets(s.triangles[LANES * block + k], s.tie, best);
       continue;
     }
     const Node& n = s.nodes[t.child];
+    double from[LANES];
+    ray.enters(n, s.slack, from);
     int nearest = depth;
     for (int k = 0; k < LANES; ++k) {
-      const double from = n.child[k] == NO_CHILD ? NEVER : ray.enters(n, k, s.slack);
-      if (!(from < best)) continue;
-      stack[depth] = {n.child[k], from};
-      if (from < stack[nearest].from) nearest = depth;
+      if (n.child[k] == NO_CHILD || !(from[k] < best)) continue;
+      stack[depth] = {n.child[k], from[k]};
+      if (from[k] < stack[nearest].from) nearest = depth;
       ++depth;
     }
     if (nearest < depth) std::swap(stack[depth - 1], stack[nearest]);
