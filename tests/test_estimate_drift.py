@@ -15,7 +15,7 @@ from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors, to_stat
 from avsreplay.estimate.drift import DrivenHypothesis, find_drift
 from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, followed
 from avsreplay.estimate.driven_fit import fit_driven, residuals_along, without_drift
-from avsreplay.estimate.driven_motion import driven_motion, fit_jointly, is_gaussian
+from avsreplay.estimate.driven_motion import driven_motion, fit_jointly, is_bounded
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise_levels import NO_LEVELS
@@ -183,7 +183,7 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
     free = fit_driven(poses, to_chart(truth), prior, np.ones(2), 0.0, np.zeros(6))
     assert free.cost > true.cost + 14.0
     assert abs(found.cost - true.cost) < 1.0
-    assert whole(is_gaussian(found, widths))
+    assert whole(is_bounded(found, widths))
 
 
 def test_the_derivatives_along_the_motion_are_those_of_differences() -> None:

@@ -144,13 +144,9 @@ class BatchSchedule:
             belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
         else:
             belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
-        drift = track.drift
-        if drift is not None and isinstance(belief, DrivenBelief):
-            drift = replace(drift, rate=belief.u[:3], velocity=belief.u[3:], P=belief.P_u)
         fixes, older = self._with(track, prediction, innovation) if self.checked_poses else ((), ())
         return track.changed(
             belief=belief,
-            drift=drift,
             mode="filter",
             window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
             sigma_hits=track.sigma_hits + hits,

@@ -99,8 +99,8 @@ class DisturbanceSchedule:
 
         A drift is tested for each time the poses have grown enough, with all poses: those that have left the fit as
         well, because the random disturbances that shorten it are the other explanation. From its first detection on it
-        is part of the motion that the filter predicts, and the filter improves its value; fits to all poses replace
-        that estimate.
+        is part of the motion that the filter predicts. The value that is reported is that of the last fit to all poses:
+        where inertia and torque explain each other, the filter's covariance becomes too small between fits.
         """
         count, last, known = pose_count(track.fixes), track.batch, track.drift
         if not self.batch.checked_poses or last is None or track.testing is not None:
@@ -184,7 +184,8 @@ class DisturbanceSchedule:
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
             onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
         detected_ns = now_ns if known is None else known.detected_ns
-        drift = Drift(onset_ns, spread, moved.u[3:], moved.u[:3], moved.P_u, detected_ns)
+        fitted = driven_moments([(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions])
+        drift = Drift(onset_ns, spread, fitted.u[3:], fitted.u[:3], fitted.P_u, detected_ns)
         result = BatchResult(epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian)
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)

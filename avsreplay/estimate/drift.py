@@ -24,7 +24,7 @@ from avsreplay.estimate.driven_fit import (
     fit_driven,
     without_drift,
 )
-from avsreplay.estimate.driven_motion import fit_jointly, is_gaussian
+from avsreplay.estimate.driven_motion import fit_jointly, is_bounded
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
@@ -90,7 +90,7 @@ def find_drift(
         if _poor(frame, factors) or free.cost - frame.cost < _FOUND:
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
-        if not constant or not (yield from is_gaussian(frame, np.where(frame.u != 0.0, widths, 0.0))):
+        if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
     later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)

@@ -34,8 +34,8 @@ _COARSE = 0.1  # the same, as a part of the cost, with normal points about a mot
 _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 5.0, 4.0, 1e8  # of Levenberg-Marquardt: first, divided, multiplied, last
 _GOOD = 0.5  # least decrease of the cost over the expected one from which the damping is reduced
 _PROBE, _LARGEST_BEND = 0.1, 0.375  # part of a step where its second order is found; largest over the first order
-_PIN, _PIN_STEPS, _MOST_BENT = 0.1, 20, 2.0  # of a profile: 1 sigma, most steps, ratio of increase to a Gaussian's
-_JOINT_WORK = 8  # work of a step for each pose, in linearised poses
+_PIN, _PIN_STEPS, _LEAST_RISE = 0.1, 20, 1.0  # of a profile: 1 sigma, most steps, least increase, 2 for a Gaussian one
+_JOINT_WORK = 10  # work of a step for each pose, in linearised poses
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
 
@@ -60,6 +60,7 @@ def fit_jointly(
         points = normal_points(without_drift(poses, chart, onset_s, u), chart, factors)
         seen, last = without_drift(points, chart, onset_s, u, back=True), last or len(points) == len(poses)
         joint = _Joint(seen, prior, factors, onset_s, widths)
+        yield _JOINT_WORK * len(seen)
         now, steps = yield from _descended(joint, joint.linearised(chart, u), left, 0.0 if last else _COARSE)
         chart, u, left = now.chart, now.u, left - steps
         if last:
@@ -80,11 +81,12 @@ def _linear_fit(poses: Poses, joint: _Joint, now: _Linear) -> DrivenFit:
     return DrivenFit(*motion, now.e - now.J[:, DIM:] @ u, J, G, prior.info, off, along=True)
 
 
-def is_gaussian(fitted: DrivenFit, widths: Array) -> Parts[bool]:
-    """Return whether the distribution of the acceleration is Gaussian up to two standard deviations, in parts.
+def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
+    """Return whether the standard deviations of the acceleration are not too small, in parts.
 
     The acceleration is moved by two standard deviations in the direction in which it is known least, and the initial
-    values are fitted again (profile likelihood). Half the chi-square then increases by 2.
+    values are fitted again (profile likelihood). Half the chi-square increases by 2 for a Gaussian distribution. It
+    increases less where other accelerations fit as well.
 
     Args:
         fitted: a joint fit.
@@ -102,7 +104,7 @@ def is_gaussian(fitted: DrivenFit, widths: Array) -> Parts[bool]:
         pin = row / (_PIN * math.sqrt(values[-1])), side / _PIN + float(row @ fitted.u) / (_PIN * math.sqrt(values[-1]))
         pinned = replace(joint, pin=pin)
         there, _ = yield from _descended(pinned, pinned.linearised(*now.moved(side * step)), _PIN_STEPS, 0.0)
-        if not 2.0 / _MOST_BENT < there.cost - now.cost < 2.0 * _MOST_BENT:
+        if there.cost - now.cost < _LEAST_RISE:
             return False
     return True
 
