@@ -137,9 +137,10 @@ def driven_steps(
     return moved, *_derivatives(x, u, times_s, Phi), steps
 
 
-def driven_history(x: State, u: Array, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
-    """The motion from ``x`` with a constant acceleration u (6,) to ``times_s`` (n,) [s], ascending."""
-    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times_s, drive_of(x, u))
+def driven_history(x: State, u: Array | None, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
+    """The motion from ``x`` with a constant acceleration u (6,), or free motion, to ``times_s`` (n,) [s], ascending."""
+    drive = NO_DRIVE if u is None else drive_of(x, u)
+    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times_s, drive)
     centre, velocity = translated(x, times_s, arc)
     Phi = np.zeros((len(times_s), DIM, DIM))
     Phi[:] = np.eye(DIM)
@@ -148,6 +149,8 @@ def driven_history(x: State, u: Array, times_s: Array, arc: OrbitArc | None) -> 
         Phi[:, RHO, VEL] = times_s[:, None, None] * np.eye(3)
     else:
         Phi[:, RHO.start : VEL.stop, RHO.start : VEL.stop] = arc.transitions(times_s)
+    if u is None:
+        return DrivenHistory(q, w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6)))
     pushed = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
     return DrivenHistory(q, w, *pushed, *_derivatives(x, u, times_s, Phi))
 
@@ -179,14 +182,14 @@ def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array] | Array) -
     turn = float(np.abs(lengths).max()) * float(np.linalg.norm(x.w_b))
     m = 2 * max(1, math.ceil(turn / _SIMPSON_RAD))
     grid = ((times_s - lengths)[:, None] + lengths[:, None] * (np.arange(1, m + 1) / m)).reshape(-1)
-    S = _motion.follow(IDENTITY_QUAT, x.w_b, ratios(x.sigma), NO_DRIVE, grid, drive)[2][:, :, :6]
-    slope = np.concatenate([np.eye(6)[None, :, 3:], np.linalg.inv(S)[:, :, 3:]])
+    rate = _motion.impulses(IDENTITY_QUAT, x.w_b, ratios(x.sigma), grid, drive)
+    slope = np.concatenate([np.eye(6)[None, :, 3:], rate])
     weight = np.where(np.arange(m + 1) % 2 == 1, 4.0, 2.0) / (3.0 * m)  # Simpson's rule
     weight[[0, -1]] *= 0.5
     pieces = slope[m * np.arange(n)[:, None] + np.arange(m + 1)]  # (n, m + 1, 6, 3)
     total = np.cumsum(lengths[:, None, None] * (pieces * weight[:, None, None]).sum(axis=1), axis=0)
-    turned = S[m - 1 :: m] @ total
     full, by_u = np.array(Phi), np.zeros((n, DIM, 6))
+    turned = full[:, :6, :6] @ total
     full[:, :6, DMU] += -2.0 * turned @ geometry.skew(np.array(drive))
     by_u[:, :6, :3] = turned @ geometry.matrix(x.q_bc)
     by_u[:, RHO, 3:] = 0.5 * (times_s**2)[:, None, None] * np.eye(3)
@@ -315,7 +318,7 @@ def followed(
     """
     first, T, x = int(np.searchsorted(times_s, onset_s, side="right")), to_errors(chart), to_state(chart)
     D = np.zeros((len(times_s), DIM, DIM + 7))
-    free = driven_history(x, np.zeros(6), np.append(times_s[:first], onset_s), arc)
+    free = driven_history(x, None, np.append(times_s[:first], onset_s), arc)
     D[:first, :, :DIM], until = free.Phi[:-1] @ T, free.Phi[-1] @ T
     if first == len(times_s):
         return free, D
@@ -326,3 +329,13 @@ def followed(
     D[first:, :, :DIM], D[first:, :, DIM:-1], D[first:, :, -1] = late.Phi @ until, late.by_u, late.Phi @ missed
     parts = zip(*((p.q, p.w, p.r, p.v, p.Phi, p.by_u) for p in (free, late)), strict=True)
     return DrivenHistory(*(np.concatenate([a[:-1], b]) for a, b in parts)), D
+
+
+def followed_poses(chart: Chart, u: Array, onset_s: float, times_s: Array, arc: OrbitArc | None) -> tuple[Array, Array]:
+    """Attitudes (n, 4) of {B} and positions (n, 3) of the centre of mass of ``followed``, without derivatives."""
+    x, first, since = to_state(chart), int(np.searchsorted(times_s, onset_s, side="right")), times_s - onset_s
+    sigma, drive = ratios(x.sigma), drive_of(x, u)
+    q, w, _, _ = _motion.follow(x.q_ab, x.w_b, sigma, NO_DRIVE, np.append(times_s[:first], onset_s))
+    late = _motion.follow(q[-1], w[-1], sigma, NO_DRIVE, since[first:], drive)[0]
+    moved = 0.5 * np.maximum(since, 0.0)[:, None] ** 2 * u[3:]
+    return np.concatenate([q[:-1], late]), translated(x, times_s, arc)[0] + moved

@@ -145,14 +145,20 @@ def residuals_along(path: DrivenHistory, D: Array, chart: Chart, poses: Poses, s
         scale: (2,) on their standard deviations of attitude and position.
     """
     x, R = to_state(chart), geometry.matrix(path.q)
-    to_c, back = geometry.matrix(x.q_bc).T, np.swapaxes(geometry.matrix(poses.q), 1, 2)
-    theta = geometry.log(geometry.multiply(geometry.conjugate(poses.q), geometry.multiply(path.q, x.q_bc)))
-    moved = (back @ (path.r + R @ x.c_b - poses.t)[:, :, None])[:, :, 0]
+    to_c = geometry.matrix(x.q_bc).T
     turned = 2.0 * to_c @ (D[:, DQ] + D[:, DMU])
     shifted = to_c @ (np.swapaxes(R, 1, 2) @ D[:, RHO] + D[:, VARRHO] - 2.0 * geometry.skew(x.c_b) @ D[:, DQ])
+    rows = (poses.root / np.repeat(scale, 3)) @ np.concatenate([turned, shifted], axis=1)
+    return white_residuals(path.q, path.r, chart, poses, scale), rows
+
+
+def white_residuals(q_ab: Array, r_a: Array, chart: Chart, poses: Poses, scale: Array) -> Array:
+    """Whitened residuals (n, 6) of poses at attitudes (n, 4) and positions (n, 3), as in ``residuals_along``."""
+    x, back = to_state(chart), np.swapaxes(geometry.matrix(poses.q), 1, 2)
+    theta = geometry.log(geometry.multiply(geometry.conjugate(poses.q), geometry.multiply(q_ab, x.q_bc)))
+    moved = (back @ (r_a + geometry.matrix(q_ab) @ x.c_b - poses.t)[:, :, None])[:, :, 0]
     root = poses.root / np.repeat(scale, 3)
-    white = (root @ np.concatenate([theta, moved], axis=1)[:, :, None])[:, :, 0]
-    return white, root @ np.concatenate([turned, shifted], axis=1)
+    return np.asarray((root @ np.concatenate([theta, moved], axis=1)[:, :, None])[:, :, 0])
 
 
 def levels_of(

@@ -16,8 +16,15 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.driven import DrivenBelief, followed
-from avsreplay.estimate.driven_fit import NO_ACCELERATION, REACHED, DrivenFit, residuals_along, without_drift
+from avsreplay.estimate.driven import DrivenBelief, followed, followed_poses
+from avsreplay.estimate.driven_fit import (
+    NO_ACCELERATION,
+    REACHED,
+    DrivenFit,
+    residuals_along,
+    white_residuals,
+    without_drift,
+)
 from avsreplay.estimate.dynamics import torque_density
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, VEL, W, definite
 from avsreplay.estimate.measurement import GATE
@@ -206,7 +213,9 @@ class _Joint:
     def step(self, now: _Linear, damping: float) -> Array:
         """The step (26,) of Levenberg-Marquardt with its second-order part, as in ``batch``."""
         step, inverse = self._newton(now, damping)
-        e = self.residuals(*now.moved(_PROBE * step))[0].reshape(-1)
+        chart, u = now.moved(_PROBE * step)
+        path = followed_poses(chart, u, self.onset_s, self.seen.times_s, self.seen.arc)
+        e = white_residuals(*path, chart, self.seen, self.factors).reshape(-1)
         second = 2.0 / _PROBE * ((now.weights * e - now.e) / _PROBE - now.J @ step)
         bend, scale = -0.5 * inverse @ (now.J.T @ second), np.sqrt(np.diagonal(now.normal))
         bent = float(np.linalg.norm(scale * bend)) <= _LARGEST_BEND * float(np.linalg.norm(scale * step))
