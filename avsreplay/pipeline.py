@@ -28,7 +28,7 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
-from avsreplay.register import Registrar, allowed_scans, measured_alignment
+from avsreplay.register import Registrar, SensorFrame, allowed_scans, measured_alignment
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -274,19 +274,21 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
         guess, origin = state.last_pose, "last"
     effort, carried = allowed_scans(state.failed), points is not scan.points
     unknown = None if state.track is None else stages.estimator.frame.motions_out(state.track.undetermined)
-    found = stages.registrar.register(points, guess, scan.seq, carried, effort, unknown)
+    found = SensorFrame(stages.registrar, scan.sensor).register(points, guess, scan.seq, carried, effort, unknown)
     return _measurement(stages, scan, points, found, origin)
 
 
 def _acquire(stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
     """Register the scan without a guess."""
-    return _measurement(stages, scan, points, stages.registrar.acquire(points, allowed_scans(state.failed)), origin)
+    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, allowed_scans(state.failed))
+    return _measurement(stages, scan, points, found, origin)
 
 
 def _measurement(stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str) -> Measurement:
     if scan.times_s is None or not (stages.deskew and alignment.measured):
         return Measurement(alignment, origin)
-    return Measurement(alignment, origin, stages.registrar.instants(points, scan.times_s, alignment.T_ac))
+    instants = SensorFrame(stages.registrar, scan.sensor).instants(points, scan.times_s, alignment.T_ac)
+    return Measurement(alignment, origin, instants)
 
 
 def _judge(
@@ -315,9 +317,7 @@ def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
     if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
-    return deskew(
-        scan.points, scan.times_s, replace(predicted, belief=stages.estimator.frame.belief_out(predicted.belief))
-    )
+    return deskew(scan.points, scan.times_s, stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns))
 
 
 Forecaster = Callable[[Array], Forecast]

@@ -11,7 +11,7 @@ from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
 from avsreplay.model_size import Advice, compare_sizes, find_model
 from avsreplay.records import Scan, ScanStatus, Surface
-from avsreplay.register import Registrar
+from avsreplay.register import Registrar, SensorFrame
 
 SCANS = 5
 OFF_THE_MODEL = 0.25  # distance of the grasp point from the bounding box, in extents, above which it is reported
@@ -118,7 +118,7 @@ def _share_on_model(source: Source, registrar: Registrar) -> float | None:
         return None
     start, truth = source.header.start, source.truth_of(scan).pose
     pose = start.x.T_ac if start is not None else truth
-    return None if pose is None else registrar.register(scan.points, pose).inlier_ratio
+    return None if pose is None else SensorFrame(registrar, scan.sensor).register(scan.points, pose).inlier_ratio
 
 
 def _transforms(info: LogInfo, source: Source) -> list[Advice]:

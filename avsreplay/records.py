@@ -144,7 +144,7 @@ class Scan:
 
     Attributes:
         seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
-        points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
+        points: (n, 3) finite, possibly strided, in {A} [m].  sensor: its pose in {A}; None: {A} is its own frame.
         times_s, intensities, places: (n,) instant after ``t_ns`` [s], intensity, share of the message before; or None.
         dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of them.
     """
@@ -161,6 +161,7 @@ class Scan:
     pose: MeasuredPose | None = None
     intensities: NDArray[Any] | None = None
     places: NDArray[Any] | None = None
+    sensor: Pose | None = None
 
 
 @value_class
@@ -335,10 +336,9 @@ class BodyParameters:
 
 @value_class
 class Forecast:
-    """Predicted standard deviations (n,) of the grasp point; each is the root of the trace of its 3x3 covariance.
+    """Predicted standard deviations (n,) of the grasp point, each the root of the trace of its 3x3 covariance.
 
-    Attributes:
-        times_s: [s after now].  pos_1s_m, vel_1s_mps, rot_1s_rad: of position, velocity, attitude (full angle).
+    ``times_s`` [s after now]; ``pos_1s_m``, ``vel_1s_mps``, ``rot_1s_rad``: position, velocity, attitude (full angle).
     """
 
     times_s: Array

@@ -40,22 +40,22 @@ def predict(now, t_ns: int = 0):
 def test_points_come_back_to_one_instant(rate: float, span: float) -> None:
     seen, times, now, whole = skewed(rate, span, 2.0)
     assert np.abs(seen - whole).max() > 0.2 * rate * span
-    assert np.abs(deskew(seen, times, predict(now)) - whole).max() < 3e-5
+    assert np.abs(deskew(seen, times, predict(now).belief.x) - whole).max() < 3e-5
 
 
 def test_float32_points_and_one_instant() -> None:
     seen, times, now, whole = skewed(0.1, 1.0, 2.0)
-    assert np.abs(deskew(seen.astype(np.float32), times.astype(np.float32), predict(now)) - whole).max() < 1e-4
-    assert np.array_equal(deskew(seen, np.zeros(500), predict(now)), seen)
-    assert deskew(np.zeros((0, 3)), np.zeros(0), predict(now)).shape == (0, 3)
+    assert np.abs(deskew(seen.astype(np.float32), times.astype(np.float32), predict(now).belief.x) - whole).max() < 1e-4
+    assert np.array_equal(deskew(seen, np.zeros(500), predict(now).belief.x), seen)
+    assert deskew(np.zeros((0, 3)), np.zeros(0), predict(now).belief.x).shape == (0, 3)
 
 
 def test_inputs_of_inconsistent_size_are_refused() -> None:
     seen, times, now, _ = skewed(0.1, 1.0, 2.0)
     with pytest.raises(ValueError, match="do not fit"):
-        deskew(seen, times[1:], predict(now))
+        deskew(seen, times[1:], predict(now).belief.x)
     with pytest.raises(ValueError, match="not finite"):
-        deskew(seen, np.full(500, np.nan), predict(now))
+        deskew(seen, np.full(500, np.nan), predict(now).belief.x)
 
 
 # --- what the carried scan's pose is a measurement of
@@ -94,7 +94,7 @@ def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin
         dx = 1e-3 * rng.normal(size=20)
         prior = predict(boxplus(now, -dx))
         guess = prior.belief.x.T_ac
-        found = guess.inverse().apply(deskew(seen, times, prior))  # in the prior's {C}: p + J' d
+        found = guess.inverse().apply(deskew(seen, times, prior.belief.x))  # in the prior's {C}: p + J' d
         d = np.linalg.lstsq(J, np.einsum("ij,ij->i", n, found - p), rcond=None)[0]
         alpha = innovation_vector(prior.belief.x, guess @ Pose(geometry.exp(d[:3]), d[3:]))
         told = with_scan_duration(prior, M, times)

@@ -277,7 +277,7 @@ def ready(track: Track) -> bool:
 _KNOTS = 65  # instants at which the motion is computed; in between, rotation and position are interpolated linearly
 
 
-def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) -> Array:
+def deskew(points: NDArray[Any], times_s: NDArray[Any], x: State) -> Array:
     """Points in {A} as if all had been measured at the scan's instant: p(0) = T_ac(0) T_ac(t)^-1 p(t).
 
     The remaining error is that of the predicted rate and velocity times the duration of the scan.
@@ -285,7 +285,7 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
     Args:
         points: (n, 3) in {A} [m].
         times_s: (n,) instant of each relative to the scan's [s].
-        prediction: the scan's prior.
+        x: predicted state at the scan's instant, in {A}.
 
     Returns:
         (n, 3) points in {A} [m].
@@ -299,7 +299,7 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
     if not len(times) or float(np.ptp(times)) == 0.0 == float(times[0]):
         return points
     knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
-    rotations, offsets = _to_scan_instant(prediction.belief.x, knots)
+    rotations, offsets = _to_scan_instant(x, knots)
     position = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, _KNOTS - 1.0)
     low = np.minimum(position.astype(int), _KNOTS - 2)
     part = (position - low)[:, None]

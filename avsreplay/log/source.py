@@ -192,8 +192,7 @@ class Source:
         Args:
             scan: of this source.
         """
-        moved = len(scan.points) and self._ground_truth.sensor is not None
-        return self._sensor(scan.t_ns, scan.frame).inverse().apply(scan.points) if moved else scan.points
+        return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
     def moving_in(self, frame: str) -> str | None:
         """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected.
@@ -281,6 +280,7 @@ class Source:
             pose=None if cloud is None else cloud.pose,
             intensities=None if cloud is None else cloud.intensities,
             places=None if cloud is None else cloud.places,
+            sensor=None if cloud is None or cloud.pose else self._place_of_sensor(placed.t_ns, cloud.frame),
         )
 
     def _body_at(self, t_ns: int) -> State | None:
@@ -300,6 +300,10 @@ class Source:
         if self._ground_truth.sensor is None:
             return cloud
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
+
+    def _place_of_sensor(self, t_ns: int, frame: str) -> Pose | None:
+        """Return the pose of the sensor in the fixed frame; None if the clouds stay in their own frame."""
+        return None if self._ground_truth.sensor is None else self._sensor(t_ns, frame)
 
     def _sensor(self, t_ns: int, frame: str) -> Pose:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""

@@ -20,6 +20,7 @@ from avsreplay.reconstruct.views import (
     Survey,
     Twist,
     averaged,
+    camera_of,
     central_points,
     depth_behind,
     full_cloud,
@@ -298,10 +299,10 @@ def fused(
         full = full_cloud(scan, twist[k])
         fine, T_ca = central_points(full, 0.7 * size_m), twist[k].T_ac.inverse()
         points.append(T_ca.apply(fine).astype(np.float32))
-        normals.append((normals_of(fine, full, survey.camera) @ T_ca.R.T).astype(np.float32))
+        normals.append((normals_of(fine, full, camera_of(scan, survey)) @ T_ca.R.T).astype(np.float32))
         owner.append(np.full(len(fine), k))
         if (len(owner) - 1) % apart == 0:
-            sights.append(Sight(fine, survey.camera, twist[k].T_ac))
+            sights.append(Sight(fine, camera_of(scan, survey), twist[k].T_ac))
     p, n, who = np.vstack(points).astype(np.float64), np.vstack(normals).astype(np.float64), np.concatenate(owner)
     mean, normal, cell = averaged(p, n, size_m)
     count = np.bincount(cell)

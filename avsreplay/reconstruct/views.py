@@ -109,6 +109,11 @@ def full_cloud(scan: Scan, twist: Twist | None) -> Array:
     return _connected(points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist))
 
 
+def camera_of(scan: Scan, survey: Survey) -> Array:
+    """Return the position (3,) of the camera in {A} [m] at a scan: of the sensor, or as the survey found it."""
+    return survey.camera if scan.sensor is None else scan.sensor.t
+
+
 def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None = None) -> ScanView:
     """A scan thinned to voxels of the given size, with normals and weights.
 
@@ -120,11 +125,12 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
     """
     full = full_cloud(scan, twist)
     points = central_points(full, size_m)
-    points = points[np.linalg.norm(survey.camera - points, axis=1) > 0.0]  # the sensor itself has no direction
-    normals, lines = normals_of(points, full, survey.camera), survey.camera - points
+    camera = camera_of(scan, survey)
+    points = points[np.linalg.norm(camera - points, axis=1) > 0.0]  # the sensor itself has no direction
+    normals, lines = normals_of(points, full, camera), camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
     rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
-    return ScanView(scan.t_ns, survey.camera, points, normals, weight, point_tree(points), point_tree(rays))
+    return ScanView(scan.t_ns, camera, points, normals, weight, point_tree(points), point_tree(rays))
 
 
 def point_tree(points: Array) -> Any:

@@ -34,6 +34,7 @@ from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import allowed_scans
 from avsreplay.register.sampling import without_scattered_points
+from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.size import (
     MOST_OF_MODEL,
     SIGMAS,
@@ -47,8 +48,8 @@ from avsreplay.register.size import (
 from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = [
-    "POSES", "Availability", "Backend", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits", "Target",
-    "allowed_scans", "available", "measured_alignment",
+    "POSES", "Availability", "Backend", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits",
+    "SensorFrame", "Target", "allowed_scans", "available", "measured_alignment",
 ]  # fmt: skip
 
 POINTS = 1500  # points used of each scan
@@ -122,11 +123,11 @@ class ModelCheck:
         if (found.status is AlignStatus.ALIGNED or on_model) and self._size_open:
             self._add_place(scan, found.T_ac)
         if found.status is not AlignStatus.ALIGNED:
-            self._unmatched = points if self._unmatched is None else self._unmatched
+            self._unmatched = _as_seen(scan) if self._unmatched is None else self._unmatched
             return
         self._aligned += 1
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
-            self._measure(points, found)
+            self._measure(scan, found.T_ac)
         if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open:
             self._measure_duration(scan, scan.places, found.T_ac)
         self._last = scan.t_ns, found.T_ac
@@ -171,7 +172,7 @@ class ModelCheck:
             return
         T_ca = T_ac.inverse()
         p = T_ca.apply(np.asarray(scan.points[_some(scan.points, _PLACE_POINTS)], dtype=np.float64))
-        found = _place_of_size(self._registrar.index, p, T_ca.t if self._registrar.sided else None)
+        found = _place_of_size(self._registrar.index, p, self._camera(scan, T_ca))
         if found is None:
             return
         moved, change, sigma_m = found
@@ -206,10 +207,16 @@ class ModelCheck:
             f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
         )
 
-    def _measure(self, points: NDArray[Any], alignment: Alignment) -> None:
-        T_ca = alignment.T_ac.inverse()
-        p = T_ca.apply(np.asarray(points[_some(points, POINTS)], dtype=np.float64))
-        camera_c = T_ca.t if self._registrar.sided else None
+    def _camera(self, scan: Scan, T_ca: Pose) -> Array | None:
+        """Position of the sensor in {C}, where only faces towards it are matched."""
+        if not self._registrar.sided:
+            return None
+        return T_ca.t if scan.sensor is None else (T_ca @ scan.sensor).t
+
+    def _measure(self, scan: Scan, T_ac: Pose) -> None:
+        T_ca = T_ac.inverse()
+        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, POINTS)], dtype=np.float64))
+        camera_c = self._camera(scan, T_ca)
         measured = fitted_size(self._registrar.index, p, camera_c)
         if measured is not None and measured.sigma > 0.0:
             self._deltas.append(measured.delta)
@@ -230,7 +237,7 @@ class ModelCheck:
         p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
         rate, velocity = (geometry.rotate(T_ca.R, each / period) for each in (turn, T_ac.t - before.t))
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
-        measured = fitted_duration(self._registrar.index, p, T_ca.t if self._registrar.sided else None, motion)
+        measured = fitted_duration(self._registrar.index, p, self._camera(scan, T_ca), motion)
         if measured is not None and measured[1] > 0.0:
             self._durations.append((*measured, period))
             if (count := len(self._durations)) >= _LEAST_DURATIONS:
@@ -275,6 +282,11 @@ class ModelCheck:
         params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
         found = Registrar(surface, params).acquire(scan)
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
+
+
+def _as_seen(scan: Scan) -> NDArray[Any]:
+    """The points (n, 3) of a scan in the frame of the sensor."""
+    return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
 
 def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:

@@ -65,7 +65,7 @@ def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int
     for k, scan in enumerate(true_scans(run)):
         track = track or estimator.initial(scan.t_ns, scan.truth)
         prediction = estimator.predict(track, scan.t_ns)
-        points = scan.points if mode == "raw" else deskew(scan.points, scan.times_s, prediction)
+        points = scan.points if mode == "raw" else deskew(scan.points, scan.times_s, prediction.belief.x)
         alignment = registrar.register(points, prediction.belief.x.T_ac)
         if mode == "told" and alignment.measured:
             prediction = with_scan_duration(

@@ -1,0 +1,55 @@
+"""Registration in the frame of the sensor, for scans that were transformed to a fixed frame.
+
+The facing test, the search without a guess and the test of free space take the origin of the points as the position of
+the sensor. A fixed frame may have its origin anywhere, so that a scan is registered in the sensor's own frame, and its
+pose is transformed. The covariance is that of d in {C} and does not change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment
+from avsreplay.register.registrar import Registrar
+
+
+@value_class
+class SensorFrame:
+    """A registrar for points and poses in {A}, seen from a sensor.
+
+    Attributes:
+        registrar: of the model.
+        sensor: pose of the sensor in {A}; None if {A} is the frame of the sensor.
+    """
+
+    registrar: Registrar
+    sensor: Pose | None
+
+    def register(self, points: NDArray[Any], guess: Pose, *more: Any) -> Alignment:
+        """Register a scan from a guess T_ac; arguments and result as of ``Registrar.register``."""
+        if self.sensor is None:
+            return self.registrar.register(points, guess, *more)
+        T_sa = self.sensor.inverse()
+        return self._in_a(self.registrar.register(T_sa.apply(points), T_sa @ guess, *more), self.sensor)
+
+    def acquire(self, points: NDArray[Any], *more: Any) -> Alignment:
+        """Find the pose without a guess; arguments and result as of ``Registrar.acquire``."""
+        if self.sensor is None:
+            return self.registrar.acquire(points, *more)
+        return self._in_a(self.registrar.acquire(self.sensor.inverse().apply(points), *more), self.sensor)
+
+    def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
+        """The effective measurement time of each direction, as ``Registrar.instants``."""
+        if self.sensor is None:
+            return self.registrar.instants(points, times_s, T_ac)
+        T_sa = self.sensor.inverse()
+        return self.registrar.instants(T_sa.apply(points), times_s, T_sa @ T_ac)
+
+    @staticmethod
+    def _in_a(found: Alignment, sensor: Pose) -> Alignment:
+        return replace(found, T_ac=sensor @ found.T_ac)
