@@ -20,6 +20,7 @@ from avsreplay.log.header import scaled
 from avsreplay.log.options import Unit
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.params import Camera
 from avsreplay.register.size import MOST_OF_MODEL, diameter, part_of_size
 
 _LEAST = 0.25  # diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
@@ -138,7 +139,7 @@ def find_model(
         options: how the log is read.
 
     Returns:
-        One finding: the number of scans in which the model is found.
+        One finding: the number of scans in which the model is found, and whether the sensor is elsewhere.
     """
     named = [advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")]
     scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
@@ -146,6 +147,11 @@ def find_model(
     few = _few(clouds)
     one, any_pose = _fitting(few, Registrar(model))
     text = f"the model is found in {any_pose} of {len(few)} searched scans"
+    if any_pose < len(few):
+        anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[1]
+        if anywhere > any_pose + 1:  # one scan more may be chance
+            text += f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
+            return [Advice("check", "sensor", text, "--set register.camera=none")]
     if not any_pose:
         return [Advice("check", "pose", f"{text}: is it the right model, and does the topic show the target?")]
     return [Advice("ok", "pose", text + ("" if one else ", each time in more than one pose"))]

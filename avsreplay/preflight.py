@@ -9,6 +9,7 @@ import numpy as np
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
+from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.model_size import Advice, compare_sizes, find_model
 from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register import Registrar, SensorFrame
@@ -81,6 +82,12 @@ def _contents(
     broken, clouds = [s for s in scans if s.status is ScanStatus.DAMAGED], list(map(source.in_own_frame, scans))
     finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
     found = [] if broken and len(broken) == len(scans) else compare_sizes(finite, surface, registrar, source.options)
+    if not finite and (dropped := max(scan.dropped_points for scan in scans)):
+        text = (
+            f"the {dropped} points of a scan are not finite or have coordinates above {MAX_COORDINATE_M:.0e} m:"
+            " transform them to a frame near the sensor"
+        )
+        return [Advice("fail", "scans", text)]
     if search and surface is not None and finite and found:
         found += find_model(finite, surface, found, source.options)
     if broken:

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from raycast_logs import cast, ray_grid
 from rosbags.rosbag1 import Writer
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 import avsreplay.model_size
 from avsreplay.geometry import Pose, exp
@@ -434,3 +436,27 @@ def test_an_origin_far_outside_of_the_model_is_reported_as_the_grasp_point(surfa
     moved = dataclasses.replace(surface, vertices=vertices, sha256="a")
     advice = [a for a in preflight(Log(_seen(surface)), moved) if a.about == "grasp point"]
     assert [a.option for a in advice] == ["--grasp X,Y,Z"] * reported
+
+
+def test_points_far_from_the_origin_of_their_frame_are_named(surface):
+    far = Log([np.zeros((0, 3))] * 3)
+    far.scan_at = lambda seq: Scan(seq, seq, np.zeros((0, 3)), ScanStatus.EMPTY, dropped_points=900)
+    (advice,) = [a for a in preflight(far, surface) if a.about == "scans"]
+    assert advice.grade == "fail"
+    assert "the 900 points of a scan" in advice.text
+    assert "1e+06 m" in advice.text
+
+
+def test_a_sensor_that_is_not_at_the_origin_is_named(surface):
+    """Ray-cast views by a sensor at the origin, and the same points in a frame whose origin is 60 m away."""
+    caster, rays = RayMeshIntersector(trimesh.Trimesh(surface.vertices, surface.faces)), ray_grid(8.0, 50)
+    clouds = []
+    for k in range(3):
+        pose = Pose(exp([0.3 * k, 0.2, 0.1]), [0.3 * k, 0.0, 12.0])
+        ranges, rows, _ = cast(caster, rays, pose.R, pose.t)
+        clouds.append(ranges[:, None] * rays[rows])
+    plain = [a for a in preflight(Log(clouds), surface, search=True) if a.about in ("pose", "sensor")]
+    assert [a.option for a in plain] == [""]
+    moved = [cloud + np.array([0.0, 45.0, -40.0]) for cloud in clouds]
+    found = [a for a in preflight(Log(moved), surface, search=True) if a.about in ("pose", "sensor")]
+    assert [a.option for a in found] == ["--set register.camera=none"]

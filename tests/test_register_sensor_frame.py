@@ -1,0 +1,69 @@
+"""Scans in a fixed frame are registered as in the frame of their sensor, wherever the fixed frame has its origin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avsreplay import geometry
+from avsreplay.geometry import Pose
+from avsreplay.log import LogWriter, SourceOptions, open_source
+from avsreplay.register import RegisterParams, Registrar, SensorFrame
+from avsreplay.run import Job, Run
+
+FIXTURE = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
+SENSOR = Pose(geometry.exp([0.4, -1.1, 2.0]), np.array([80.0, -45.0, 10.0]))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    with open_source(FIXTURE) as source:
+        scan = source.scan_at(3)
+        return Registrar(source.header.surface, RegisterParams()), scan.points.copy(), source.truth_of(scan).pose
+
+
+def test_pose_and_quality_are_those_in_the_frame_of_the_sensor(scene):
+    registrar, points, truth = scene
+    guess = truth @ Pose(geometry.exp([0.02, -0.01, 0.02]), np.array([0.02, 0.01, -0.02]))
+    plain, moved = registrar.register(points, guess), SENSOR.apply(points)
+    found = SensorFrame(registrar, SENSOR).register(moved, SENSOR @ guess)
+    np.testing.assert_allclose(found.T_ac.matrix, (SENSOR @ plain.T_ac).matrix, atol=1e-6)
+    assert (found.status, found.inliers) == (plain.status, plain.inliers)
+    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-3, atol=1e-12)
+    acquired = SensorFrame(registrar, SENSOR).acquire(moved)
+    np.testing.assert_allclose(acquired.T_ac.matrix, (SENSOR @ registrar.acquire(points).T_ac).matrix, atol=1e-5)
+    times = np.linspace(0.0, 0.1, len(points))
+    expected = registrar.instants(points, times, plain.T_ac)
+    instants = SensorFrame(registrar, SENSOR).instants(moved, times, SENSOR @ plain.T_ac)
+    np.testing.assert_allclose(instants, expected, atol=1e-6)
+
+
+def test_without_a_sensor_pose_the_registrar_is_used_as_it_is(scene):
+    registrar, points, truth = scene
+    plain, found = registrar.register(points, truth), SensorFrame(registrar, None).register(points, truth)
+    assert found.T_ac.t.tobytes() == plain.T_ac.t.tobytes()
+
+
+def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
+    """The camera stands 90 m from the origin of the fixed frame; the target is behind it as seen from there."""
+    log = tmp_path / "far.mcap"
+    with open_source(FIXTURE) as source:
+        header = replace(source.header, start=None, truth=None, scenario="", labels=())
+        with LogWriter(log, header, moving_camera=True) as writer:
+            for scan in source.scans():
+                writer.write_camera(scan.log_ns, scan.t_ns, SENSOR)
+                writer.write(scan)
+                writer.write_truth(scan.log_ns, scan.t_ns, SENSOR @ source.truth_of(scan).pose)
+    with Run(Job(source=log, options=SourceOptions(fixed_frame="map"))) as run:
+        rows = list(run.rows())
+    with Run(Job(source=FIXTURE, assignments=("init=auto", "estimator.start=cold"))) as run:
+        plain = list(run.rows())
+    assert [row.gamma for row in rows] == [row.gamma for row in plain]
+    assert sum(row.gamma for row in rows) > 0.8 * len(rows)
+    for row, other in zip(rows, plain, strict=True):
+        if row.gamma:
+            assert row.reg_pos_err_m == pytest.approx(other.reg_pos_err_m, abs=1e-4)
+            assert row.inliers == pytest.approx(other.inliers, abs=2)
