@@ -196,7 +196,7 @@ class Packer:
         return bytes(self.out)
 
 
-_DATATYPE = {"<f4": 7, "<f8": 8}  # FLOAT32 and FLOAT64 of a PointField
+_DATATYPE = {"float32": 7, "float64": 8}
 
 
 def point_cloud2(
@@ -219,16 +219,21 @@ def point_cloud2(
         intensities: (n,), the field ``intensity``; None: no such field.
         residuals: (n,) [m], the field ``residual``; None: no such field.
     """
-    besides = (("t", times_s), ("intensity", intensities), ("residual", residuals))
-    kind = "<f4" if point_type == "float32" else "<f8"
-    columns = [(axis, kind, points[:, k]) for k, axis in enumerate("xyz")]
-    columns += [(name, "<f4", values) for name, values in besides if values is not None]
-    table = np.empty(len(points), dtype=[(name, kind) for name, kind, _ in columns])
-    packer, offset = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(columns)), 0
-    for name, kind, values in columns:
+    names = ["x", "y", "z"]
+    formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
+    fields = (("t", times_s), ("intensity", intensities), ("residual", residuals))
+    besides = [(name, values) for name, values in fields if values is not None]
+    names, formats = [*names, *(name for name, _ in besides)], [*formats, *("<f4" for _ in besides)]
+    table = np.empty(len(points), dtype={"names": names, "formats": formats})
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    for name, values in besides:
         table[name] = values
-        packer.string(name).u32(offset).u8(_DATATYPE[kind]).u32(1)
-        offset += table.dtype[name].itemsize
+    packer = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(names))
+    for name in names:
+        offset = int(table.dtype.fields[name][1]) if table.dtype.fields else 0
+        kind = 7 if name not in ("x", "y", "z") else _DATATYPE[point_type]
+        packer.string(name).u32(offset).u8(kind).u32(1)
     step = table.dtype.itemsize
     return packer.u8(0).u32(step).u32(step * len(points)).octets(table.tobytes()).u8(1).bytes()
 
@@ -284,26 +289,6 @@ _DIAGNOSTIC = (
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
     "string hardware_id\nKeyValue[] values\n",
 )
-_POSES = (_POSE, _POINT, _QUATERNION)
-_MARKER_PARTS = (
-    ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"),
-    ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
-    ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data\n"),
-    ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n"),
-    ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n"),
-)
-_MARKER_KINDS = (
-    "ARROW CUBE SPHERE CYLINDER LINE_STRIP LINE_LIST CUBE_LIST SPHERE_LIST POINTS TEXT_VIEW_FACING MESH_RESOURCE"
-    " TRIANGLE_LIST"
-)
-_MARKER = "".join(f"int32 {name}={k}\n" for k, name in enumerate(_MARKER_KINDS.split())) + (
-    "int32 ADD=0\nint32 MODIFY=0\nint32 DELETE=2\nint32 DELETEALL=3\n"
-    "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\n"
-    "geometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n"
-    "geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n"
-    "sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\nstring text\n"
-    "string mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n"
-)
 
 SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
     "sensor_msgs/msg/PointCloud2": (
@@ -311,19 +296,14 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
         "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n",
         (_HEADER, _TIME, _FIELD),
     ),
-    "geometry_msgs/msg/PoseStamped": ("std_msgs/Header header\nPose pose\n", (_HEADER, _TIME, *_POSES)),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": (
-        "std_msgs/Header header\nPoseWithCovariance pose\n",
-        (_HEADER, _TIME, _POSE_COV, *_POSES),
-    ),
-    "nav_msgs/msg/Path": (
-        "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n",
-        (_HEADER, _TIME, ("geometry_msgs/PoseStamped", "std_msgs/Header header\nPose pose\n"), *_POSES),
+    "geometry_msgs/msg/PoseStamped": (
+        "std_msgs/Header header\nPose pose\n",
+        (_HEADER, _TIME, _POSE, _POINT, _QUATERNION),
     ),
     "nav_msgs/msg/Odometry": (
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
         "geometry_msgs/TwistWithCovariance twist\n",
-        (_HEADER, _TIME, _POSE_COV, *_POSES, _TWIST_COV, _TWIST, _VECTOR3),
+        (_HEADER, _TIME, _POSE_COV, _POSE, _POINT, _QUATERNION, _TWIST_COV, _TWIST, _VECTOR3),
     ),
     "tf2_msgs/msg/TFMessage": (
         "geometry_msgs/TransformStamped[] transforms\n",
@@ -333,13 +313,6 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
         "std_msgs/Header header\nDiagnosticStatus[] status\n",
         (_HEADER, _TIME, _DIAGNOSTIC, _KEY_VALUE),
     ),
-    "visualization_msgs/msg/Marker": (_MARKER, (_HEADER, _TIME, *_POSES, _VECTOR3, *_MARKER_PARTS)),
-    "rcl_interfaces/msg/Log": (
-        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\nbuiltin_interfaces/Time stamp\n"
-        "uint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n",
-        (_TIME,),
-    ),
-    "std_msgs/msg/Float64": ("float64 data\n", ()),
 }
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
-from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text, transform
+from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
 from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
@@ -97,7 +97,9 @@ class ResultLog:
             UnreadableInput: the file cannot be written.
         """
         from mcap.writer import CompressionType, Writer
+        from rosbags.typesys import Stores, get_typestore
 
+        self._definitions: Any = get_typestore(Stores.ROS2_HUMBLE)
         try:
             self._stream = path.open("wb")
         except OSError as error:
@@ -190,7 +192,8 @@ class ResultLog:
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
+                text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
         self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
