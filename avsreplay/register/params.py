@@ -127,7 +127,8 @@ class RegisterParams(Settings):
         high=1.0,
     )
     camera: Camera = setting(
-        Camera.AUTO, "Position of the camera: the origin of the frame of the clouds, unknown (none), or detected (auto)."
+        Camera.AUTO,
+        "Position of the camera: the origin of the frame of the clouds, unknown (none), or detected (auto).",
     )
     subsample_m: float = setting(
         0.0,
