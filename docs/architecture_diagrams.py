@@ -77,7 +77,8 @@ def stage_calls(function, functions, kinds):
     """(stage, method) of every call to a stage, helper functions of the module included."""
     calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
     for call in sorted(calls, key=lambda node: (node.end_lineno, node.end_col_offset)):
-        words = ast.unparse(call.func).split(".")
+        text = ast.unparse(call.func).replace("SensorFrame(stages.registrar, scan.sensor)", "stages.registrar")
+        words = text.split(".")
         if len(words) == 1 and words[0] in functions and words[0] != "fold":
             yield from stage_calls(functions[words[0]], functions, kinds)
         elif len(words) == 3 and words[0] == "stages" and words[1] in kinds:
