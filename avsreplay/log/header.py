@@ -187,9 +187,12 @@ def parse_surface(data: bytes, name: str) -> Surface:
 
 def scaled(surface: Surface, scale: float) -> Surface:
     """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256 are those of the result."""
-    if scale == 1.0:
-        return surface
-    bare = replace(surface, vertices=frozen(scale * surface.vertices, -1, 3), sha256="", data=b"")
+    return surface if scale == 1.0 else with_vertices(surface, scale * surface.vertices)
+
+
+def with_vertices(surface: Surface, vertices: Array) -> Surface:
+    """Return the model with other coordinates (n, 3) [m]; its bytes and SHA-256 are those of the result."""
+    bare = replace(surface, vertices=frozen(vertices, -1, 3), sha256="", data=b"")
     data = surface_bytes(bare)
     return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
 

@@ -19,6 +19,7 @@ from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.header import with_vertices
 from avsreplay.log.index import MessageClouds, Recording, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
 from avsreplay.log.point_cloud2 import Cloud, usable
@@ -213,7 +214,7 @@ def about_grasp(grasp: Array, header: LogHeader, known: GroundTruth) -> tuple[Lo
     """
     surface, body, lookup = header.surface, header.truth, known.truth
     if surface is not None and surface.sha256:  # not the octahedron that stands for a target without a model
-        surface = replace(surface, vertices=surface.vertices - grasp)
+        surface = with_vertices(surface, surface.vertices - grasp)
     if body is not None:
         body = replace(body, c_b=body.c_b + geometry.matrix(body.q_bc) @ grasp)
     header = replace(header, surface=surface, truth=body, start=None)
