@@ -94,7 +94,21 @@ def test_nees_of_every_block_is_that_of_the_solved_equations(world: tumbling.Wor
     assert size == pytest.approx(e @ np.linalg.solve(P, e), rel=1e-6)
     total, blocks = nees_by_block(belief, truth)
     assert total == pytest.approx(d @ np.linalg.solve(P, d), rel=1e-6)
-    assert blocks == pytest.approx({name: e[b] @ np.linalg.solve(P[b, b], e[b]) for name, b in BLOCKS.items()})
+    assert blocks == pytest.approx({name: d[b] @ np.linalg.solve(P[b, b], d[b]) for name, b in BLOCKS.items()})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nees_of_the_rate_is_right_where_the_axes_are_unknown(seed: int) -> None:
+    """Errors drawn in the chart, with axes uncertain by tens of degrees and a rate that is well known in {C}."""
+    rng, found = np.random.default_rng(seed), []
+    chart = to_chart(tumbling.draw(seed, seconds=1.0).states[0])
+    sigma = np.repeat([1e-3, 1e-4, 1e-3, 1e-3, 0.7, 0.1], [3, 3, 3, 3, 5, 3])
+    T = to_errors(chart)
+    belief = Belief(0, to_state(chart), T @ np.diag(sigma**2) @ T.T)
+    for _ in range(200):
+        truth = to_state(chart.moved(sigma * rng.normal(size=20)))
+        found.append(nees_by_block(belief, truth)[1]["rate"])
+    assert np.mean(found) == pytest.approx(3.0, rel=0.25)
 
 
 @pytest.mark.parametrize("size", [1.0, 30.0, 1e3, 1e8])

@@ -221,7 +221,10 @@ def nees(belief: Belief, truth: State) -> float:
 
 
 def nees_by_block(belief: Belief, truth: State) -> tuple[float, dict[str, float]]:
-    """``nees``, and e' P^-1 e of each block of error states, for the axis permutation nearest to the estimate.
+    """``nees``, and that of each block of error states.
+
+    The error states are the differences in the chart, transformed by its Jacobian as the covariance is. Differences of
+    the states themselves are not linear where the principal axes are uncertain by more than some degrees.
 
     Args:
         belief: the estimate and its covariance.

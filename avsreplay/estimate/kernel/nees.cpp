@@ -85,7 +85,7 @@ Errors errors_squared(const State& truth, const State& x, const Square P, const 
   Errors out;
   Factored whole, part;
   const bool regular = whole.of(P, 0, DIM);
-  double nearest[DIM] = {}, d[DIM];
+  double d[DIM];
   out.size = std::numeric_limits<double>::infinity();
   for (int k = 0; k < count; ++k) {
     difference(truth, x, R_nb[k], q_bn[k], d);
@@ -95,11 +95,8 @@ Errors errors_squared(const State& truth, const State& x, const Square P, const 
       for (int i = 0; i < DIM; ++i) size += P[i][i] > 0 ? d[i] * d[i] / P[i][i] : 0;
     if (k == 0 || size < out.size) {
       out.best = k, out.size = size;
-      std::memcpy(nearest, d, sizeof d);
     }
   }
-  for (int b = 0; b < BLOCK_COUNT; ++b)
-    out.block[b] = part.of(P, BLOCK_START[b], BLOCK_SIZE[b]) ? part.squared(nearest + BLOCK_START[b]) : NAN;
   const Chart here = chart_of(x);
   double y[DIM];
   Square T;
@@ -110,6 +107,8 @@ Errors errors_squared(const State& truth, const State& x, const Square P, const 
     for (int i = 0; i < DIM; ++i) d[r] += T[r][i] * y[i];
   }
   out.chart = regular ? whole.squared(d) : NAN;
+  for (int b = 0; b < BLOCK_COUNT; ++b)
+    out.block[b] = part.of(P, BLOCK_START[b], BLOCK_SIZE[b]) ? part.squared(d + BLOCK_START[b]) : NAN;
   return out;
 }
 
