@@ -267,7 +267,7 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     if scan.pose is not None:
         return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
-    guess, origin = stages.estimator.frame.belief_out(predicted.belief).x.T_ac, "predicted"
+    guess, origin = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac, "predicted"
     if state.last_pose is None:
         origin = state.origin
     elif stages.guess is Guess.LAST:

@@ -123,6 +123,8 @@ class Estimator:
             prediction: of this scan.
             alignment: of this scan.
         """
+        if not track.undetermined.size:
+            return track, prediction
         t_ns = prediction.belief.t_ns
         T_ac = self.frame.pose_into(alignment.T_ac, t_ns)
         after = turned(track, prediction.belief.x.T_ac, T_ac, alignment)
@@ -245,7 +247,7 @@ class Estimator:
         return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
 
     def _common_1s(self, track: Track) -> Array:
-        return common_1s(track, self.frame.state_out(track.belief.x, track.belief.t_ns).r_a)
+        return common_1s(track, self.frame.position_out(track.belief.x.r_a, track.belief.t_ns))
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""

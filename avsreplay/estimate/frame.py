@@ -17,18 +17,18 @@ since the first scan. In that frame the motion is free, and the error states and
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import DIM, DMU, VARRHO
-from avsreplay.geometry import Array, Pose
+from avsreplay.estimate.error_state import DMU, VARRHO
+from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, Belief, State
 
-ZERO = geometry.frozen(np.zeros(3), 3)
+ZERO = frozen(np.zeros(3), 3)
 
 
 @value_class
@@ -39,21 +39,24 @@ class EstimatorFrame:
         centre_c: (3,) centre of the model in {C} [m].
         acceleration: (3,) of the centre of mass in {A} [m/s2].
         epoch_ns: instant at which the falling frame coincides with {A}.
+        shifted, falls: whether centre and acceleration differ from zero.
     """
 
     centre_c: Array
     acceleration: Array
     epoch_ns: int
+    shifted: bool = field(init=False)
+    falls: bool = field(init=False)
+    _into: Array = field(init=False, repr=False)  # (6, 6) d' = _into d
+    _out: Array = field(init=False, repr=False)
 
-    @property
-    def falls(self) -> bool:
-        """Return whether there is an acceleration."""
-        return bool(self.acceleration.any())
-
-    @property
-    def shifted(self) -> bool:
-        """Return whether the centre of the model is not the origin of {C}."""
-        return bool(self.centre_c.any())
+    def __post_init__(self) -> None:
+        lower = np.zeros((6, 6))
+        lower[3:, :3] = -geometry.skew(self.centre_c)
+        object.__setattr__(self, "shifted", bool(self.centre_c.any()))
+        object.__setattr__(self, "falls", bool(self.acceleration.any()))
+        object.__setattr__(self, "_into", frozen(np.eye(6) + lower, 6, 6))
+        object.__setattr__(self, "_out", frozen(np.eye(6) - lower, 6, 6))
 
     @property
     def origin_c(self) -> tuple[float, float, float]:
@@ -73,7 +76,7 @@ class EstimatorFrame:
         found = replace(alignment, T_ac=self.pose_into(alignment.T_ac, t_ns))
         if not self.shifted:
             return found
-        into, out, C, free = self._adjoint(1.0), self._adjoint(-1.0), alignment.covariance, alignment.free
+        into, out, C, free = self._into, self._out, alignment.covariance, alignment.free
         return replace(
             found,
             info=out.T @ alignment.info @ out,
@@ -83,11 +86,11 @@ class EstimatorFrame:
 
     def instants_into(self, instants: Array) -> Array:
         """Return the mean instants (6, 6) by direction in {C} [s] as those by direction in {C'}."""
-        return self._adjoint(1.0) @ instants @ self._adjoint(-1.0) if self.shifted else instants
+        return self._into @ instants @ self._out if self.shifted else instants
 
     def motions_out(self, motions: Array) -> Array:
         """Return motions d = [theta; v] of {C'} (6, k) as those of {C}."""
-        return self._adjoint(-1.0) @ motions if self.shifted else motions
+        return self._out @ motions if self.shifted and motions.size else motions
 
     def state_into(self, x: State, t_ns: int) -> State:
         """Return a state in {A} at an instant [ns] in the estimator's coordinates."""
@@ -105,6 +108,10 @@ class EstimatorFrame:
         """Return a belief in the estimator's coordinates as it is in {A}."""
         return self._converted(belief, -1.0)
 
+    def position_out(self, r_a: Array, t_ns: int) -> Array:
+        """Return the position (3,) of the centre of mass in the estimator's coordinates at an instant as in {A} [m]."""
+        return r_a + self._fallen(t_ns)[0] if self.falls else r_a
+
     def _moved(self, x: State, t_ns: int, sign: float) -> State:
         r_a, v_a, c_b = x.r_a, x.v_a, x.c_b
         if self.falls:
@@ -112,26 +119,24 @@ class EstimatorFrame:
             r_a, v_a = r_a - sign * away, v_a - sign * speed
         if self.shifted:
             c_b = c_b + sign * geometry.rotate(geometry.matrix(x.q_bc), self.centre_c)
-        return replace(x, r_a=r_a, v_a=v_a, c_b=c_b) if self.falls or self.shifted else x
+        if not (self.falls or self.shifted):
+            return x
+        return State(x.q_ab, x.w_b, r_a, v_a, x.sigma, c_b, x.q_bc)
 
     def _converted(self, belief: Belief, sign: float) -> Belief:
         """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu x]) A(mu)."""
         x = self._moved(belief.x, belief.t_ns, sign)
         if not self.shifted:
             return belief if x is belief.x else replace(belief, x=x)
-        J = np.eye(DIM)
-        J[VARRHO, DMU] = -2.0 * sign * geometry.skew(geometry.rotate(geometry.matrix(x.q_bc), self.centre_c))
-        P = J @ belief.P @ J.T
-        P = 0.5 * (P + P.T)
-        if isinstance(belief, DrivenBelief):
-            return replace(belief, x=x, P=P, cross=J @ belief.cross)
-        return replace(belief, x=x, P=P)
-
-    def _adjoint(self, sign: float) -> Array:
-        """(6, 6) d' = adjoint d where the origin of {C} is moved by ``sign`` s."""
-        out = np.eye(6)
-        out[3:, :3] = -sign * geometry.skew(self.centre_c)
-        return out
+        J = 2.0 * geometry.skew(belief.x.c_b - x.c_b)
+        P = belief.P.copy()
+        P[VARRHO] += J @ belief.P[DMU]
+        P[:, VARRHO] += P[:, DMU] @ J.T
+        if not isinstance(belief, DrivenBelief):
+            return Belief(belief.t_ns, x, P)
+        cross = belief.cross.copy()
+        cross[VARRHO] += J @ belief.cross[DMU]
+        return replace(belief, x=x, P=P, cross=cross)
 
     def _fallen(self, t_ns: int) -> tuple[Array, Array]:
         """Displacement and velocity of the falling frame in {A} at an instant."""
