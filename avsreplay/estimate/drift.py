@@ -56,6 +56,7 @@ def find_drift(
     scale: tuple[float, float],
     levels: NoiseLevels = NO_LEVELS,
     known: tuple[float, Array] | None = None,
+    correlated: float = 1.0,
 ) -> Parts[DriftFound | None]:
     """The drift that the poses show with the initial values of the motion, in parts.
 
@@ -69,15 +70,17 @@ def find_drift(
         scale: prior 1 sigma of the angular acceleration [rad/s2] and of the acceleration [m/s2].
         levels: noise levels; random disturbances explain the poses as well, and better unless they are constant.
         known: onset [s] and size u (6,) of a drift that was found in fewer poses and is to be refined.
+        correlated: how many times larger than of white noise the variance of the mean of many poses is.
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, _NO_DRIFT) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
-    anew = known is None and _poor(free, factors)
+    alike = max(1.0, min(correlated, len(poses) / len(free.points)))  # of the poses that a normal point joins
+    anew = known is None and _poor(free, factors, alike)
     begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
     frame, found, onsets = yield from _improved(poses, prior, factors, widths, begin)
-    if _poor(frame, factors):  # a local minimum, or no constant acceleration at all
+    if _poor(frame, factors, alike):  # a local minimum, or no constant acceleration at all
         begin = free if anew else (yield from _from_sphere(fixes, poses, prior, factors, widths))
         other = yield from _improved(poses, prior, factors, widths, begin)
         frame, found, onsets = min((frame, found, onsets), other, key=lambda each: each[0].cost)
@@ -188,14 +191,15 @@ def _from_sphere(
     return (yield from fit_jointly(poses, start, prior, factors, 0.0, _NO_DRIFT, torque))
 
 
-def _poor(frame: DrivenFit, factors: Array) -> bool:
+def _poor(frame: DrivenFit, factors: Array, alike: float = 1.0) -> bool:
     """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
 
-    The bound is the quantile of chi-square by Wilson and Hilferty. The noise is at least as claimed.
+    The bound is the quantile of chi-square by Wilson and Hilferty. The noise is at least as claimed; ``alike`` is the
+    factor on its variance by the correlation of the errors.
     """
     dof = max(6 * len(frame.points) - DIM - 6, 6)
     bound = dof * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
-    return 2.0 * frame.cost * min(1.0, float(factors.min())) ** 2 > bound
+    return 2.0 * frame.cost * min(1.0, float(factors.min())) ** 2 > bound * alike
 
 
 def _size(fitted: DrivenFit) -> int:
