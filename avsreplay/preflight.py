@@ -82,7 +82,7 @@ def _contents(
     broken, clouds = [s for s in scans if s.status is ScanStatus.DAMAGED], list(map(source.in_own_frame, scans))
     finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
     found = [] if broken and len(broken) == len(scans) else compare_sizes(finite, surface, registrar, source.options)
-    if not finite and (dropped := max(scan.dropped_points for scan in scans)):
+    if not finite and (dropped := max((scan.dropped_points for scan in scans), default=0)):
         text = (
             f"the {dropped} points of a scan are not finite or have coordinates above {MAX_COORDINATE_M:.0e} m:"
             " transform them to a frame near the sensor"

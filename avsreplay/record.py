@@ -12,6 +12,7 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.files import STDOUT
 from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
+from avsreplay.log.writer import ROOT_FRAME
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import (
     EPOCH_NS,
@@ -174,10 +175,20 @@ def record_source(
     with open_source(source, reading) as opened:
         epoch_ns = opened.scan_at(0).log_ns if len(opened) else 0
         header, due = _labelled(opened.header, options, epoch_ns), opened.info().scans
-        with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
-            pairs = _with_faults(scans, header, options, epoch_ns)
-            tally = _fold(pairs, opened.truth_of, writer, true_clock=False)
-        return tally.recorded(output, writer.bytes, header, tuple(opened.losses))
+        moved = reading.fixed_frame is not None or reading.sensor_topic is not None
+        with _writer(output, header, options, moved) as writer, _ticked(ticker, opened.scans(), due) as scans:
+            pairs = _with_faults(map(_as_seen, scans), header, options, epoch_ns)
+            tally = _fold(pairs, opened.truth_of, writer, true_clock=False, camera_of=lambda scan: scan.sensor)
+        done = tally.recorded(output, writer.bytes, header, tuple(opened.losses))
+        frame = (
+            f"scans are in the frame of the sensor, its poses in '{ROOT_FRAME}': replay with --fixed-frame {ROOT_FRAME}"
+        )
+        return replace(done, note="; ".join(each for each in (frame if moved else "", done.note) if each))
+
+
+def _as_seen(scan: Scan) -> Scan:
+    """A scan in the frame of its sensor, whose pose a log has to hold: registration and faults need it."""
+    return scan if scan.sensor is None else replace(scan, points=scan.sensor.inverse().apply(scan.points))
 
 
 @dataclass(slots=True)
@@ -247,7 +258,7 @@ def _fold(
             writer.write_truth(before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state)
         camera = camera_of(before) if camera_of else None
         if camera is not None:
-            writer.write_camera(before.log_ns, before.log_ns, camera)
+            writer.write_camera(before.log_ns, before.log_ns if true_clock else before.t_ns, camera)
         tally.add(scan)
     return tally
 

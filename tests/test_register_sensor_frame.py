@@ -11,6 +11,7 @@ import pytest
 from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, SourceOptions, open_source
+from avsreplay.record import RecordOptions, record_source
 from avsreplay.register import RegisterParams, Registrar, SensorFrame
 from avsreplay.run import Job, Run
 
@@ -47,9 +48,8 @@ def test_without_a_sensor_pose_the_registrar_is_used_as_it_is(scene):
     assert found.T_ac.t.tobytes() == plain.T_ac.t.tobytes()
 
 
-def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
-    """The camera stands 90 m from the origin of the fixed frame; the target is behind it as seen from there."""
-    log = tmp_path / "far.mcap"
+def _far_log(log: Path) -> Path:
+    """The fixture, seen by a camera 90 m from the origin of the fixed frame 'map'."""
     with open_source(FIXTURE) as source:
         header = replace(source.header, start=None, truth=None, scenario="", labels=())
         with LogWriter(log, header, moving_camera=True) as writer:
@@ -57,6 +57,27 @@ def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path)
                 writer.write_camera(scan.log_ns, scan.t_ns, SENSOR)
                 writer.write(scan)
                 writer.write_truth(scan.log_ns, scan.t_ns, SENSOR @ source.truth_of(scan).pose)
+    return log
+
+
+def test_a_log_that_is_recorded_from_a_fixed_frame_holds_the_pose_of_the_sensor(tmp_path):
+    far, copy = _far_log(tmp_path / "far.mcap"), tmp_path / "copy.mcap"
+    reading = SourceOptions(fixed_frame="map")
+    done = record_source(far, copy, reading, RecordOptions())
+    assert "--fixed-frame map" in done.note
+    with open_source(FIXTURE) as plain, open_source(copy, reading) as again:
+        assert len(again) == len(plain)
+        for seq in (0, 5, len(plain) - 1):
+            scan, other = plain.scan_at(seq), again.scan_at(seq)
+            np.testing.assert_allclose(other.sensor.matrix, SENSOR.matrix, atol=1e-9)
+            np.testing.assert_allclose(other.points, SENSOR.apply(scan.points), atol=1e-5)
+            truth = SENSOR @ plain.truth_of(scan).pose
+            np.testing.assert_allclose(again.truth_of(other).pose.matrix, truth.matrix, atol=1e-6)
+
+
+def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
+    """The camera stands 90 m from the origin of the fixed frame; the target is behind it as seen from there."""
+    log = _far_log(tmp_path / "far.mcap")
     with Run(Job(source=log, options=SourceOptions(fixed_frame="map"))) as run:
         rows = list(run.rows())
     with Run(Job(source=FIXTURE, assignments=("init=auto", "estimator.start=cold"))) as run:

@@ -31,20 +31,46 @@ class SensorFrame:
     sensor: Pose | None
 
     def register(self, points: NDArray[Any], guess: Pose, *more: Any) -> Alignment:
-        """Register a scan from a guess T_ac; arguments and result as of ``Registrar.register``."""
+        """Register a scan from a guess, as ``Registrar.register`` does.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            guess: predicted T_ac.
+            more: the other arguments of ``Registrar.register``.
+
+        Returns:
+            The pose T_ac with its quality.
+        """
         if self.sensor is None:
             return self.registrar.register(points, guess, *more)
         T_sa = self.sensor.inverse()
         return self._in_a(self.registrar.register(T_sa.apply(points), T_sa @ guess, *more), self.sensor)
 
     def acquire(self, points: NDArray[Any], *more: Any) -> Alignment:
-        """Find the pose without a guess; arguments and result as of ``Registrar.acquire``."""
+        """Find the pose without a guess, as ``Registrar.acquire`` does.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            more: the other arguments of ``Registrar.acquire``.
+
+        Returns:
+            The pose T_ac with its quality.
+        """
         if self.sensor is None:
             return self.registrar.acquire(points, *more)
         return self._in_a(self.registrar.acquire(self.sensor.inverse().apply(points), *more), self.sensor)
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
-        """The effective measurement time of each direction, as ``Registrar.instants``."""
+        """Return the effective measurement time of each direction, as ``Registrar.instants`` does.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            times_s: (n,) of each [s].
+            T_ac: the registered pose.
+
+        Returns:
+            (6, 6) mean instants by direction [s].
+        """
         if self.sensor is None:
             return self.registrar.instants(points, times_s, T_ac)
         T_sa = self.sensor.inverse()
