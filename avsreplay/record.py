@@ -177,18 +177,15 @@ def record_source(
         header, due = _labelled(opened.header, options, epoch_ns), opened.info().scans
         moved = reading.fixed_frame is not None or reading.sensor_topic is not None
         with _writer(output, header, options, moved) as writer, _ticked(ticker, opened.scans(), due) as scans:
-            pairs = _with_faults(map(_as_seen, scans), header, options, epoch_ns)
+            # registration and faults need the position of the sensor: a log holds its frame and its poses
+            seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
+            pairs = _with_faults(seen, header, options, epoch_ns)
             tally = _fold(pairs, opened.truth_of, writer, true_clock=False, camera_of=lambda scan: scan.sensor)
         done = tally.recorded(output, writer.bytes, header, tuple(opened.losses))
         frame = (
             f"scans are in the frame of the sensor, its poses in '{ROOT_FRAME}': replay with --fixed-frame {ROOT_FRAME}"
         )
         return replace(done, note="; ".join(each for each in (frame if moved else "", done.note) if each))
-
-
-def _as_seen(scan: Scan) -> Scan:
-    """A scan in the frame of its sensor, whose pose a log has to hold: registration and faults need it."""
-    return scan if scan.sensor is None else replace(scan, points=scan.sensor.inverse().apply(scan.points))
 
 
 @dataclass(slots=True)

@@ -101,7 +101,7 @@ class ModelCheck:
         self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
         self._places: list[_Place] = []
         self._placed, self._stride = 0, _PLACE_EVERY  # scans that may give a place; one of ``_stride`` does
-        self._unmatched: NDArray[Any] | None = None
+        self._unmatched: Scan | None = None
         self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
         self._durations: list[tuple[float, float, float]] = []  # duration, its standard error, period [s]
 
@@ -123,7 +123,7 @@ class ModelCheck:
         if (found.status is AlignStatus.ALIGNED or on_model) and self._size_open:
             self._add_place(scan, found.T_ac)
         if found.status is not AlignStatus.ALIGNED:
-            self._unmatched = _as_seen(scan) if self._unmatched is None else self._unmatched
+            self._unmatched = self._unmatched or scan
             return
         self._aligned += 1
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
@@ -265,28 +265,23 @@ class ModelCheck:
             f"--scan-duration {mean:.3g} gives times by the order of the points",
         )
 
-    def _diagnosis(self, points: NDArray[Any]) -> str:
+    def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""
-        finite = np.isfinite(points).all(axis=1)
-        scan = without_scattered_points(np.asarray(points[finite], dtype=np.float64))
+        finite = np.isfinite(scan.points).all(axis=1)
+        points = without_scattered_points(np.asarray(scan.points[finite], dtype=np.float64))
         mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
-        if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
+        if len(points) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), points, scan.sensor):
             return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
-        own, seen = diameter(self._surface.vertices, trimmed=False), diameter(scan)
+        own, seen = diameter(self._surface.vertices, trimmed=False), diameter(points)
         sizes = f"the first of them measures {seen:.3g} m, the model {own:.3g} m"
         cause = "is background left around the target, and is it" if seen > MOST_OF_MODEL * own else "is it"
         return f"no pose of the model explains the scans ({sizes}): {cause} the right model, in metres?"
 
-    def _fits(self, surface: Surface, scan: Array) -> bool:
+    def _fits(self, surface: Surface, points: Array, sensor: Pose | None) -> bool:
         """Whether nearly all of a scan is on a model, in one pose only and with its size."""
         params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
-        found = Registrar(surface, params).acquire(scan)
+        found = SensorFrame(Registrar(surface, params), sensor).acquire(points)
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
-
-
-def _as_seen(scan: Scan) -> NDArray[Any]:
-    """The points (n, 3) of a scan in the frame of the sensor."""
-    return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
 
 def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:
