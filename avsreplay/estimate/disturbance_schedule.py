@@ -105,28 +105,32 @@ class DisturbanceSchedule:
         count, last, known = pose_count(track.fixes), track.batch, track.drift
         if not self.batch.checked_poses or last is None or track.testing is not None:
             return track
-        epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
         if count >= FEWEST and known is None and late > (0 if track.since else _LATEST):
+            start = self._start(track, last, track.fixes[0].t_ns)
             poses = track.fixes, last, start, self.params, track.levels, _positions(track, start)
             if len(track.fixes) < FEWEST_TO_SPREAD:
                 return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
             return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
+        if track.untested <= FEWEST_TO_TEST or track.since == 0:
+            return track
         every = _all_poses(track) if known is None else track
         count, epoch_ns = pose_count(every.fixes), every.fixes[0].t_ns
         early = known is None or track.belief.t_ns - epoch_ns < _EARLY * (known.detected_ns - epoch_ns)
-        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if early else CHECK_GROWTH) * count)
-        if count < FEWEST_WITH_DRIFT or track.untested <= due or track.since == 0:
+        if count < FEWEST_WITH_DRIFT or track.untested <= (DRIFT_GROWTH if early else CHECK_GROWTH) * count:
             return track
         begun = None
         if known is not None:
             if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
                 return track.changed(untested=0)
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
-        start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
+        start = self._start(track, last, epoch_ns)
         job = Computation(ComputationKind.DRIFT, (every, start, begun), (epoch_ns, every.fixes[-1].t_ns))
         return track.changed(testing=job, untested=0)
+
+    def _start(self, track: Track, last: BatchResult, epoch_ns: int) -> Chart:
+        """Initial values at an instant: those of the last fit, or of the belief propagated back."""
+        return last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
 
     def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
         """The track with new noise levels."""
@@ -193,6 +197,7 @@ class DisturbanceSchedule:
 
 
 def _alike(track: Track) -> float:
+    """The larger factor on R, of attitude and position, by which the errors of the poses are correlated."""
     return 1.0 if track.inflation is None else float(track.inflation.max())
 
 
