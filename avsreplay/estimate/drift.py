@@ -19,6 +19,7 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.driven_fit import (
+    NO_ACCELERATION,
     DrivenFit,
     drift_unknowns,
     fit_driven,
@@ -73,7 +74,7 @@ def find_drift(
         correlated: how many times larger than of white noise the variance of the mean of many poses is.
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
-    onset_s, u = (0.0, _NO_DRIFT) if known is None else known
+    onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
     alike = max(1.0, min(correlated, len(poses) / len(free.points)))  # of the poses that a normal point joins
@@ -88,7 +89,7 @@ def find_drift(
     if best.log_odds < _FOUND or not frame.u.any():
         return None
     if known is None:
-        free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, _NO_DRIFT), key=lambda f: f.cost)
+        free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION), key=lambda f: f.cost)
         yield _size(free)
         if _poor(frame, factors) or free.cost - frame.cost < _FOUND:
             return None
@@ -145,9 +146,6 @@ class _Found:
     width: float
 
 
-_NO_DRIFT = np.zeros(6)
-
-
 def _improved(
     poses: Poses,
     prior: Prior,
@@ -188,7 +186,7 @@ def _from_sphere(
     minimum.
     """
     start, torque = to_chart(rough_state(fixes)), np.append(widths[:3], np.zeros(3))
-    return (yield from fit_jointly(poses, start, prior, factors, 0.0, _NO_DRIFT, torque))
+    return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
 
 
 def _poor(frame: DrivenFit, factors: Array, alike: float = 1.0) -> bool:

@@ -35,8 +35,8 @@ from avsreplay.estimate.dynamics import (
     propagate,
     propagate_state,
     ratios,
+    rotation_history,
     seconds_to,
-    sigma_join,
     transition,
     translated,
 )
@@ -139,20 +139,19 @@ def driven_steps(
 
 def driven_history(x: State, u: Array | None, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
     """The motion from ``x`` with a constant acceleration u (6,), or free motion, to ``times_s`` (n,) [s], ascending."""
-    drive = NO_DRIVE if u is None else drive_of(x, u)
-    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times_s, drive)
+    path = rotation_history(x, times_s, NO_DRIVE if u is None else drive_of(x, u))
     centre, velocity = translated(x, times_s, arc)
     Phi = np.zeros((len(times_s), DIM, DIM))
     Phi[:] = np.eye(DIM)
-    Phi[:, :6, :6], Phi[:, :6, SIGMA] = S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)
+    Phi[:, :6, :6], Phi[:, :6, SIGMA] = path.S[:, :, :6], path.S[:, :, 6:]
     if arc is None:
         Phi[:, RHO, VEL] = times_s[:, None, None] * np.eye(3)
     else:
         Phi[:, RHO.start : VEL.stop, RHO.start : VEL.stop] = arc.transitions(times_s)
     if u is None:
-        return DrivenHistory(q, w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6)))
+        return DrivenHistory(path.q, path.w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6)))
     pushed = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
-    return DrivenHistory(q, w, *pushed, *_derivatives(x, u, times_s, Phi))
+    return DrivenHistory(path.q, path.w, *pushed, *_derivatives(x, u, times_s, Phi))
 
 
 def _pushed(x: State, u: Array, h: float) -> State:

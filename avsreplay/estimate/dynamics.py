@@ -209,10 +209,13 @@ class RotationHistory:
     S: Array
 
 
-def rotation_history(x: State, times_s: Array) -> RotationHistory:
-    """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached from the one before."""
+def rotation_history(x: State, times_s: Array, drive: Triple = NO_DRIVE) -> RotationHistory:
+    """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached from the one before.
+
+    ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
+    """
     times = np.asarray(times_s, dtype=np.float64)
-    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times)
+    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times, drive)
     return RotationHistory(q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2))
 
 

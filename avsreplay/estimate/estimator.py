@@ -147,7 +147,7 @@ class Estimator:
     def step(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
     ) -> tuple[Track, Verdict]:
-        """The posterior and the final verdict: a large innovation is decided on over the next scans.
+        """The posterior and the final verdict. The cause of a large innovation is decided with the next scans.
 
         Args:
             track: after the last scan.

@@ -2,7 +2,7 @@
 
 Centre. A CAD file may have its origin far from the body, and the origin of {C} is where its designer has put it. The
 pose of a point outside the body is uncertain by the error of the attitude times the distance, and the prior of the
-offset from the centre of mass would be about a point that has nothing to do with the mass. The estimator therefore
+offset from the centre of mass would be about a point that is unrelated to the mass. The estimator therefore
 estimates {C'}, which is {C} with its origin at the centre s of the model's bounding box, s given in {C}:
 
     T_ac' = T_ac (1, s),    varrho' = varrho + A(mu) s,    v' = v + theta x s for d = [theta; v] in {C}.
@@ -65,51 +65,52 @@ class EstimatorFrame:
         return x, y, z
 
     def pose_into(self, T_ac: Pose, t_ns: int) -> Pose:
-        """Return a pose of {C} in {A} at an instant [ns] in the estimator's coordinates."""
+        """Convert a pose of {C} in {A} at an instant [ns] to the estimator's coordinates."""
         t = T_ac.t + geometry.rotate(T_ac.R, self.centre_c) if self.shifted else T_ac.t
         return Pose(T_ac.q, t - self._fallen(t_ns)[0]) if self.falls else Pose(T_ac.q, t)
 
     def alignment_into(self, alignment: Alignment, t_ns: int) -> Alignment:
-        """Return a registered pose of {C} in {A} at an instant [ns] in the estimator's coordinates."""
+        """Convert a registered pose of {C} in {A} at an instant [ns] to the estimator's coordinates."""
         if not (self.falls or self.shifted):
             return alignment
-        found = replace(alignment, T_ac=self.pose_into(alignment.T_ac, t_ns))
+        T_ac = self.pose_into(alignment.T_ac, t_ns)
         if not self.shifted:
-            return found
+            return replace(alignment, T_ac=T_ac)
         into, out, C, free = self._into, self._out, alignment.covariance, alignment.free
         return replace(
-            found,
+            alignment,
+            T_ac=T_ac,
             info=out.T @ alignment.info @ out,
             covariance=None if C is None else into @ C @ into.T,
             free=None if free is None else into @ free,
         )
 
     def instants_into(self, instants: Array) -> Array:
-        """Return the mean instants (6, 6) by direction in {C} [s] as those by direction in {C'}."""
+        """Convert the mean instants (6, 6) [s] by directions of {C} to those by directions of {C'}."""
         return self._into @ instants @ self._out if self.shifted else instants
 
     def motions_out(self, motions: Array) -> Array:
-        """Return motions d = [theta; v] of {C'} (6, k) as those of {C}."""
+        """Convert motions d = [theta; v] of {C'} (6, k) to those of {C}."""
         return self._out @ motions if self.shifted and motions.size else motions
 
     def state_into(self, x: State, t_ns: int) -> State:
-        """Return a state in {A} at an instant [ns] in the estimator's coordinates."""
+        """Convert a state about {C} in {A} at an instant [ns] to the estimator's coordinates."""
         return self._moved(x, t_ns, 1.0)
 
     def state_out(self, x: State, t_ns: int) -> State:
-        """Return a state in the estimator's coordinates at an instant [ns] as it is in {A}."""
+        """Convert a state at an instant [ns] from the estimator's coordinates to {C} and {A}."""
         return self._moved(x, t_ns, -1.0)
 
     def belief_into(self, belief: Belief) -> Belief:
-        """Return a belief in {A} in the estimator's coordinates."""
+        """Convert a belief about {C} in {A} to the estimator's coordinates."""
         return self._converted(belief, 1.0)
 
     def belief_out(self, belief: Belief) -> Belief:
-        """Return a belief in the estimator's coordinates as it is in {A}."""
+        """Convert a belief from the estimator's coordinates to {C} and {A}."""
         return self._converted(belief, -1.0)
 
     def position_out(self, r_a: Array, t_ns: int) -> Array:
-        """Return the position (3,) of the centre of mass in the estimator's coordinates at an instant as in {A} [m]."""
+        """Convert a position (3,) [m] of the centre of mass at an instant [ns] from the falling frame to {A}."""
         return r_a + self._fallen(t_ns)[0] if self.falls else r_a
 
     def _moved(self, x: State, t_ns: int, sign: float) -> State:

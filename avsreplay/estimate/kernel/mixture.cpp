@@ -100,12 +100,16 @@ Fixture fixture(const State& x, double t, const Turn& at) {
   return {vector(x.r_a) + t * v + A * arm, v + A * cross(vector(at.w), arm), quad(at.q) * quad(x.q_bc)};
 }
 
-// The state and its covariance with the fixture moved to `origin`, given in {C}: varrho + A(mu) origin, with
-// A(dmu mu) = (1 + 2 [dmu x]) A(mu).
-void move_fixture(State& x, const V3& origin, Square P) {
+// Moves the fixture of a state to `origin`, given in {C}: varrho + A(mu) origin. Returns the displacement in {B}.
+V3 move_fixture(State& x, const V3& origin) {
   const V3 by = matrix(quad(x.q_bc)) * origin;
-  const M3 J = skew(by);  // dvarrho' = dvarrho - 2 J dmu
   for (int i = 0; i < 3; ++i) x.c_b[i] += by.x[i];
+  return by;
+}
+
+// The same with the covariance of the state: A(dmu mu) = (1 + 2 [dmu x]) A(mu).
+void move_fixture(State& x, const V3& origin, Square P) {
+  const M3 J = skew(move_fixture(x, origin));  // dvarrho' = dvarrho - 2 J dmu
   for (int r = 0; r < 3; ++r)
     for (int k = 0; k < 3; ++k)
       for (int c = 0; c < DIM; ++c) P[14 + r][c] -= 2 * J.x[r][k] * P[17 + k][c];
@@ -117,8 +121,7 @@ void move_fixture(State& x, const V3& origin, Square P) {
 // The point `origin`, given in {C}, of a chart at each of n ascending times after it.
 std::vector<Fixture> path_of(const Chart& chart, const double* times, size_t n, const V3& origin) {
   State x = state_of(chart);
-  const V3 by = matrix(quad(x.q_bc)) * origin;
-  for (int i = 0; i < 3; ++i) x.c_b[i] += by.x[i];
+  move_fixture(x, origin);
   double join[3][2], t = 0;
   const Body body = body_of(x, join);
   Turn turn = turn_of(x);
