@@ -329,7 +329,7 @@ def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wi
 
 
 def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
-    """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and lie in its plane."""
+    """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and are in its plane."""
     distances, nearest = point_tree(p).query(p, k=2 * SUPPORT + 1, most_m=3.0 * size_m)
     d = distances[:, 1:]
     index = np.where(np.isfinite(d), nearest[:, 1:], 0)
