@@ -105,6 +105,9 @@ def impulses(
     times: NDArray[np.float64],
     drive: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Array: ...
+def by_drive(
+    q: Array, w: Array, sigma: tuple[float, float, float], times: Array, drive: tuple[float, float, float]
+) -> Array: ...
 def join(charts: Array, P: Array, weights: Array, quadrature: Array) -> tuple[Array, Array]: ...
 def propagate(
     q_ab: Array,
@@ -155,7 +158,7 @@ class Problem:
     def rows(self) -> tuple[Array, Array]: ...
     def absorbed(self, P: Array) -> tuple[float, float]: ...
     def smooth(
-        self, y: Array, P: Array, into: Array, torque: tuple[float, float, float], force: float
+        self, y: Array, P: Array, into: Array, torque: tuple[float, float, float], force: float, since: float = 0.0
     ) -> tuple[Array, Array]: ...
     @property
     def chart(self) -> Array: ...
@@ -165,6 +168,27 @@ class Problem:
     def d(self) -> Array: ...
     @property
     def weights(self) -> Array: ...
+
+class Driven(Problem):
+    def __init__(
+        self,
+        times: Array,
+        q: Array,
+        t: Array,
+        root: Array,
+        info: Array,
+        mean: Array,
+        prior_info: Array,
+        onset: float,
+        widths: Array,
+    ) -> None: ...
+    def measure(self, row: Array, target: float) -> None: ...
+    def linearise(self, chart: Array, u: Array) -> None: ...  # type: ignore[override]
+    def step(self, damping: float) -> float: ...
+    @property
+    def u(self) -> Array: ...
+    @property
+    def left(self) -> float: ...
 
 class Path:
     def __init__(

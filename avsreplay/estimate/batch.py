@@ -207,9 +207,7 @@ class Problem:
         self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
         core = _motion.Problem(poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info)
         self.core = core
-        if poses.arc is not None:
-            moved = poses.arc.transitions(poses.times_s)
-            core.paths(np.stack([moved[:, :3, :3], moved[:, :3, 3:]], axis=1))
+        follow_orbit(core, poses)
         self.reweigh(factors)
         if start is not None:
             core.linearise(start.flat)
@@ -249,6 +247,13 @@ class Problem:
     def covariance(self) -> Array:
         """(20, 20) inverse of the normal matrix, in chart coordinates."""
         return _inverse(self.core.normal()[0])
+
+
+def follow_orbit(core: _motion.Problem, poses: Poses) -> None:
+    """Move the centre of mass along the orbit of the poses, if they have one, in place of free motion."""
+    if poses.arc is not None:
+        moved = poses.arc.transitions(poses.times_s)
+        core.paths(np.stack([moved[:, :3, :3], moved[:, :3, 3:]], axis=1))
 
 
 def _pair(factors: Array) -> tuple[float, float]:

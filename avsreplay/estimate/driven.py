@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
@@ -42,11 +41,10 @@ from avsreplay.estimate.dynamics import (
 )
 from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VEL, W
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
-from avsreplay.geometry import IDENTITY_QUAT, Array
+from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
 
 _STEP_RAD = 0.1  # step of the integral in drift_equivalents
-_SIMPSON_RAD = 0.4  # largest rotation of two steps of Simpson's rule in drift_response
 
 
 @value_class
@@ -79,10 +77,6 @@ class DrivenHistory:
     v: Array
     Phi: Array
     by_u: Array
-
-    def some(self, which: NDArray[np.int64]) -> DrivenHistory:
-        """The motion at some of the instants."""
-        return DrivenHistory(*(a[which] for a in (self.q, self.w, self.r, self.v, self.Phi, self.by_u)))
 
 
 def drive_of(x: State, u: Array) -> Triple:
@@ -176,19 +170,9 @@ def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array] | Array) -
         times_s: (n,) [s after now], each reached from the one before.
         Phi: (20, 20) along the motion with u, of each instant, without that effect.
     """
-    n, drive = len(times_s), drive_of(x, u)
-    lengths = np.diff(times_s, prepend=0.0)
-    turn = float(np.abs(lengths).max()) * float(np.linalg.norm(x.w_b))
-    m = 2 * max(1, math.ceil(turn / _SIMPSON_RAD))
-    grid = ((times_s - lengths)[:, None] + lengths[:, None] * (np.arange(1, m + 1) / m)).reshape(-1)
-    rate = _motion.impulses(IDENTITY_QUAT, x.w_b, ratios(x.sigma), grid, drive)
-    slope = np.concatenate([np.eye(6)[None, :, 3:], rate])
-    weight = np.where(np.arange(m + 1) % 2 == 1, 4.0, 2.0) / (3.0 * m)  # Simpson's rule
-    weight[[0, -1]] *= 0.5
-    pieces = slope[m * np.arange(n)[:, None] + np.arange(m + 1)]  # (n, m + 1, 6, 3)
-    total = np.cumsum(lengths[:, None, None] * (pieces * weight[:, None, None]).sum(axis=1), axis=0)
-    full, by_u = np.array(Phi), np.zeros((n, DIM, 6))
-    turned = full[:, :6, :6] @ total
+    drive = drive_of(x, u)
+    turned = _motion.by_drive(x.q_ab, x.w_b, ratios(x.sigma), times_s, drive)
+    full, by_u = np.array(Phi), np.zeros((len(times_s), DIM, 6))
     full[:, :6, DMU] += -2.0 * turned @ geometry.skew(np.array(drive))
     by_u[:, :6, :3] = turned @ geometry.matrix(x.q_bc)
     by_u[:, RHO, 3:] = 0.5 * (times_s**2)[:, None, None] * np.eye(3)
@@ -328,13 +312,3 @@ def followed(
     D[first:, :, :DIM], D[first:, :, DIM:-1], D[first:, :, -1] = late.Phi @ until, late.by_u, late.Phi @ missed
     parts = zip(*((p.q, p.w, p.r, p.v, p.Phi, p.by_u) for p in (free, late)), strict=True)
     return DrivenHistory(*(np.concatenate([a[:-1], b]) for a, b in parts)), D
-
-
-def followed_poses(chart: Chart, u: Array, onset_s: float, times_s: Array, arc: OrbitArc | None) -> tuple[Array, Array]:
-    """Attitudes (n, 4) of {B} and positions (n, 3) of the centre of mass of ``followed``, without derivatives."""
-    x, first, since = to_state(chart), int(np.searchsorted(times_s, onset_s, side="right")), times_s - onset_s
-    sigma, drive = ratios(x.sigma), drive_of(x, u)
-    q, w, _, _ = _motion.follow(x.q_ab, x.w_b, sigma, NO_DRIVE, np.append(times_s[:first], onset_s))
-    late = _motion.follow(q[-1], w[-1], sigma, NO_DRIVE, since[first:], drive)[0]
-    moved = 0.5 * np.maximum(since, 0.0)[:, None] ** 2 * u[3:]
-    return np.concatenate([q[:-1], late]), translated(x, times_s, arc)[0] + moved

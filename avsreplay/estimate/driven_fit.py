@@ -16,7 +16,7 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.driven import DrivenHistory, drift_equivalents, drive_of
+from avsreplay.estimate.driven import drift_equivalents, drive_of
 from avsreplay.estimate.dynamics import (
     NO_DRIVE,
     propagate_state,
@@ -24,7 +24,6 @@ from avsreplay.estimate.dynamics import (
     rotation_history,
     translated,
 )
-from avsreplay.estimate.error_state import DMU, DQ, RHO, VARRHO
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.work import Parts
@@ -132,33 +131,6 @@ def drift_columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Arr
 
 def _columns(G: Array, B: Array, times_s: Array, onset_s: float) -> Array:
     return np.asarray((G @ (B[:-1] - B[-1])) * (times_s > onset_s)[:, None, None])
-
-
-def residuals_along(path: DrivenHistory, D: Array, chart: Chart, poses: Poses, scale: Array) -> tuple[Array, Array]:
-    """Whitened residuals (n, 6) of poses along a motion, and their derivatives (n, 6, 27).
-
-    Args:
-        path: the motion at the poses.
-        D: (n, 20, 27) its derivatives.
-        chart: its initial values.
-        poses: the measurements.
-        scale: (2,) on their standard deviations of attitude and position.
-    """
-    x, R = to_state(chart), geometry.matrix(path.q)
-    to_c = geometry.matrix(x.q_bc).T
-    turned = 2.0 * to_c @ (D[:, DQ] + D[:, DMU])
-    shifted = to_c @ (np.swapaxes(R, 1, 2) @ D[:, RHO] + D[:, VARRHO] - 2.0 * geometry.skew(x.c_b) @ D[:, DQ])
-    rows = (poses.root / np.repeat(scale, 3)) @ np.concatenate([turned, shifted], axis=1)
-    return white_residuals(path.q, path.r, chart, poses, scale), rows
-
-
-def white_residuals(q_ab: Array, r_a: Array, chart: Chart, poses: Poses, scale: Array) -> Array:
-    """Whitened residuals (n, 6) of poses at attitudes (n, 4) and positions (n, 3), as in ``residuals_along``."""
-    x, back = to_state(chart), np.swapaxes(geometry.matrix(poses.q), 1, 2)
-    theta = geometry.log(geometry.multiply(geometry.conjugate(poses.q), geometry.multiply(q_ab, x.q_bc)))
-    moved = (back @ (r_a + geometry.matrix(q_ab) @ x.c_b - poses.t)[:, :, None])[:, :, 0]
-    root = poses.root / np.repeat(scale, 3)
-    return np.asarray((root @ np.concatenate([theta, moved], axis=1)[:, :, None])[:, :, 0])
 
 
 def levels_of(

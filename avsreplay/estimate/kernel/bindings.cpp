@@ -265,13 +265,12 @@ Numpy body_numbers(const Flat& from, const Matrix<DIM, DIM>& P, double largest) 
   return out;
 }
 
-void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
+void fill(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
             const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
             const Matrix<DIM, DIM>& prior_info) {
   const size_t n = t.shape(0);
   if (q.shape(0) != n || p.shape(0) != n || root.shape(0) != n || info.shape(0) != n)
     throw std::invalid_argument("times, q, p, root and info must be equally many");
-  new (self) Problem();
   self->poses.resize(n);
   for (size_t k = 0; k < n; ++k) {
     Measured& pose = self->poses[k];
@@ -284,6 +283,30 @@ void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<
   }
   self->mean = chart(mean);
   std::memcpy(self->prior_info, prior_info.data(), sizeof self->prior_info);
+}
+
+void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
+            const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
+            const Matrix<DIM, DIM>& prior_info) {
+  fill(new (self) Problem(), t, q, p, root, info, mean, prior_info);
+}
+
+// An acceleration with a prior 1 sigma of zero is fixed at zero.
+void create_driven(Driven* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
+                   const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
+                   const Matrix<DIM, DIM>& prior_info, double onset, const Vector<SEEN>& widths) {
+  fill(new (self) Driven(), t, q, p, root, info, mean, prior_info);
+  self->push.onset = onset;
+  for (int k = 0; k < SEEN; ++k) {
+    self->open[k] = widths(k) > 0;
+    self->push.info[k] = self->open[k] ? 1 / (widths(k) * widths(k)) : 1;
+  }
+}
+
+// A pseudo-measurement of the acceleration with unit standard deviation.
+void set_row(Driven& self, const Vector<SEEN>& row, double target) {
+  std::memcpy(self.push.row, row.data(), sizeof self.push.row);
+  self.push.target = target;
 }
 
 // The centre of mass at each pose by position and by velocity at the epoch, in place of those of free motion.
@@ -343,21 +366,32 @@ nb::tuple rows(const Problem& self) {
   return nb::make_tuple(first, second);
 }
 
+// Weighted residuals (n, 6) and their Jacobian (n, 6, 27) by chart steps, acceleration and onset.
+nb::tuple driven_rows(const Driven& self) {
+  const size_t n = self.poses.size();
+  constexpr size_t ALL = DIM + PUSHED;
+  double *e, *H;
+  Numpy first = array({n, SEEN}, &e), second = array({n, SEEN, ALL}, &H);
+  for (size_t k = 0; k < n; ++k)
+    self.in_steps<ALL>(k, e + SEEN * k, *reinterpret_cast<double(*)[SEEN][ALL]>(H + SEEN * ALL * k));
+  return nb::make_tuple(first, second);
+}
+
 Two absorbed(const Problem& self, const Matrix<DIM, DIM>& P) {
   Two out;
   self.absorbed(as<Square>(P.data()), out.data());
   return out;
 }
 
-nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0,
-                 const Matrix<MOTION, MOTION>& into, const Three& torque, double force) {
-  double y[DIM];
-  Square P;
+template <int N>
+nb::tuple smooth(const Problem& self, const Vector<N>& y0, const Matrix<N, N>& P0, const Matrix<MOTION, MOTION>& into,
+                 const Three& torque, double force, double since) {
+  double y[N], P[N][N];
   std::memcpy(y, y0.data(), sizeof y);
   std::memcpy(P, P0.data(), sizeof P);
   {
     nb::gil_scoped_release release;
-    self.smooth(y, P, as<double[MOTION][MOTION]>(into.data()), torque.data(), force);
+    self.smooth<N>(y, P, as<double[MOTION][MOTION]>(into.data()), torque.data(), force, since);
   }
   return nb::make_tuple(made(y), made(P));
 }
@@ -421,6 +455,21 @@ Numpy impulses(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, con
     double back[6][6];
     backward(flow, back);
     for (int r = 0; r < 6; ++r) std::memcpy(out + 18 * k + 3 * r, &back[r][3], 3 * sizeof(double));
+  }
+  return found;
+}
+
+// (n, 6, 3) derivatives of (dq_v, w) at each instant by the angular acceleration in {B} since the start.
+Numpy by_drive(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, const Times& times, const Three& drive) {
+  const size_t n = times.shape(0);
+  double* out;
+  Numpy found = array({n, 6, 3}, &out);
+  Body b = body(sigma, {0, 0, 0}, drive);
+  b.driven = true;
+  Flow flow = begin(turn(q0, w0));
+  for (size_t k = 0; k < n; ++k) {
+    advance(flow, b, times(k) - (k ? times(k - 1) : 0));
+    std::memcpy(out + 18 * k, flow.D, sizeof flow.D);
   }
   return found;
 }
@@ -516,6 +565,7 @@ NB_MODULE(_motion, m) {
   m.def("above", &above_of, nb::arg("P"), nb::arg("least"));
   m.def("impulses", &impulses, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"),
         nb::arg("drive") = Three{0, 0, 0});
+  m.def("by_drive", &by_drive, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"), nb::arg("drive"));
   m.def("join", &join_of, nb::arg("charts"), nb::arg("P"), nb::arg("weights"), nb::arg("quadrature"));
   m.def("propagate", &propagate_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
@@ -537,11 +587,25 @@ NB_MODULE(_motion, m) {
       .def("normal", &normal)
       .def("rows", &rows)
       .def("absorbed", &absorbed, nb::arg("P"))
-      .def("smooth", &smooth, nb::arg("y"), nb::arg("P"), nb::arg("into"), nb::arg("torque"), nb::arg("force"))
+      .def("smooth", &smooth<DIM>, nb::arg("y"), nb::arg("P"), nb::arg("into"), nb::arg("torque"), nb::arg("force"),
+           nb::arg("since") = 0.0)
       .def_prop_ro("chart", [](const Problem& self) { return flat(self.at); }, nb::rv_policy::move)
       .def_prop_ro("cost", [](const Problem& self) { return self.cost; })
       .def_prop_ro("d", [](const Problem& self) { return copied(self.d, {self.poses.size(), SEEN}); }, nb::rv_policy::move)
       .def_prop_ro("weights", [](const Problem& self) { return copied(self.weights, {self.poses.size()}); }, nb::rv_policy::move);
+  nb::class_<Driven, Problem>(m, "Driven")
+      .def("__init__", &create_driven, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
+           nb::arg("mean"), nb::arg("prior_info"), nb::arg("onset"), nb::arg("widths"))
+      .def("measure", &set_row, nb::arg("row"), nb::arg("target"))
+      .def("linearise", [](Driven& self, const Flat& at, const Vector<SEEN>& u) { self.linearise(chart(at), u.data()); },
+           nb::arg("chart"), nb::arg("u"))
+      .def("step", &Driven::step, nb::arg("damping"))
+      .def("rows", &driven_rows)
+      .def("normal", [](const Driven& self) { return nb::make_tuple(made(self.A), made(self.b)); })
+      .def("smooth", &smooth<DIM + PUSHED>, nb::arg("y"), nb::arg("P"), nb::arg("into"), nb::arg("torque"),
+           nb::arg("force"), nb::arg("since"))
+      .def_prop_ro("u", [](const Driven& self) { return made(self.push.u); }, nb::rv_policy::move)
+      .def_prop_ro("left", [](const Driven& self) { return self.left; });
   nb::class_<Path>(m, "Path")
       .def("__init__", [](Path* self, const Vector<4>& q, const Vector<3>& w, const Three& sigma, const Three& drive) {
         new (self) Path(turn(q, w), body(sigma, {0, 0, 0}, drive));

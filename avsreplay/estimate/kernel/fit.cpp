@@ -19,24 +19,6 @@ double dot(const double* a, const double* b, int n) {
   return s;
 }
 
-// x := A^-1 x for a symmetric positive definite A, by A = L D L'.
-void solve(const Square A, double x[DIM]) {
-  double L[DIM][DIM], D[DIM];
-  for (int r = 0; r < DIM; ++r) {
-    for (int c = 0; c <= r; ++c) {
-      double s = A[r][c];
-      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
-      if (c < r) L[r][c] = s / D[c];
-      else D[r] = s;
-    }
-    for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
-  }
-  for (int r = DIM - 1; r >= 0; --r) {
-    x[r] /= D[r];
-    for (int i = r + 1; i < DIM; ++i) x[r] -= L[i][r] * x[i];
-  }
-}
-
 // Rows (3, 20) of the attitude's derivative B by (dq_v, w, sigma1..3), multiplied by A (3, 3) from the left.
 void turned(const M3& A, double f, const double S[6][9], const double join[3][2], double rows[3][DIM]) {
   for (int r = 0; r < 3; ++r) {
@@ -128,7 +110,8 @@ Body body_of(const State& x, double join[3][2]) {
 double Problem::residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const {
   const V3 theta = rotation_vector(conjugate(pose.q) * (quad(turn.q) * quad(x.q_bc)));
   const V3 centre = pose.place * vector(x.r_a) + pose.speed * vector(x.v_a);
-  const V3 off = centre + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
+  V3 off = centre + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
+  if (const double since = pose.t - push.onset; since > 0) off = off + 0.5 * since * since * vector(push.u + 3);
   const V3 v = transposed(matrix(pose.q)) * off;
   std::memcpy(d, theta.x, sizeof theta.x);
   std::memcpy(d + 3, v.x, sizeof v.x);
@@ -153,19 +136,35 @@ double Problem::penalty(const Chart& chart) const {
   double off[DIM], s = 0;
   minus(chart, mean, off);
   for (int r = 0; r < DIM; ++r) s += off[r] * dot(prior_info[r], off, DIM);
+  const double miss_u = dot(push.row, push.u, SEEN) - push.target;
+  for (int r = 0; r < SEEN; ++r) s += push.u[r] * push.info[r] * push.u[r];
+  s += miss_u * miss_u;
   if (!pinned) return 0.5 * s;
   minus(chart, pin.centre, off);
   const double miss = (dot(pin.row, off, DIM) - pin.target) / pin.one_sigma;
   return 0.5 * (s + miss * miss);
 }
 
+template <class Motion, class At>
+void Problem::go(Motion& motion, Body& body, const State& x, double from, double to, At at_onset) const {
+  if (from <= push.onset && push.onset < to) {
+    avs::advance(motion, body, push.onset - from);
+    const V3 drive = matrix(quad(x.q_bc)) * vector(push.u);
+    std::memcpy(body.drive, drive.x, sizeof body.drive);
+    body.driven = true;
+    at_onset();
+    from = push.onset;
+  }
+  avs::advance(motion, body, to - from);
+}
+
 double Problem::cost_at(const Chart& chart, double* residuals, double* misfit) const {
   const State x = state_of(chart);
   double join[3][2], own[SEEN], weight, sum = 0, t = 0;
-  const Body body = body_of(x, join);
+  Body body = body_of(x, join);
   Turn turn = turn_of(x);
   for (size_t k = 0; k < poses.size(); ++k) {
-    avs::advance(turn, body, poses[k].t - t);
+    go(turn, body, x, t, poses[k].t, [] {});
     t = poses[k].t;
     sum += robust(residual(poses[k], x, turn, residuals ? residuals + SEEN * k : own), &weight);
   }
@@ -185,16 +184,21 @@ double Problem::trial_cost(const Chart& chart, double* residuals) const {
 void Problem::linearise(const Chart& chart) {
   const size_t n = poses.size();
   at = chart;
-  d.resize(SEEN * n), J.assign(SEEN * DIM * n, 0.0);
+  d.resize(SEEN * n), J.assign(SEEN * DIM * n, 0.0), Ju.clear();
+  if (std::isfinite(push.onset)) Ju.assign(SEEN * PUSHED * n, 0.0);
   const State x = state_of(chart);
   errors_of(chart, T);
-  double join[3][2], t = 0;
-  const Body body = body_of(x, join);
+  double join[3][2], later[6] = {}, t = 0;  // `later`: errors at the epoch by the onset
+  Body body = body_of(x, join);
   Flow flow = begin(turn_of(x));
   const M3 A_cb = transposed(matrix(quad(x.q_bc))), arm = skew(vector(x.c_b));
   for (size_t k = 0; k < n; ++k) {
     const Measured& pose = poses[k];
-    avs::advance(flow, body, pose.t - t);
+    go(flow, body, x, t, pose.t, [&] {
+      double back[6][6];
+      backward(flow, back);
+      for (int r = 0; r < 6; ++r) later[r] = -dot(back[r] + 3, body.drive, 3);
+    });
     t = pose.t;
     residual(pose, x, flow.at, &d[SEEN * k]);
     const M3 R_ca = transposed(matrix(pose.q)), R_cb = R_ca * matrix(quad(flow.at.q));
@@ -205,6 +209,30 @@ void Problem::linearise(const Chart& chart) {
     put(R_ca * pose.place, 1, 6, rows + 3);
     put(R_ca * pose.speed, 1, 9, rows + 3);
     put(R_cb, 1, 14, rows + 3);
+    if (!body.driven) continue;
+    auto* by_push = reinterpret_cast<double(*)[PUSHED]>(&Ju[SEEN * PUSHED * k]);
+    const double since = t - push.onset;
+    const M3 A_bc = transposed(A_cb), axes[2] = {A_cb, R_cb * arm};
+    const V3 force = vector(push.u + 3), moved = R_ca * force;
+    for (int half = 0; half < 2; ++half) {
+      double by_drive[3][3] = {}, f = half ? -2 : 2;  // of d by the angular acceleration in {B}
+      for (int r = 0; r < 3; ++r)
+        for (int i = 0; i < 3; ++i) {
+          for (int c = 0; c < 3; ++c) by_drive[r][c] += f * axes[half].x[r][i] * flow.D[i][c];
+          by_push[3 * half + r][6] += f * axes[half].x[r][i] * dot(flow.S[i], later, 6);
+        }
+      for (int r = 0; r < 3; ++r) {
+        const V3 row = vector(by_drive[r]), by_u = transposed(A_bc) * row, by_mu = cross(row, vector(body.drive));
+        for (int c = 0; c < 3; ++c) {
+          by_push[3 * half + r][c] = by_u.x[c];
+          rows[3 * half + r][17 + c] -= 2 * by_mu.x[c];  // R(dmu mu) = (1 + 2 [dmu x]) R(mu)
+        }
+      }
+    }
+    for (int r = 0; r < 3; ++r) {
+      for (int c = 0; c < 3; ++c) by_push[3 + r][3 + c] = 0.5 * since * since * R_ca.x[r][c];
+      by_push[3 + r][6] -= since * moved.x[r];
+    }
   }
   reweigh();
 }
@@ -238,6 +266,25 @@ void Problem::whitened(size_t k, double e[SEEN], Rows H) const {
     }
   }
 }
+
+template <int N>
+void Problem::in_steps(size_t k, double e[SEEN], double H[SEEN][N]) const {
+  Rows own, turned;
+  whitened(k, e, own);
+  product<SEEN, DIM>(own, T, turned);
+  const double w = std::sqrt(weights[k]);
+  for (int r = 0; r < SEEN; ++r) {
+    std::memcpy(H[r], turned[r], sizeof turned[r]);
+    for (int c = DIM; c < N; ++c) {
+      H[r][c] = 0;
+      for (int i = 0; i <= r; ++i)
+        H[r][c] += w * poses[k].root[r][i] / factors[i >= 3] * Ju[PUSHED * (SEEN * k + i) + c - DIM];
+    }
+  }
+}
+
+template void Problem::in_steps<DIM>(size_t, double[SEEN], double[SEEN][DIM]) const;
+template void Problem::in_steps<DIM + PUSHED>(size_t, double[SEEN], double[SEEN][DIM + PUSHED]) const;
 
 void Problem::normal(Square A, double b[DIM]) const {
   Square B = {};
@@ -303,7 +350,7 @@ bool Problem::bent(const Square M, const Square A, double step[DIM], std::vector
   }
   for (int i = 0; i < DIM; ++i)
     for (int r = 0; r < DIM; ++r) a[r] -= 0.5 * T[i][r] * g[i];
-  solve(M, a);
+  solve<DIM>(M, a);
   for (int r = 0; r < DIM; ++r) {
     sizes[0] += A[r][r] * step[r] * step[r], sizes[1] += A[r][r] * a[r] * a[r];
     step[r] += a[r];
@@ -321,7 +368,7 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
     std::memcpy(M, A, sizeof M);
     std::memcpy(step, b, sizeof step);
     for (int k = 0; k < DIM; ++k) M[k][k] += damping * A[k][k];
-    solve(M, step);
+    solve<DIM>(M, step);
     double expected = dot(step, b, DIM);
     for (int r = 0; r < DIM; ++r) expected -= 0.5 * step[r] * dot(A[r], step, DIM);
     const double turning = std::sqrt(dot(at.w.x, at.w.x, 3)), change = std::sqrt(dot(step + 3, step + 3, 3));
@@ -371,13 +418,18 @@ void Problem::absorbed(const Square P, double out[2]) const {
     }
 }
 
-void Problem::smooth(double y[DIM], Square P, const double into[MOTION][MOTION], const double torque_density[3],
-                     double force_density) const {
+template <int N>
+void Problem::smooth(double y[N], double P[N][N], const double into[MOTION][MOTION], const double torque_density[3],
+                     double force_density, double since) const {
   const State x = state_of(at);
-  double join[3][2], before[6][6] = {}, now[6][6], e[SEEN], t = 0;
+  double join[3][2], before[6][6] = {}, now[6][6], e[SEEN], H[SEEN][N], t = since;
   Body body = body_of(x, join);
   std::memcpy(body.push, torque_density, sizeof body.push);
   Flow flow = begin(turn_of(x));
+  if (since > 0) {
+    go(flow, body, x, 0, since, [] {});
+    at_start(flow, before);
+  }
   double place[MOTION][MOTION] = {}, mixed[MOTION][MOTION] = {}, speed[MOTION][MOTION] = {};
   double turned_by[6][MOTION];  // the transpose of the columns of attitude and rate
   for (int r = 0; r < MOTION; ++r)
@@ -389,11 +441,10 @@ void Problem::smooth(double y[DIM], Square P, const double into[MOTION][MOTION],
       }
   for (int i = 0; i < 6; ++i)
     for (int r = 0; r < MOTION; ++r) turned_by[i][r] = into[r][i];
-  Rows H, HT;
   for (size_t k = 0; k < poses.size(); ++k) {
     const double last = t;
     t = poses[k].t;
-    avs::advance(flow, body, t - last);
+    go(flow, body, x, last, t, [] {});
     at_start(flow, now);
     const double third = force_density * (t * t * t - last * last * last) / 3;
     const double half = -force_density * (t * t - last * last) / 2, one = force_density * (t - last);
@@ -407,10 +458,103 @@ void Problem::smooth(double y[DIM], Square P, const double into[MOTION][MOTION],
       for (int c = 0; c < MOTION; ++c) Q[r][c] = s[c] + third * place[r][c] + half * mixed[r][c] + one * speed[r][c];
     }
     std::memcpy(before, now, sizeof before);
-    whitened(k, e, H);
-    product<SEEN, DIM>(H, T, HT);
-    pass(y, P, e, HT, Q);
+    in_steps<N>(k, e, H);
+    pass<N>(y, P, e, H, Q);
   }
+}
+
+template void Problem::smooth<DIM>(double[DIM], Square, const double[MOTION][MOTION], const double[3], double,
+                                   double) const;
+template void Problem::smooth<DIM + PUSHED>(double[DIM + PUSHED], double[DIM + PUSHED][DIM + PUSHED],
+                                            const double[MOTION][MOTION], const double[3], double, double) const;
+
+void Driven::linearise(const Chart& chart, const double u[SEEN]) {
+  std::memcpy(push.u, u, sizeof push.u);
+  Problem::linearise(chart);
+  if (!std::isfinite(cost)) cost = std::numeric_limits<double>::infinity();
+  normal();
+}
+
+void Driven::normal() {
+  std::memset(A, 0, sizeof A);
+  double e[SEEN], off[DIM], to_minimum[JOINT];
+  double H[SEEN][DIM + PUSHED];
+  minus(at, mean, off);
+  const double miss = dot(push.row, push.u, SEEN) - push.target;
+  for (int r = 0; r < JOINT; ++r)
+    b[r] = r < DIM ? -dot(prior_info[r], off, DIM) : -push.info[r - DIM] * push.u[r - DIM] - miss * push.row[r - DIM];
+  for (size_t k = 0; k < poses.size(); ++k) {
+    in_steps<DIM + PUSHED>(k, e, H);
+    for (auto& row : H)
+      for (int c = 0; c < SEEN; ++c) row[DIM + c] *= open[c];
+    for (int r = 0; r < JOINT; ++r) {
+      const int first = r & ~1;  // the upper triangle, in pairs
+      double s[JOINT];
+      std::memcpy(s, A[r], sizeof s);
+      for (int i = 0; i < SEEN; ++i) {
+        const double h = H[i][r];
+        for (int c = first; c < JOINT; ++c) s[c] += h * H[i][c];
+        b[r] -= h * e[i];
+      }
+      std::memcpy(A[r], s, sizeof s);
+    }
+  }
+  for (int r = 0; r < JOINT; ++r)
+    for (int c = r; c < JOINT; ++c) {
+      double known = 0;
+      if (c < DIM) known = prior_info[r][c];
+      else if (r >= DIM) known = push.row[r - DIM] * push.row[c - DIM] + (r == c ? push.info[r - DIM] : 0);
+      A[c][r] = A[r][c] += known;
+    }
+  std::memcpy(to_minimum, b, sizeof b);
+  solve<JOINT>(A, to_minimum);
+  left = 0.5 * dot(b, to_minimum, JOINT);
+}
+
+// Cost and residuals at a part of a step.
+double Driven::cost_there(const double step[JOINT], double part, double* residuals) {
+  double y[DIM], u[SEEN];
+  std::memcpy(u, push.u, sizeof u);
+  for (int r = 0; r < DIM; ++r) y[r] = part * step[r];
+  for (int r = 0; r < SEEN; ++r) push.u[r] += part * step[DIM + r];
+  const double found = trial_cost(moved(at, y), residuals);
+  std::memcpy(push.u, u, sizeof u);
+  return found;
+}
+
+double Driven::step(double damping) {
+  constexpr double LESS = 5, MORE = 4, GOOD = 0.5;  // divided, multiplied; least decrease over the expected one
+  double M[JOINT][JOINT], step[JOINT], a[JOINT] = {}, sizes[2] = {}, e[SEEN], H[SEEN][DIM + PUSHED];
+  std::vector<double> trial(d.size());
+  std::memcpy(M, A, sizeof M);
+  std::memcpy(step, b, sizeof step);
+  for (int r = 0; r < JOINT; ++r) M[r][r] += damping * A[r][r];
+  solve<JOINT>(M, step);
+  if (std::isfinite(cost_there(step, DIFFERENCE, trial.data()))) {  // as in `bent`
+    for (size_t k = 0; k < poses.size(); ++k) {
+      in_steps<DIM + PUSHED>(k, e, H);
+      const double w = std::sqrt(weights[k]);
+      for (int r = 0; r < SEEN; ++r) {
+        double probed = 0;
+        for (int i = 0; i <= r; ++i) probed += w * poses[k].root[r][i] / factors[i >= 3] * trial[SEEN * k + i];
+        const double second = 2 / DIFFERENCE * ((probed - e[r]) / DIFFERENCE - dot(H[r], step, JOINT));
+        for (int c = 0; c < JOINT; ++c) a[c] -= 0.5 * H[r][c] * second;
+      }
+    }
+    for (int r = 0; r < SEEN; ++r) a[DIM + r] *= open[r];
+    solve<JOINT>(M, a);
+    for (int r = 0; r < JOINT; ++r) sizes[0] += A[r][r] * step[r] * step[r], sizes[1] += A[r][r] * a[r] * a[r];
+    if (sizes[1] <= MOST_BENT * sizes[0])
+      for (int r = 0; r < JOINT; ++r) step[r] += a[r];
+  }
+  const double gain = cost - cost_there(step, 1, trial.data());
+  if (!(gain > 0)) return damping * MORE;
+  double expected = dot(step, b, JOINT);
+  for (int r = 0; r < JOINT; ++r) expected -= 0.5 * step[r] * dot(A[r], step, JOINT);
+  for (int r = 0; r < SEEN; ++r) push.u[r] += step[DIM + r];
+  Problem::linearise(moved(at, step));
+  normal();
+  return gain < GOOD * expected ? damping : damping / LESS;
 }
 
 }  // namespace avs

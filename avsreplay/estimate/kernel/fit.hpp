@@ -1,5 +1,6 @@
 // The cost of the batch fit over the initial values, its linearisation and its minimum (batch.py).
 #pragma once
+#include <limits>
 #include <vector>
 
 #include "chart.hpp"
@@ -27,6 +28,14 @@ struct Pin {
   double row[DIM], target, one_sigma;
 };
 
+// A constant acceleration u since `onset`: of the body in {C} [rad/s2] and of its centre of mass in {A} [m/s2]. Its prior
+// has the information `info` about zero; `row` . u = `target` is a pseudo-measurement of unit standard deviation.
+struct Push {
+  double onset = std::numeric_limits<double>::infinity();
+  double u[SEEN] = {}, info[SEEN] = {}, row[SEEN] = {}, target = 0;
+};
+constexpr int PUSHED = SEEN + 1;  // derivatives by the acceleration and by its onset
+
 class Problem {
  public:
   std::vector<Measured> poses;
@@ -37,12 +46,13 @@ class Problem {
   double factors[2] = {1, 1};  // on the noise of attitude and position
   bool redescend = true;  // Cauchy's weights, else Huber's
   double slack = 1;  // on chi-square from which a pose is an outlier
+  Push push;
 
   // The linearisation at the present chart.
   Chart at;
   double cost;
   std::vector<double> d, weights;  // residuals (n, 6), M-estimator weights (n)
-  std::vector<double> J;  // (n, 6, 20) by the error states at the epoch
+  std::vector<double> J, Ju;  // (n, 6, 20) by the error states at the epoch; (n, 6, 7) by the acceleration and its onset
   Square T;  // error states by chart steps
 
   void linearise(const Chart& chart);
@@ -59,11 +69,20 @@ class Problem {
   bool descend(int most, double gain_tol, int& steps);
   // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
   void absorbed(const Square P, double out[2]) const;
-  // Kalman pass over the poses with process noise between them, from y and P in chart steps. The error states of
-  // attitude to velocity are in other coordinates than P where two moments are nearly equal; `into` takes them to steps,
-  // of which they reach attitude to velocity alone.
-  void smooth(double y[DIM], Square P, const double into[MOTION][MOTION], const double torque_density[3],
-              double force_density) const;
+  // Kalman pass over the poses with process noise since an instant [s], from y and P in N = 20 chart steps, or in 27 unknowns
+  // with acceleration and onset. The error states of attitude to velocity are in other coordinates than P where two
+  // moments are nearly equal; `into` takes them to steps, of which they reach attitude to velocity alone.
+  template <int N>
+  void smooth(double y[N], double P[N][N], const double into[MOTION][MOTION], const double torque_density[3],
+              double force_density, double since) const;
+  // Residual and Jacobian of a pose as in `whitened`, by chart steps and the first N - 20 of acceleration and onset.
+  template <int N>
+  void in_steps(size_t k, double e[SEEN], double H[SEEN][N]) const;
+
+ protected:
+  // A motion on from one instant to another, of which the body is driven from the onset on.
+  template <class Motion, class At>
+  void go(Motion& motion, Body& body, const State& x, double from, double to, At at_onset) const;
 
  private:
   bool bent(const Square M, const Square A, double step[DIM], std::vector<double>& trial) const;
@@ -71,6 +90,42 @@ class Problem {
   double robust(double chi2, double* weight) const;
   double penalty(const Chart& chart) const;
 };
+
+// The minimum over initial values and a constant acceleration since a given onset, by Levenberg-Marquardt. An acceleration
+// is fixed where `open` is false.
+constexpr int JOINT = DIM + SEEN;
+class Driven : public Problem {
+ public:
+  bool open[SEEN];
+  double A[JOINT][JOINT], b[JOINT], left;  // normal equations, and the decrease of their cost to its minimum
+
+  void linearise(const Chart& chart, const double u[SEEN]);
+  // One step with this damping from the present linearisation; returns the damping of the next.
+  double step(double damping);
+
+ private:
+  void normal();
+  double cost_there(const double step[JOINT], double part, double* residuals);
+};
+
+// x := A^-1 x for a symmetric positive definite A, by A = L D L'.
+template <int N>
+void solve(const double A[N][N], double x[N]) {
+  double L[N][N], D[N];
+  for (int r = 0; r < N; ++r) {
+    for (int c = 0; c <= r; ++c) {
+      double s = A[r][c];
+      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
+      if (c < r) L[r][c] = s / D[c];
+      else D[r] = s;
+    }
+    for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
+  }
+  for (int r = N - 1; r >= 0; --r) {
+    x[r] /= D[r];
+    for (int i = r + 1; i < N; ++i) x[r] -= L[i][r] * x[i];
+  }
+}
 
 // S^-1 of a flow: errors (dq_v, w) at its start with the same effect as a unit error at its end.
 void backward(const Flow& flow, double out[6][6]);

@@ -218,7 +218,7 @@ void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6
     for (int c = 0; c < MOTION; ++c) P[r][c] += Q[r][c];
   const double none[MOTION][MOTION] = {};
   evidence(e, HT, P, told);
-  pass(y, P, e, HT, none);
+  pass<DIM>(y, P, e, HT, none);
   chart = moved(chart, y);
 }
 

@@ -43,7 +43,8 @@ Orders orders_for(double turn, double tail) {
 }
 
 // Taylor coefficients over a step of length 1. Rows of X: dq_v, then u. Its first six columns are the derivatives by u
-// and by sigma1..3 at the start (those by dq_v are A(q)' alone); with N = 12 the last six are the noise's covariance.
+// and by sigma1..3 at the start (those by dq_v are A(q)' alone); with N = 12 the last six are the noise's covariance, with
+// N = 9 the last three the derivative by the angular acceleration.
 template <int N>
 struct Series {
   double u[MOST_ORDER + 1][3];
@@ -102,6 +103,7 @@ void linear(Series<N>& y, int k, const Body& body, const double* p, const double
       M[3 + r][c] *= body.sigma[r];
     }
     M[3 + r][3 + r] += p[r];
+    if constexpr (N == 9) M[3 + r][6 + r] += k == 0;
   }
   if constexpr (N == 12) {
     for (int r = 0; r < 6; ++r) {
@@ -224,6 +226,15 @@ void piece(Flow& flow, const Body& body, double h) {
       drive[r][c] = r < 3 ? X[r][3 + c] : X[r][3 + c] / h;
     }
   carry(M, drive, flow.S);
+  if constexpr (N == 9) {
+    double D[6][3] = {};
+    for (int r = 0; r < 6; ++r)
+      for (int c = 0; c < 3; ++c) {
+        for (int i = 0; i < 6; ++i) D[r][c] += M[r][i] * flow.D[i][c];
+        D[r][c] += X[r][6 + c] * (r < 3 ? h * h : h);
+      }
+    std::memcpy(flow.D, D, sizeof D);
+  }
   if constexpr (N == 12) {
     carry(M, flow.Q);
     for (int r = 0; r < 6; ++r)
@@ -247,7 +258,7 @@ void cut(double h, Rate rate, One one) {
 }  // namespace
 
 Flow begin(const Turn& at) {
-  Flow flow{at, {}, {}};
+  Flow flow{at, {}, {}, {}};
   for (int r = 0; r < 6; ++r) flow.S[r][r] = 1;
   return flow;
 }
@@ -265,6 +276,8 @@ void advance(Flow& flow, const Body& body, double h) {
   cut(h, [&] { return pace(flow.at.w, body); }, [&](double length) {
     if (noisy)
       piece<12>(flow, body, length);
+    else if (body.driven)
+      piece<9>(flow, body, length);
     else
       piece<6>(flow, body, length);
   });

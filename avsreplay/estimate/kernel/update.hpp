@@ -7,13 +7,13 @@ namespace avs {
 constexpr int DIM = 20, SEEN = 6;  // error states, and what a pose measures
 constexpr int MOTION = 12;  // attitude, rate, position and velocity: the steps that disturbances reach
 
-// out := A B for A (N, M), B (M, DIM).
-template <int N, int M>
-void product(const double A[N][M], const double B[M][DIM], double out[N][DIM]) {
+// out := A B for A (N, M), B (M, W).
+template <int N, int M, int W>
+void product(const double A[N][M], const double B[M][W], double out[N][W]) {
   for (int r = 0; r < N; ++r) {
-    double s[DIM] = {};
+    double s[W] = {};
     for (int i = 0; i < M; ++i)
-      for (int c = 0; c < DIM; ++c) s[c] += A[r][i] * B[i][c];
+      for (int c = 0; c < W; ++c) s[c] += A[r][i] * B[i][c];
     std::memcpy(out[r], s, sizeof s);
   }
 }
@@ -48,9 +48,9 @@ void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2],
 double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double share,
                     double P[DIM][DIM]);
 
-// y and P once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
-void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM],
-          const double Q[MOTION][MOTION]);
+// y and P of W unknowns once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
+template <int W>
+void pass(double y[W], double P[W][W], const double e[SEEN], const double H[SEEN][W], const double Q[MOTION][MOTION]);
 
 // x displaced by the error d through the chart, and P carried from about the one to about the other.
 void retract(State& x, double P[DIM][DIM], const double d[DIM]);
