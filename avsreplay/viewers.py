@@ -8,6 +8,7 @@ import socket
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "og
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _IN_MESSAGES = {"seq", "t_ns", *_POSE_COLUMNS, *(f"reg_{name}" for name in _POSE_COLUMNS)}  # what other messages hold
 _COLUMNS = tuple(column.name for column in columns() if column.name not in _IN_MESSAGES)
+_VALUES = attrgetter(*_COLUMNS)
 RERUN_PORT = 9876  # port of a Rerun viewer
 
 
@@ -121,7 +123,7 @@ class ResultLogWriter:
 
 def _numbers(row: Row) -> dict[str, float]:
     """The numeric columns of a row that have a value."""
-    found = ((name, getattr(row, name)) for name in _COLUMNS)
+    found = zip(_COLUMNS, _VALUES(row), strict=True)
     return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 

@@ -112,6 +112,7 @@ class ResultLog:
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self._columns: dict[str, int] = {}
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
@@ -185,10 +186,16 @@ class ResultLog:
                     self._append_columns(columns, message.log_time)
 
     def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
+        channels, count, add, pack = self._columns, self._count, self._writer.add_message, _FLOAT64.pack
         for name, value in columns.items():
-            self._append(_ROWS + name, t_ns, _FLOAT64.pack(1, value))
+            channel = channels.get(name) or channels.setdefault(name, self._channel(_ROWS + name))
+            add(channel, t_ns, pack(1, value), t_ns, count)
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
+        self._writer.add_message(self._channel(topic), t_ns, payload, t_ns, self._count)
+
+    def _channel(self, topic: str) -> int:
+        """Return the number of a topic's channel, which is registered at the first message."""
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
@@ -196,7 +203,7 @@ class ResultLog:
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
-        self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
+        return self._channels[topic]
 
 
 def _path(t_ns: int, times_s: Array, positions: Array) -> bytes:
