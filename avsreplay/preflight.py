@@ -138,7 +138,8 @@ def _transforms(info: LogInfo, source: Source) -> list[Advice]:
     if root is not None and source.options.fixed_frame is None:
         text = f"the frame of the clouds, '{shown(frame)}', moves in '{shown(root)}'"
         return [Advice("check", "transforms", text, f"--fixed-frame {shown(root)}")]
-    return [Advice("ok", "transforms", names)]
+    fixed = source.options.fixed_frame
+    return [Advice("ok", "transforms", names if fixed is None else f"{names}; clouds are moved to '{shown(fixed)}'")]
 
 
 def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from avsreplay.errors import UsageError, value_class
 from avsreplay.files import STDOUT
@@ -138,9 +137,9 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
     """
     meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
-    header = _labelled(simulation.header, options, EPOCH_NS)
+    header = _labelled(simulation.header, options, EPOCH_NS, moving=scenario.params.camera is not None)
     with (
-        _writer(output, header, options, moving_camera=scenario.params.camera is not None) as writer,
+        _writer(output, header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, EPOCH_NS)
@@ -174,17 +173,15 @@ def record_source(
     )
     with open_source(source, reading) as opened:
         epoch_ns = opened.scan_at(0).log_ns if len(opened) else 0
-        header, due = _labelled(opened.header, options, epoch_ns), opened.info().scans
-        moved = reading.fixed_frame is not None or reading.sensor_topic is not None
-        with _writer(output, header, options, moved) as writer, _ticked(ticker, opened.scans(), due) as scans:
+        moved = opened.options.fixed_frame is not None or opened.options.sensor_topic is not None
+        header, due = _labelled(opened.header, options, epoch_ns, moving=moved), opened.info().scans
+        with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
             # registration and faults need the position of the sensor: a log holds its frame and its poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
             tally = _fold(pairs, opened.truth_of, writer, true_clock=False, camera_of=lambda scan: scan.sensor)
         done = tally.recorded(output, writer.bytes, header, tuple(opened.losses))
-        frame = (
-            f"scans are in the frame of the sensor, its poses in '{ROOT_FRAME}': replay with --fixed-frame {ROOT_FRAME}"
-        )
+        frame = f"scans are in the frame of the sensor, which moves in '{ROOT_FRAME}'; a replay transforms them to it"
         return replace(done, note="; ".join(each for each in (frame if moved else "", done.note) if each))
 
 
@@ -260,8 +257,9 @@ def _fold(
     return tally
 
 
-def _labelled(header: LogHeader, options: RecordOptions, epoch_ns: int) -> LogHeader:
-    """The header with the labels of the injected faults and the seed of their random numbers."""
+def _labelled(header: LogHeader, options: RecordOptions, epoch_ns: int, *, moving: bool) -> LogHeader:
+    """The header with the labels of the injected faults, the seed of their random numbers, and the fixed frame."""
+    header = replace(header, fixed_frame=ROOT_FRAME if moving else "")
     if not options.faults:
         return header
     labels = (*header.labels, *(fault.label(epoch_ns) for fault in options.faults))
@@ -277,9 +275,8 @@ def _with_faults(
     return disturbed(scans, options.faults, epoch_ns, options.fault_seed, radius_m)
 
 
-def _writer(output: Path, header: LogHeader, options: RecordOptions, moving_camera: bool = False) -> LogWriter:
-    rules: dict[str, Any] = {"overwrite": options.overwrite, "compression": options.compression}
-    return LogWriter(output, header, moving_camera=moving_camera, **rules)
+def _writer(output: Path, header: LogHeader, options: RecordOptions) -> LogWriter:
+    return LogWriter(output, header, overwrite=options.overwrite, compression=options.compression)
 
 
 def _ticked(ticker: Ticker | None, scans: Iterable[Scan], due: int) -> AbstractContextManager[Iterator[Scan]]:

@@ -180,6 +180,7 @@ class LogHeader:
     Attributes:
         surface: model of the target.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
         labels: injected faults.  start: initial belief.  truth: at the first scan.  notes: free text by name.
+        fixed_frame: frame of its transforms in which start, truth and poses are; "": the frame of the clouds.
     """
 
     surface: Surface | None = None
@@ -189,6 +190,7 @@ class LogHeader:
     start: Belief | None = None
     truth: State | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    fixed_frame: str = ""
 
 
 @value_class

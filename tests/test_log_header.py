@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from log_cases import header
 from avsreplay.log import header as record
 from avsreplay.records import LogHeader
 
-HEAD = header(np.random.Generator(np.random.PCG64(1)))
+HEAD = replace(header(np.random.Generator(np.random.PCG64(1))), fixed_frame="map")
 
 
 def signed(values: dict[str, str]) -> dict[str, str]:
@@ -26,6 +27,12 @@ def test_an_empty_header_is_preserved() -> None:
     assert back.scenario == ""
     assert back.seed is back.start is back.truth is None
     assert back.labels == ()
+    assert back.fixed_frame == ""
+
+
+def test_the_fixed_frame_is_written_where_there_is_one() -> None:
+    assert "fixed_frame" not in record.encode_header(LogHeader())
+    assert record.decode_header(record.encode_header(HEAD)).fixed_frame == "map"
 
 
 def test_every_value_is_covered_by_the_checksum() -> None:
@@ -59,6 +66,7 @@ def with_(name: str, new: object) -> Callable[[object], object]:
     changed("truth", with_("q_ab", [0, 0, 0, 0])), changed("truth", with_("sigma", [0.5, 1.0])),
     changed("truth", with_("w_b", [1, 2])), changed("truth", with_("r_a", [1e400, 0, 0])),
     changed("truth", without("c_b")),
+    ("fixed_frame", "7"), ("fixed_frame", "null"), ("fixed_frame", json.dumps(257 * "m")),
     changed("start", with_("P", [[1]])), changed("start", with_("x", None)), changed("start", with_("t_ns", "x")),
 ])  # fmt: skip
 def test_an_invalid_header_is_rejected_although_its_checksum_is_correct(name: str, text: str) -> None:

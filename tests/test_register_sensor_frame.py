@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from avsreplay import geometry
+from avsreplay.errors import UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, SourceOptions, open_source
 from avsreplay.record import RecordOptions, record_source
+from avsreplay.records import LogHeader, Scan
 from avsreplay.register import RegisterParams, Registrar, SensorFrame
 from avsreplay.run import Job, Run
 
@@ -48,11 +50,11 @@ def test_without_a_sensor_pose_the_registrar_is_used_as_it_is(scene):
     assert found.T_ac.t.tobytes() == plain.T_ac.t.tobytes()
 
 
-def _far_log(log: Path) -> Path:
-    """The fixture, seen by a camera 90 m from the origin of the fixed frame 'map'."""
+def _far_log(log: Path, fixed_frame: str = "map") -> Path:
+    """The fixture, seen by a camera 90 m from the origin of the fixed frame that the header names."""
     with open_source(FIXTURE) as source:
         header = replace(source.header, start=None, truth=None, scenario="", labels=())
-        with LogWriter(log, header, moving_camera=True) as writer:
+        with LogWriter(log, replace(header, fixed_frame=fixed_frame)) as writer:
             for scan in source.scans():
                 writer.write_camera(scan.log_ns, scan.t_ns, SENSOR)
                 writer.write(scan)
@@ -61,11 +63,11 @@ def _far_log(log: Path) -> Path:
 
 
 def test_a_log_that_is_recorded_from_a_fixed_frame_holds_the_pose_of_the_sensor(tmp_path):
-    far, copy = _far_log(tmp_path / "far.mcap"), tmp_path / "copy.mcap"
-    reading = SourceOptions(fixed_frame="map")
-    done = record_source(far, copy, reading, RecordOptions())
-    assert "--fixed-frame map" in done.note
-    with open_source(FIXTURE) as plain, open_source(copy, reading) as again:
+    far, copy = _far_log(tmp_path / "far.mcap", "world"), tmp_path / "copy.mcap"
+    done = record_source(far, copy, SourceOptions(sensor_topic="/camera/pose"), RecordOptions())
+    assert "moves in 'map'" in done.note
+    with open_source(FIXTURE) as plain, open_source(copy) as again:
+        assert (again.header.fixed_frame, again.options.fixed_frame) == ("map", "map")
         assert len(again) == len(plain)
         for seq in (0, 5, len(plain) - 1):
             scan, other = plain.scan_at(seq), again.scan_at(seq)
@@ -75,10 +77,19 @@ def test_a_log_that_is_recorded_from_a_fixed_frame_holds_the_pose_of_the_sensor(
             np.testing.assert_allclose(again.truth_of(other).pose.matrix, truth.matrix, atol=1e-6)
 
 
+def test_without_transforms_no_scan_of_a_log_that_names_a_fixed_frame_can_be_used(tmp_path):
+    with LogWriter(tmp_path / "x.mcap", LogHeader(fixed_frame="map")) as writer:
+        writer.write(Scan(0, 1_000_000_000, np.ones((3, 3), np.float32), log_ns=1_000_000_000))
+    with open_source(tmp_path / "x.mcap") as source:
+        assert "the pose of the sensor is unknown" in source.scan_at(0).note
+    with pytest.raises(UsageError, match="no frame 'map'"):
+        open_source(tmp_path / "x.mcap", SourceOptions(fixed_frame="map"))
+
+
 def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
     """The camera stands 90 m from the origin of the fixed frame; the target is behind it as seen from there."""
     log = _far_log(tmp_path / "far.mcap")
-    with Run(Job(source=log, options=SourceOptions(fixed_frame="map"))) as run:
+    with Run(Job(source=log)) as run:
         rows = list(run.rows())
     with Run(Job(source=FIXTURE, assignments=("init=auto", "estimator.start=cold"))) as run:
         plain = list(run.rows())

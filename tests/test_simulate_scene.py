@@ -336,7 +336,8 @@ def test_the_scans_of_a_moving_camera_lie_on_the_target_after_its_pose(tmp_path)
     for name, options in (
         ("topic", SourceOptions(sensor_topic="/camera/pose")),
         ("tf", SourceOptions(fixed_frame="map")),
-        ("neither", SourceOptions()),
+        ("header", SourceOptions()),
+        ("own", SourceOptions(fixed_frame="camera")),
     ):
         with open_source(tmp_path / "m.mcap", options) as source:
             far = [
@@ -346,7 +347,8 @@ def test_the_scans_of_a_moving_camera_lie_on_the_target_after_its_pose(tmp_path)
         away[name] = max(far)
     assert away["topic"] < 1e-4
     assert away["tf"] < 1e-4
-    assert away["neither"] > 0.05
+    assert away["header"] == away["tf"]
+    assert away["own"] > 0.05
 
 
 def test_the_reported_pose_of_the_camera_has_the_stated_error():

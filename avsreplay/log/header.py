@@ -35,7 +35,7 @@ from avsreplay.log.scan_files import read_pcd
 from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
-FORMAT = "1"
+FORMAT, _MAX_NAME = "1", 256
 _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
 
@@ -52,6 +52,8 @@ def encode_header(header: LogHeader) -> dict[str, str]:
         "model": _json(None if header.surface is None else header.surface.name),
         "model_sha256": _json(None if header.surface is None else header.surface.sha256),
     }
+    if header.fixed_frame:
+        values["fixed_frame"] = _json(header.fixed_frame)
     return {**values, "crc32": f"{_checksum(values):08x}"}
 
 
@@ -73,6 +75,7 @@ def decode_header(values: Mapping[str, str]) -> LogHeader:
             start=_to_belief(_loads(values["start"])),
             truth=_to_state(_loads(values["truth"])),
             notes={str(name): str(text) for name, text in dict(_loads(values["notes"])).items()},
+            fixed_frame=_to_frame(_loads(values.get("fixed_frame", '""'))),
         )
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"header record: {str(error)[:120]}") from None
@@ -109,6 +112,12 @@ def _no_number(name: str) -> None:
 def _to_seed(value: Any) -> int | None:
     if value is not None and type(value) is not int:
         raise ValueError(f"a seed of {str(value)[:40]}")
+    return value
+
+
+def _to_frame(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > _MAX_NAME:
+        raise ValueError(f"a fixed frame of {str(value)[:40]}")
     return value
 
 

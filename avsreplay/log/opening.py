@@ -69,14 +69,19 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
     return _messages(path, options, inspect, upto)
 
 
-def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
+def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None, stated: str = "") -> Source:
+    """Open a log of messages; ``stated``: the fixed frame of its header, used where the options name none."""
     collector = streams.TruthCollector(options)
     recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto)
     try:
         topics = recording.topics()
-        collector.check(topics, shown(path))
+        collector.check(topics, shown(path), stated)
         topic = _optional_topic(recording, options, path) if inspect else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
+        if header.fixed_frame and options.fixed_frame is None and options.sensor_topic is None:
+            recording.close()  # read once more, because the first reading did not collect the transforms
+            fixed = header.fixed_frame
+            return _messages(path, replace(options, fixed_frame=fixed), inspect, upto, fixed)
         ground_truth = collector.ground_truth()
         if options.poses:
             clouds: MessageClouds = streams.PoseMessages(recording, topic)

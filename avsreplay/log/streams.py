@@ -256,8 +256,8 @@ class TruthCollector:
             out.update({"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)})
         return out
 
-    def check(self, topics: Sequence[TopicInfo], where: str) -> None:
-        """Raise UsageError if a requested topic or frame does not exist."""
+    def check(self, topics: Sequence[TopicInfo], where: str, stated: str = "") -> None:
+        """Raise UsageError if a requested topic or frame does not exist. ``stated``: the frame that the log names."""
         for role, name in (("truth", self.options.truth_topic), ("sensor", self.options.sensor_topic)):
             found = next((t for t in topics if t.name == name), None)
             if name is not None and (found is None or found.type not in POSE_TYPES):
@@ -265,7 +265,7 @@ class TruthCollector:
                 hint = f"pose topics here: {_poses_of(topics) or 'none'}"
                 raise UsageError(f"{what}: '{shown(name)}'", where=where, hint=hint)
         for frame in (self.options.truth_frame, self.options.fixed_frame):
-            if frame is not None and frame.lstrip("/") not in self._tf.frames():
+            if frame is not None and frame != stated and frame.lstrip("/") not in self._tf.frames():
                 hint = f"frames of its {TF_TYPE}: {', '.join(map(shown, self._tf.frames()[:20])) or 'none'}"
                 raise UsageError(f"no frame '{shown(frame)}'", where=where, hint=hint)
 

@@ -91,20 +91,19 @@ class LogWriter:
         chunk_s: float = 1.0,
         streaming: bool = False,
         point_type: str = "float32",
-        moving_camera: bool = False,
     ) -> None:
         """Open the output and write the header.
 
         Args:
             path: the output; ``-`` is standard output.
-            header: scenario, seed, labels and model; the model is attached.
+            header: scenario, seed, labels and model; the model is attached. If it names a fixed frame, the log holds no
+                static transform of the camera, and ``write_camera`` gives its poses.
             overwrite: replace an existing output.
             compression: ``zstd``, ``lz4`` or ``none``.
             chunk_bytes: a chunk is written when it reaches this size.
             chunk_s: a chunk is also written when it reaches this span of the log clock [s].
             streaming: write under the final name from the first byte, for a reader that follows the file.
             point_type: type of the stored coordinates, ``float32`` or ``float64``.
-            moving_camera: the log holds no static transform of the camera; ``write_camera`` gives its poses.
 
         Raises:
             UsageError: the output exists, or its folder does not.
@@ -124,7 +123,7 @@ class LogWriter:
         self._partial = self._path if self._direct else self._path.with_name(self._path.name + ".partial")
         self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
         self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
-        self._moving, self._root = moving_camera, ROOT_FRAME if moving_camera else CAMERA_FRAME
+        self._root = header.fixed_frame or CAMERA_FRAME
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._chunk_start_ns: int | None = None
@@ -182,8 +181,8 @@ class LogWriter:
         Raises:
             UnreadableInput: the output cannot be written, or a time is outside the range of a log.
         """
-        self._message(CAMERA_TOPIC, log_ns, pose_stamped(t_ns, ROOT_FRAME, pose))
-        self._message("/tf", log_ns, transform(t_ns, ROOT_FRAME, CAMERA_FRAME, pose))
+        self._message(CAMERA_TOPIC, log_ns, pose_stamped(t_ns, self._root, pose))
+        self._message("/tf", log_ns, transform(t_ns, self._root, CAMERA_FRAME, pose))
 
     def close(self) -> None:
         """Finish and rename the file. Raises UnreadableInput if it cannot be written."""
@@ -253,7 +252,7 @@ class LogWriter:
         self._append(topic, log_ns, payload)
 
     def _static(self, log_ns: int) -> None:
-        if self._moving:
+        if self._root != CAMERA_FRAME:
             return
         self._append("/tf_static", log_ns, transform(log_ns, ROOT_FRAME, CAMERA_FRAME, Pose.identity()))
 
