@@ -335,10 +335,7 @@ class Pose:
         Returns:
             (..., 3) coordinates in a [m].
         """
-        points_a: Array = np.asarray(points_b, dtype=np.float64) @ self.R.T
-        for axis, t in enumerate(self.t.tolist()):  # numpy adds a vector to each of many rows three times as slowly
-            points_a[..., axis] += t
-        return points_a
+        return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t
 
 
 @value_class

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array, MeasuredPose, Pose, frozen, matrix, multiply, rotate
+from avsreplay.geometry import Array, MeasuredPose, Pose, bounding_diagonal, frozen, matrix, multiply, rotate
 
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -88,7 +87,7 @@ class Surface:
     @property
     def extent(self) -> float:
         """Return the diagonal of the bounding box [m]."""
-        return geometry.bounding_diagonal(self.vertices)
+        return bounding_diagonal(self.vertices)
 
 
 @value_class
@@ -177,10 +176,9 @@ class Truth:
 class LogHeader:
     """The metadata of a log; with them it can be replayed without options.
 
-    Attributes:
-        surface: model of the target.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
-        labels: injected faults.  start: initial belief.  truth: at the first scan.  notes: free text by name.
-        fixed_frame: frame of its transforms in which start, truth and poses are; "": the frame of the clouds.
+    Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults ``labels``, initial
+    belief ``start``, ``truth`` at the first scan, ``notes`` by name, and the frame of its transforms in which start,
+    truth and poses are, ``fixed_frame`` ("": that of the clouds).
     """
 
     surface: Surface | None = None
