@@ -16,7 +16,6 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import (
     Alignment,
     Belief,
-    BodyParameters,
     Drift,
     Forecast,
     Innovation,
@@ -121,6 +120,28 @@ class MonitorReport:
     predictive_converged: bool
     unconverged: tuple[str, ...]
     forecast: Forecast
+
+
+@value_class
+class BodyParameters:
+    """Parameters of the target in {C}, independent of the order of the principal axes.
+
+    Attributes:
+        inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
+        moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
+        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of trace.
+        limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without any information.
+    """
+
+    inertia: Array
+    inertia_1s: Array
+    moments: Array
+    moments_1s: Array
+    centre_c: Array
+    centre_1s_m: float
+    rate_c: Array
+    rate_1s_radps: float
+    limited_1s: tuple[float, float, float, float]
 
 
 @value_class(kw_only=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field
 from enum import Enum
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,10 @@ BLOCKS: Mapping[str, slice] = {
     "varrho": slice(14, 17),  # [m], {B}
     "mu": slice(17, 20),  # dmu_v, half angle, {B}
 }  # the 20 error states by name, in the order of every covariance
+_SIZES = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}  # parts of a state
+_STATE = {
+    name: (end - size, end) for (name, size), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)
+}
 
 
 class ScanStatus(Enum):
@@ -98,6 +103,7 @@ class State:
         q_ab: (4,) attitude of {B}.  w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
         r_a: (3,) centre of mass, rho_o [m].  v_a: (3,) its velocity [m/s].
         sigma: (2,) inertia ratios.  c_b: (3,) fixture in {B}, varrho [m].  q_bc: (4,) mu, {C} to {B}.
+        flat: (22,) these numbers one after the other, of which the others are views: the state of the extension.
     """
 
     q_ab: Array
@@ -107,11 +113,24 @@ class State:
     sigma: Array
     c_b: Array
     q_bc: Array
+    flat: Array = field(init=False, repr=False)
     _T_ac: Pose | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name, size in (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4)):
-            object.__setattr__(self, name, frozen(getattr(self, name), size))
+        self._view(np.concatenate([frozen(getattr(self, name), b - a) for name, (a, b) in _STATE.items()]))
+
+    @classmethod
+    def of(cls, flat: Array) -> State:
+        """Return the state of its 22 numbers, which become read-only."""
+        return cls.__new__(cls)._view(flat)
+
+    def _view(self, flat: Array) -> State:
+        flat.setflags(write=False)
+        object.__setattr__(self, "flat", flat)
+        object.__setattr__(self, "_T_ac", None)
+        for name, (a, b) in _STATE.items():
+            object.__setattr__(self, name, flat[a:b])
+        return self
 
     @property
     def T_ac(self) -> Pose:
@@ -310,28 +329,6 @@ class Manoeuvre:
 
 class Drift(Manoeuvre):
     """A constant acceleration since ``t_ns``: ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force."""
-
-
-@value_class
-class BodyParameters:
-    """Parameters of the target in {C}, independent of the order of the principal axes.
-
-    Attributes:
-        inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
-        moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
-        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of trace.
-        limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without any information.
-    """
-
-    inertia: Array
-    inertia_1s: Array
-    moments: Array
-    moments_1s: Array
-    centre_c: Array
-    centre_1s_m: float
-    rate_c: Array
-    rate_1s_radps: float
-    limited_1s: tuple[float, float, float, float]
 
 
 @value_class

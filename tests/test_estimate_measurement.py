@@ -279,7 +279,7 @@ def test_values_that_are_not_numbers_terminate() -> None:
             WHITE,
         )
     with pytest.raises(TypeError):
-        _motion.correct(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, H[:5], np.ones(6), S, S, (1.0, 1.0))
+        _motion.correct(x.flat, P, H[:5], np.ones(6), S, S, (1.0, 1.0))
 
 
 def test_an_innovation_covariance_is_definite_also_where_rounding_has_spoilt_the_prior() -> None:

@@ -12,20 +12,14 @@ def follow(
     drive: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array, Array]: ...
 def correct(
-    q_ab: Array,
-    w_b: Array,
-    r_a: Array,
-    v_a: Array,
-    sigma: Array,
-    c_b: Array,
-    q_bc: Array,
+    x: Array,
     P: Array,
     H: Array,
     alpha: Array,
     S: Array,
     R: Array,
     colour: tuple[float, float],
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]: ...
+) -> tuple[Array, Array]: ...
 def change(
     Phi: Array,
     P: Array,
@@ -39,13 +33,7 @@ def change(
     share: float,
 ) -> tuple[float, Array]: ...
 def forecast(
-    q_ab: Array,
-    w_b: Array,
-    r_a: Array,
-    v_a: Array,
-    sigma: Array,
-    c_b: Array,
-    q_bc: Array,
+    x: Array,
     P: Array,
     torque: tuple[float, float, float],
     force: float,
@@ -62,23 +50,17 @@ def mixture_forecast(
     times: Array,
     origin_c: tuple[float, float, float],
 ) -> Array: ...
-def chart(q_ab: Array, w_b: Array, r_a: Array, v_a: Array, sigma: Array, c_b: Array, q_bc: Array) -> Array: ...
+def chart(x: Array) -> Array: ...
 def least_gap(chart: Array) -> float: ...
 def moved(chart: Array, y: Array) -> Array: ...
 def spread(
-    q_ab: Array,
-    w_b: Array,
-    r_a: Array,
-    v_a: Array,
-    sigma: Array,
-    c_b: Array,
-    q_bc: Array,
+    x: Array,
     errors: Array,
     most: float,
     chart: Array,
 ) -> Array: ...
 def minus(chart: Array, other: Array) -> Array: ...
-def state(chart: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]: ...
+def state(chart: Array) -> Array: ...
 def errors(chart: Array) -> Array: ...
 def body(chart: Array, P: Array, largest: float) -> Array: ...
 def transition(chart: Array, h: float, path: Array) -> tuple[Array, Array]: ...
@@ -110,34 +92,16 @@ def by_drive(
 ) -> Array: ...
 def join(charts: Array, P: Array, weights: Array, quadrature: Array) -> tuple[Array, Array]: ...
 def propagate(
-    q_ab: Array,
-    w_b: Array,
-    r_a: Array,
-    v_a: Array,
-    sigma: Array,
-    c_b: Array,
-    q_bc: Array,
+    x: Array,
     P: Array,
     h: float,
     path: Array,
     torque: tuple[float, float, float],
     force: float,
-) -> tuple[Array, Array, Array, Array, Array, Array]: ...
+) -> tuple[Array, Array, Array]: ...
 def nees(
-    q_ab: Array,
-    w_b: Array,
-    r_a: Array,
-    v_a: Array,
-    sigma: Array,
-    c_b: Array,
-    q_bc: Array,
-    true_q_ab: Array,
-    true_w_b: Array,
-    true_r_a: Array,
-    true_v_a: Array,
-    true_sigma: Array,
-    true_c_b: Array,
-    true_q_bc: Array,
+    x: Array,
+    truth: Array,
     P: Array,
     R_nb: Array,
     q_bn: Array,

@@ -33,7 +33,8 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.dynamics import sigma3, sigma_join
 from avsreplay.estimate.error_state import DIM, DMU, DQ, SIGMA, VARRHO, W
 from avsreplay.geometry import Array
-from avsreplay.records import BLOCKS, Belief, BodyParameters, State
+from avsreplay.outcome import BodyParameters
+from avsreplay.records import BLOCKS, Belief, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
@@ -140,12 +141,12 @@ class Chart:
 
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
-    return Chart(_motion.chart(*_parts(x)))
+    return Chart(_motion.chart(x.flat))
 
 
 def to_state(c: Chart) -> State:
     """The state of chart coordinates, its principal axes being the columns of ``R_cb``."""
-    return State(*_motion.state(c.flat))
+    return State.of(_motion.state(c.flat))
 
 
 def to_errors(c: Chart) -> Array:
@@ -236,11 +237,7 @@ def nees_by_block(belief: Belief, truth: State) -> tuple[float, dict[str, float]
 
 def _compared(belief: Belief, truth: State) -> tuple[int, float, float, list[float]]:
     """Number of the nearest permutation, NEES of the error states in it, NEES in the chart, and that of each block."""
-    return _motion.nees(*_parts(belief.x), *_parts(truth), belief.P, _R_NB, _Q_BN)
-
-
-def _parts(x: State) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    return x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc
+    return _motion.nees(belief.x.flat, truth.flat, belief.P, _R_NB, _Q_BN)
 
 
 def body_parameters(belief: Belief) -> BodyParameters:

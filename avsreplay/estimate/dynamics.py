@@ -176,10 +176,8 @@ def propagate(
     h, x = seconds_to(belief, t_ns), belief.x
     path = translation(h, None if orbit is None else orbit.at(belief.t_ns))
     density = torque_density(x.sigma, torque)
-    q_ab, w_b, r_a, v_a, Phi, P = _motion.propagate(
-        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, belief.P, h, path, density, force**2
-    )
-    return Belief(t_ns, State(q_ab, w_b, r_a, v_a, x.sigma, x.c_b, x.q_bc), P), Phi
+    there, Phi, P = _motion.propagate(x.flat, belief.P, h, path, density, force**2)
+    return Belief(t_ns, State.of(there), P), Phi
 
 
 def seconds_to(belief: Belief, t_ns: int) -> float:
@@ -279,8 +277,7 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     if max(map(abs, x.w_b.tolist())) * float(times.max(initial=0.0)) > MOST_RAD:
         return Forecast(times, *np.full((3, len(times)), np.inf))
     P, density = np.ascontiguousarray(belief.P), torque_density(x.sigma, torque)
-    state = x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc
-    return forecast_of(times, _motion.forecast(*state, P, density, force**2, times))
+    return forecast_of(times, _motion.forecast(x.flat, P, density, force**2, times))
 
 
 def ascending(times_s: Array) -> Array:

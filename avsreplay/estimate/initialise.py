@@ -198,8 +198,7 @@ def given_prior(belief: Belief) -> Prior:
     """
     x, mean, root = belief.x, to_chart(belief.x), np.linalg.cholesky(belief.P)
     draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
-    state, errors = (x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc), np.concatenate([draws, -draws])
-    y = _motion.spread(*state, errors, _EDGE, mean.flat)
+    y = _motion.spread(x.flat, np.concatenate([draws, -draws]), _EDGE, mean.flat)
     return Prior(mean, y.T @ y / len(y))
 
 

@@ -284,10 +284,8 @@ def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Arr
     """
     x, factors = prior.x, inflation / innovation.weight
     alpha, S, R = innovation.alpha, innovation.S, innovation.R
-    *mean, P = _motion.correct(
-        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, prior.P, H, alpha, S, R, factors.tolist()
-    )
-    then = Belief(prior.t_ns, State(*mean), P)
+    mean, P = _motion.correct(x.flat, prior.P, H, alpha, S, R, factors.tolist())
+    then = Belief(prior.t_ns, State.of(mean), P)
     if not isinstance(prior, DrivenBelief):
         return then
     return corrected(prior, then, H, S + inflated(R, factors) - R, alpha)

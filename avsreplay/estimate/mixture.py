@@ -131,7 +131,7 @@ def carried(
     """
     pair, found = (float(factors[0]), float(factors[1])), []
     for c in components:
-        density = torque_density(_motion.state(c.chart.flat)[4], noise[0])
+        density = torque_density(to_state(c.chart).sigma, noise[0])
         h = (t_ns - c.t_ns) * 1e-9
         path = translation(h, None if orbit is None else orbit.at(c.t_ns))
         chart, reference, P, chi2, log_det = _motion.carry(
@@ -241,7 +241,7 @@ def mixture_forecast(
         np.array([chart.flat for chart in about]),
         np.array([c.P for c in components]),
         np.array([c.weight for c in components]),
-        np.array([torque_density(_motion.state(chart.flat)[4], torque) for chart in about]),
+        np.array([torque_density(to_state(chart).sigma, torque) for chart in about]),
         separated(published.chart, published.P).flat,
         force**2,
         ahead,

@@ -166,9 +166,9 @@ def from_motion(rng: np.random.Generator) -> str:
     P = numbers(rng, 20, 20)
     done = _tried(lambda: _motion.follow(state[0], state[1], sigma, push, times))
     done |= _tried(lambda: _motion.Path(state[0], state[1], sigma).at(times))
-    done |= _tried(lambda: _motion.forecast(*state, P @ P.T, push, float(abs(push[0])), times))
+    done |= _tried(lambda: _motion.forecast(np.concatenate(state), P @ P.T, push, float(abs(push[0])), times))
     H, S = numbers(rng, 6, 20), numbers(rng, 6, 6)
-    done |= _tried(lambda: _motion.correct(*state, P @ P.T, H, numbers(rng, 6), S, S @ S.T, (0.5, 0.5)))
+    done |= _tried(lambda: _motion.correct(np.concatenate(state), P @ P.T, H, numbers(rng, 6), S, S @ S.T, (0.5, 0.5)))
     return "motion used" if done else "motion refused"
 
 

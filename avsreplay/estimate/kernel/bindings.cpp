@@ -112,13 +112,22 @@ void put(const Vector<(int)N>& from, double (&to)[N]) {
   std::memcpy(to, from.data(), sizeof to);
 }
 
-State state_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v, const Vector<2>& sigma,
-                 const Vector<3>& c, const Vector<4>& q_bc) {
+// A state as the array of its 22 numbers.
+constexpr int STATE = sizeof(State) / sizeof(double);
+using Mean = Vector<STATE>;
+
+State state(const Mean& from) {
   State x;
-  put<4>(q_ab, x.q_ab), put<3>(w, x.w_b), put<3>(r, x.r_a), put<3>(v, x.v_a);
-  put<2>(sigma, x.sigma), put<3>(c, x.c_b), put<4>(q_bc, x.q_bc);
+  std::memcpy(&x, from.data(), sizeof x);
   check_ratios(x.sigma, 2);
   return x;
+}
+
+Numpy flat(const State& from) {
+  double* to;
+  Numpy out = array({STATE}, &to);
+  std::memcpy(to, &from, sizeof from);
+  return out;
 }
 
 Numpy flat(const Chart& from) {
@@ -128,21 +137,18 @@ Numpy flat(const Chart& from) {
   return out;
 }
 
-Numpy chart_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                 const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc) {
-  return flat(chart_of(state_from(q_ab, w, r, v, sigma, c, q_bc)));
+Numpy chart_from(const Mean& mean) {
+  return flat(chart_of(state(mean)));
 }
 
 // Per instant: variances of position, velocity and half-angle attitude.
-Numpy forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                  const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P,
-                  const Three& torque, double force, const Times& times) {
+Numpy forecast_of(const Mean& mean, const Matrix<DIM, DIM>& P, const Three& torque, double force, const Times& times) {
   const size_t n = times.shape(0);
   double* variances;
   Numpy out = array({n, 3}, &variances);
   {
     nb::gil_scoped_release release;
-    const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+    const State x = state(mean);
     double join[3][2], t = 0;
     Body body = body_of(x, join);
     std::memcpy(body.push, torque.data(), sizeof body.push);
@@ -156,12 +162,11 @@ Numpy forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r,
   return out;
 }
 
-// The state's seven arrays and P, once a pose has been seen.
-nb::tuple correct_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                     const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P0,
-                     const Matrix<SEEN, DIM>& H, const Vector<SEEN>& alpha, const Matrix<SEEN, SEEN>& S,
+// State and P, once a pose has been seen.
+nb::tuple correct_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Matrix<SEEN, DIM>& H,
+                     const Vector<SEEN>& alpha, const Matrix<SEEN, SEEN>& S,
                      const Matrix<SEEN, SEEN>& R, const Two& colour) {
-  State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+  State x = state(mean);
   Pose seen;
   Square P;
   put<SEEN>(alpha, seen.alpha);
@@ -170,8 +175,7 @@ nb::tuple correct_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>&
   std::memcpy(seen.S, S.data(), sizeof seen.S);
   std::memcpy(seen.R, R.data(), sizeof seen.R);
   correct(x, P, seen, colour.data());
-  return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(x.sigma), made(x.c_b), made(x.q_bc),
-                        made(P));
+  return nb::make_tuple(flat(x), made(P));
 }
 
 // The likelihood ratio of a change in the last scans, and the second moments (20, 20) of the error it would cause.
@@ -220,16 +224,12 @@ Numpy minus_of(const Flat& c, const Flat& from) {
   return made(y);
 }
 
-nb::tuple state(const Flat& from) {
-  const State x = state_of(chart(from));
-  return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(x.sigma), made(x.c_b), made(x.q_bc));
-}
+Numpy state_at(const Flat& from) { return flat(state_of(chart(from))); }
 
 // Steps (n, 20) from a chart to those of a state displaced by errors (n, 20), |sigma| being at most `most`. The terms of
 // the products are added in the order of error_state.py's hamilton.
-Numpy spread_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v, const Vector<2>& sigma,
-                const Vector<3>& c, const Vector<4>& q_bc, const Matrix<-1, DIM>& errors, double most, const Flat& from) {
-  const State mean = state_from(q_ab, w, r, v, sigma, c, q_bc);
+Numpy spread_of(const Mean& mean, const Matrix<-1, DIM>& errors, double most, const Flat& from) {
+  const State centre = state(mean);
   const Chart origin = chart(from);
   const auto product = [](const Quad& a, const Quad& b) {
     return unit({a.w * b.x + b.w * a.x + a.y * b.z - a.z * b.y, a.w * b.y + b.w * a.y + a.z * b.x - a.x * b.z,
@@ -239,8 +239,8 @@ Numpy spread_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, c
   Numpy out = array({errors.shape(0), (size_t)DIM}, &y);
   for (size_t k = 0; k < errors.shape(0); ++k) {
     const double* d = errors.data() + DIM * k;
-    State x = mean;
-    const Quad q = product(quad(mean.q_ab), half_angle(vector(d))), mu = product(half_angle(vector(d + 17)), quad(mean.q_bc));
+    State x = centre;
+    const Quad q = product(quad(centre.q_ab), half_angle(vector(d))), mu = product(half_angle(vector(d + 17)), quad(centre.q_bc));
     std::memcpy(x.q_ab, &q, sizeof q), std::memcpy(x.q_bc, &mu, sizeof mu);
     for (int i = 0; i < 3; ++i) x.w_b[i] += d[3 + i], x.r_a[i] += d[6 + i], x.v_a[i] += d[9 + i], x.c_b[i] += d[14 + i];
     for (int i = 0; i < 2; ++i) x.sigma[i] = std::min(std::max(x.sigma[i] + d[12 + i], -most), most);
@@ -505,27 +505,23 @@ nb::tuple join_of(const Matrix<-1, CHART>& charts, const Matrix<-1, DIM, DIM>& P
   return nb::make_tuple(flat(mean), made(moments));
 }
 
-// Attitude, rate, position and velocity h seconds later, the transition and the covariance.
-nb::tuple propagate_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                       const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P0,
-                       double h, const Matrix<6, 6>& path, const Three& torque, double force) {
-  State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+// The state h seconds later, the transition and the covariance.
+nb::tuple propagate_of(const Mean& mean, const Matrix<DIM, DIM>& P0, double h, const Matrix<6, 6>& path,
+                       const Three& torque, double force) {
+  State x = state(mean);
   Square P, Phi;
   std::memcpy(P, P0.data(), sizeof P);
   propagate(x, P, h, as<double[6][6]>(path.data()), torque.data(), force, Phi);
-  return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(Phi), made(P));
+  return nb::make_tuple(flat(x), made(Phi), made(P));
 }
 
 // Number of the nearest order of the truth's axes among R_nb, and NEES: of all states in that order, in the chart, by block.
-nb::tuple nees_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                  const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Vector<4>& true_q_ab,
-                  const Vector<3>& true_w, const Vector<3>& true_r, const Vector<3>& true_v, const Vector<2>& true_sigma,
-                  const Vector<3>& true_c, const Vector<4>& true_q_bc, const Matrix<DIM, DIM>& P,
+nb::tuple nees_of(const Mean& mean, const Mean& true_mean, const Matrix<DIM, DIM>& P,
                   const Matrix<-1, 3, 3>& R_nb, const Matrix<-1, 4>& q_bn) {
   if (!R_nb.shape(0) || q_bn.shape(0) != R_nb.shape(0))
     throw std::invalid_argument("rotations and quaternions must be equally many, one at least");
-  const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
-  const State truth = state_from(true_q_ab, true_w, true_r, true_v, true_sigma, true_c, true_q_bc);
+  const State x = state(mean);
+  const State truth = state(true_mean);
   const Errors found = errors_squared(truth, x, as<Square>(P.data()), reinterpret_cast<const M3*>(R_nb.data()),
                                       reinterpret_cast<const Quad*>(q_bn.data()), (int)R_nb.shape(0));
   std::array<double, BLOCK_COUNT> block;
@@ -538,24 +534,20 @@ nb::tuple nees_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r,
 NB_MODULE(_motion, m) {
   m.def("follow", &follow, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("push"), nb::arg("times"),
         nb::arg("drive") = Three{0, 0, 0});
-  m.def("correct", &correct_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
+  m.def("correct", &correct_of, nb::arg("x"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"));
-  m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
+  m.def("forecast", &forecast_of, nb::arg("x"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
   m.def("mixture_forecast", &mixture_forecast_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"),
         nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"),
         nb::arg("origin_c"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
-  m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"));
+  m.def("chart", &chart_from, nb::arg("x"));
   m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
-  m.def("spread", &spread_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("errors"), nb::arg("most"), nb::arg("chart"));
+  m.def("spread", &spread_of, nb::arg("x"), nb::arg("errors"), nb::arg("most"), nb::arg("chart"));
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
-  m.def("state", &state, nb::arg("chart"));
+  m.def("state", &state_at, nb::arg("chart"));
   m.def("errors", &errors, nb::arg("chart"));
   m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
@@ -567,12 +559,9 @@ NB_MODULE(_motion, m) {
         nb::arg("drive") = Three{0, 0, 0});
   m.def("by_drive", &by_drive, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"), nb::arg("drive"));
   m.def("join", &join_of, nb::arg("charts"), nb::arg("P"), nb::arg("weights"), nb::arg("quadrature"));
-  m.def("propagate", &propagate_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
+  m.def("propagate", &propagate_of, nb::arg("x"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"));
-  m.def("nees", &nees_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("true_q_ab"), nb::arg("true_w_b"), nb::arg("true_r_a"),
-        nb::arg("true_v_a"), nb::arg("true_sigma"), nb::arg("true_c_b"), nb::arg("true_q_bc"), nb::arg("P"),
+  m.def("nees", &nees_of, nb::arg("x"), nb::arg("truth"), nb::arg("P"),
         nb::arg("R_nb"), nb::arg("q_bn"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),

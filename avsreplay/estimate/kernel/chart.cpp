@@ -1,4 +1,5 @@
 #include "chart.hpp"
+#include "elimination.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -41,27 +42,6 @@ void inertia(const M3& M, double tensor[3][3], double moments[3]) {
       for (int k = 0; k < 3; ++k) tensor[i][j] += V.x[i][k] * moments[k] * V.x[j][k];
     }
   std::sort(moments, moments + 3);
-}
-
-// Rows of the inverse of T, which is overwritten: Gauss-Jordan elimination with row pivots. False if T is singular.
-bool invert(double T[DIM][DIM], double out[DIM][DIM]) {
-  std::memset(out, 0, sizeof(double) * DIM * DIM);
-  for (int k = 0; k < DIM; ++k) out[k][k] = 1;
-  for (int k = 0; k < DIM; ++k) {
-    int pivot = k;
-    for (int r = k + 1; r < DIM; ++r)
-      if (std::fabs(T[r][k]) > std::fabs(T[pivot][k])) pivot = r;
-    if (!(std::fabs(T[pivot][k]) > 0)) return false;
-    for (int c = 0; c < DIM; ++c) std::swap(T[k][c], T[pivot][c]), std::swap(out[k][c], out[pivot][c]);
-    const double one = 1 / T[k][k];
-    for (int c = 0; c < DIM; ++c) T[k][c] *= one, out[k][c] *= one;
-    for (int r = 0; r < DIM; ++r) {
-      const double f = T[r][k];
-      if (r == k || f == 0) continue;
-      for (int c = 0; c < DIM; ++c) T[r][c] -= f * T[k][c], out[r][c] -= f * out[k][c];
-    }
-  }
-  return true;
 }
 
 // Eigenvalues, on the diagonal of a symmetric S, and eigenvectors, the columns of V: cyclic Jacobi rotations.
@@ -112,9 +92,10 @@ double trace(const double A[3][3]) { return A[0][0] + A[1][1] + A[2][2]; }
 
 BodyNumbers numbers_of(const Chart& c, const double P[DIM][DIM], double largest) {
   BodyNumbers out;
-  double T[DIM][DIM], inverse[DIM][DIM], small[3][3], S[5][5], V[5][5];
+  double T[DIM][DIM], inverse[DIM][DIM] = {}, small[3][3], S[5][5], V[5][5];
   errors_of(c, T);
-  if (!invert(T, inverse)) std::fill(&inverse[0][0], &inverse[0][0] + DIM * DIM, NAN);
+  for (int k = 0; k < DIM; ++k) inverse[k][k] = 1;
+  Factored<DIM>(T).divide<DIM>(inverse);
   block<3>(inverse, P, ARM, small);
   out.arm_variance = trace(small);
   block<3>(inverse, P, RATE, small);

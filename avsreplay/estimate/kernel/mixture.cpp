@@ -3,36 +3,11 @@
 #include <limits>
 #include <utility>
 
+#include "elimination.hpp"
 #include "fit.hpp"
 
 namespace avs {
 namespace {
-
-// B := A^-1 B for A (N, N), B (N, M), by elimination with the largest pivot of each column; A is overwritten.
-template <int N, int M>
-void divide(double A[N][N], double B[N][M]) {
-  for (int k = 0; k < N; ++k) {
-    int best = k;
-    for (int r = k + 1; r < N; ++r)
-      if (std::fabs(A[r][k]) > std::fabs(A[best][k])) best = r;
-    if (best != k) {
-      for (int c = 0; c < N; ++c) std::swap(A[k][c], A[best][c]);
-      for (int c = 0; c < M; ++c) std::swap(B[k][c], B[best][c]);
-    }
-    for (int r = k + 1; r < N; ++r) {
-      const double f = A[r][k] / A[k][k];
-      if (f == 0) continue;
-      for (int c = k; c < N; ++c) A[r][c] -= f * A[k][c];
-      for (int c = 0; c < M; ++c) B[r][c] -= f * B[k][c];
-    }
-  }
-  for (int k = N - 1; k >= 0; --k)
-    for (int c = 0; c < M; ++c) {
-      double s = B[k][c];
-      for (int i = k + 1; i < N; ++i) s -= A[k][i] * B[i][c];
-      B[k][c] = s / A[k][k];
-    }
-}
 
 // A B A' for symmetric B, exactly symmetric.
 template <int N>
@@ -180,7 +155,7 @@ void transition(Chart& chart, double h, const double path[6][6], const double* t
       into[r][r] = 1;
       std::memcpy(first[r], T[r], sizeof first[r]);
     }
-    divide<MOTION, MOTION>(first, into);
+    Factored<MOTION>(first).divide<MOTION>(into);
     for (int r = 0; r < 6; ++r) std::memcpy(noise[r], flow.Q[r], sizeof flow.Q[r]);
     const double d = std::fabs(h);
     for (int r = 6; r < 9; ++r) {
@@ -190,7 +165,7 @@ void transition(Chart& chart, double h, const double path[6][6], const double* t
     }
     congruent<MOTION>(into, noise, Q);
   }
-  divide<DIM, DIM>(T, F);
+  Factored<DIM>(T).divide<DIM>(F);
 }
 
 void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6], const double torque_density[3],

@@ -4,54 +4,12 @@
 #include <limits>
 
 #include "covariance.hpp"
+#include "elimination.hpp"
 
 namespace avs {
 namespace {
 
 constexpr int BLOCK_START[BLOCK_COUNT] = {0, 3, 6, 9, 12, 14, 17}, BLOCK_SIZE[BLOCK_COUNT] = {3, 3, 3, 3, 2, 3, 3};
-
-// An LU factorisation of the first n rows and columns of A, with row pivots; false where A is singular or not finite.
-struct Factored {
-  int n = 0, pivot[DIM];
-  Square LU;
-
-  bool of(const Square A, int first, int size) {
-    n = size;
-    for (int r = 0; r < n; ++r)
-      for (int c = 0; c < n; ++c) LU[r][c] = A[first + r][first + c];
-    for (int k = 0; k < n; ++k) {
-      int best = k;
-      for (int r = k + 1; r < n; ++r)
-        if (std::fabs(LU[r][k]) > std::fabs(LU[best][k])) best = r;
-      pivot[k] = best;
-      const double largest = std::fabs(LU[best][k]);
-      if (!(largest > 0) || !std::isfinite(largest)) return false;
-      if (best != k)
-        for (int c = 0; c < n; ++c) std::swap(LU[k][c], LU[best][c]);
-      for (int r = k + 1; r < n; ++r) {
-        const double f = LU[r][k] /= LU[k][k];
-        for (int c = k + 1; c < n; ++c) LU[r][c] -= f * LU[k][c];
-      }
-    }
-    return true;
-  }
-
-  // e' A^-1 e.
-  double squared(const double* e) const {
-    double x[DIM];
-    std::memcpy(x, e, n * sizeof(double));
-    for (int k = 0; k < n; ++k) std::swap(x[k], x[pivot[k]]);
-    for (int k = 0; k < n; ++k)
-      for (int r = k + 1; r < n; ++r) x[r] -= LU[r][k] * x[k];
-    double sum = 0;
-    for (int k = n - 1; k >= 0; --k) {
-      x[k] /= LU[k][k];
-      for (int r = 0; r < k; ++r) x[r] -= LU[r][k] * x[k];
-    }
-    for (int k = 0; k < n; ++k) sum += e[k] * x[k];
-    return sum;
-  }
-};
 
 void put(const Quad& q, double* half_angle) {
   const double sign = q.w >= 0 ? 1 : -1;
@@ -83,14 +41,13 @@ void difference(const State& truth, const State& x, const M3& R_nb, const Quad& 
 
 Errors errors_squared(const State& truth, const State& x, const Square P, const M3* R_nb, const Quad* q_bn, int count) {
   Errors out;
-  Factored whole, part;
-  const bool regular = whole.of(P, 0, DIM);
+  const Factored<DIM> whole(P);
   double d[DIM];
   out.size = std::numeric_limits<double>::infinity();
   for (int k = 0; k < count; ++k) {
     difference(truth, x, R_nb[k], q_bn[k], d);
     double size = 0;
-    if (regular) size = whole.squared(d);
+    if (whole.regular) size = whole.squared(d);
     else
       for (int i = 0; i < DIM; ++i) size += P[i][i] > 0 ? d[i] * d[i] / P[i][i] : 0;
     if (k == 0 || size < out.size) {
@@ -106,9 +63,9 @@ Errors errors_squared(const State& truth, const State& x, const Square P, const 
     d[r] = 0;
     for (int i = 0; i < DIM; ++i) d[r] += T[r][i] * y[i];
   }
-  out.chart = regular ? whole.squared(d) : NAN;
+  out.chart = whole.squared(d);
   for (int b = 0; b < BLOCK_COUNT; ++b)
-    out.block[b] = part.of(P, BLOCK_START[b], BLOCK_SIZE[b]) ? part.squared(d + BLOCK_START[b]) : NAN;
+    out.block[b] = Factored<DIM>(P, BLOCK_START[b], BLOCK_SIZE[b]).squared(d + BLOCK_START[b]);
   return out;
 }
 

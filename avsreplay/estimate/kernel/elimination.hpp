@@ -1,0 +1,57 @@
+// Elimination with the largest pivot of each column, in fixed size.
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+namespace avs {
+
+// The factors L U of `size` rows and columns of A from `first` on, with the rows in the order of their pivots.
+template <int N>
+struct Factored {
+  int n, pivot[N];
+  double LU[N][N];
+  bool regular = true;  // else the quotients are not finite
+
+  explicit Factored(const double A[N][N], int first = 0, int size = N) : n(size) {
+    for (int r = 0; r < n; ++r) std::copy(A[first + r] + first, A[first + r] + first + n, LU[r]);
+    for (int k = 0; k < n; ++k) {
+      int& best = pivot[k] = k;
+      for (int r = k + 1; r < n; ++r)
+        if (std::fabs(LU[r][k]) > std::fabs(LU[best][k])) best = r;
+      const double largest = std::fabs(LU[best][k]);
+      regular = regular && largest > 0 && std::isfinite(largest);
+      if (best != k) std::swap_ranges(LU[k], LU[k] + n, LU[best]);
+      for (int r = k + 1; r < n; ++r) {
+        const double f = LU[r][k] /= LU[k][k];
+        for (int c = k + 1; c < n; ++c) LU[r][c] -= f * LU[k][c];
+      }
+    }
+  }
+
+  // B := A^-1 B.
+  template <int M>
+  void divide(double B[N][M]) const {
+    for (int k = 0; k < n; ++k) {
+      if (pivot[k] != k) std::swap_ranges(B[k], B[k] + M, B[pivot[k]]);
+    }
+    for (int k = 0; k < n; ++k)
+      for (int r = k + 1; r < n; ++r)
+        for (int c = 0; c < M; ++c) B[r][c] -= LU[r][k] * B[k][c];
+    for (int k = n - 1; k >= 0; --k) {
+      for (int i = k + 1; i < n; ++i)
+        for (int c = 0; c < M; ++c) B[k][c] -= LU[k][i] * B[i][c];
+      for (int c = 0; c < M; ++c) B[k][c] /= LU[k][k];
+    }
+  }
+
+  // e' A^-1 e, NaN where A is singular.
+  double squared(const double* e) const {
+    double x[N][1], sum = 0;
+    for (int k = 0; k < n; ++k) x[k][0] = e[k];
+    divide<1>(x);
+    for (int k = 0; k < n; ++k) sum += e[k] * x[k][0];
+    return regular ? sum : NAN;
+  }
+};
+
+}  // namespace avs
