@@ -21,7 +21,7 @@ import numpy as np
 from registration_cases import (
     REACH_M,
     Case,
-    error,
+    determined_error,
     in_turn,
     look,
     off,
@@ -155,26 +155,49 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         print(f"{name:6} 50000 points: 2 threads {gain:.2f}x one, poses bit-identical: {same}")
 
 
-def views(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Final errors over 12 sides of the target, ours and GICP's."""
-    mesh, points = SurfaceIndex.build(surface, REACH_M), cloud.vertices
-    for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05)):
-        errors: dict[str, list[tuple[float, float]]] = {}
-        for side in range(3 if args.quick else 12):
-            scan, truth = look(surface, args.scan, outliers, side)
-            guess = off(truth, deg, metres, 100 + side)
-            cases = {
-                "ours, mesh, sides that face the camera": Case(ours(mesh, scan, guess, settled(facing=True))),
-                "ours, mesh, both sides": Case(ours(mesh, scan, guess, settled())),
-            }
-            cases.update(peers({"small_gicp GICP": partial(small_gicp, points, scan, guess, "GICP", 200, EPS_RAD)}))
-            for name, case in cases.items():
-                errors.setdefault(name, []).append(error(case.run()[0], truth))
-        print(f"\nfinal error over {side + 1} sides, outliers {outliers:.0%}, start {deg} deg: median (largest)")
-        for name, found in errors.items():
-            e = np.array(found)
-            middle, most = np.median(e, axis=0), e.max(axis=0)
-            print(f"{name:40} {middle[0]:8.4f} ({most[0]:.4f}) deg {middle[1]:8.3f} ({most[1]:.3f}) mm")
+def accuracy(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Errors of the poses over many sides, of `Registrar.register` and of the peers on the same scans.
+
+    A ratio is the error of `register` over that of the peer on the same scan. The range is that of one standard error
+    of the median, from the order of the ratios.
+    """
+    for mesh in [*real_meshes(surface, args), stage()]:
+        registrar = Registrar(mesh, RegisterParams(index_cache=False))
+        points = sample(mesh, args.model, 1).vertices
+        for start in STARTS[:2]:
+            sides = range(3 if args.quick else args.views)
+            found = [_errors(registrar, mesh, points, start, side, args) for side in sides]
+            print(f"\n{mesh.name}, outliers {start[0]:.0%}, start {start[1]} deg: median errors, {len(found)} sides")
+            for name in found[0]:
+                each = np.array([errors[name] for errors in found])
+                deg, mm = np.median(each, axis=0)
+                ratios = np.array([errors["register"] for errors in found]) / each
+                text = "" if name == "register" else f"{_median(ratios[:, 0])} deg  {_median(ratios[:, 1])} mm"
+                print(f"{name:12} {deg:8.4f} deg {mm:7.3f} mm   {text}", flush=True)
+
+
+def _errors(
+    registrar: Registrar,
+    mesh: Surface,
+    points: Array,
+    start: tuple[float, float, float],
+    side: int,
+    args: argparse.Namespace,
+) -> dict[str, tuple[float, float]]:
+    """The error of each method in the motions that `register` reports as determined by this view."""
+    scan, truth = look(mesh, args.scan, start[0], side, lambda eye, rays: registrar.index.cast(eye, rays)[0])
+    guess = off(truth, *start[1:], 100 + side)
+    found = registrar.register(scan, guess.inverse())
+    kinds = ("GICP", "PLANE_ICP")
+    makers = {kind: partial(small_gicp, points, scan, guess, kind, 200, EPS_RAD) for kind in kinds}
+    poses = {"register": found.T_ac.inverse().matrix, **{name: case.run()[0] for name, case in peers(makers)}}
+    return {name: determined_error(T_ca, truth, found.free, mesh.extent) for name, T_ca in poses.items()}
+
+
+def _median(x: Array) -> str:
+    n, ordered = len(x), np.sort(x)
+    low, high = (ordered[round((n - 1) / 2 + k * np.sqrt(n) / 2)] for k in (-1, 1))
+    return f"{np.median(x):5.2f} ({low:.2f} to {high:.2f})"
 
 
 def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
@@ -344,7 +367,7 @@ PARTS = {
     "speed": speed,
     "passes": passes,
     "converged": converged,
-    "views": views,
+    "accuracy": accuracy,
 }
 
 
@@ -354,6 +377,7 @@ def main() -> None:
     parser.add_argument("--model", type=int, default=100_000)
     parser.add_argument("--scan", type=int, default=10_000)
     parser.add_argument("--reps", type=int, default=7)
+    parser.add_argument("--views", type=int, default=30, help="sides of a mesh of which the errors are measured")
     parser.add_argument("--only", default=",".join(PARTS))
     args = parser.parse_args()
     if args.quick:

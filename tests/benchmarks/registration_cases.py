@@ -34,31 +34,51 @@ def sample(surface: Surface, n: int, seed: int) -> Surface:
     return Surface(p.astype(np.float32).astype(np.float64), NO_FACES, f"{n} points", "")
 
 
-def look(surface: Surface, n: int, outliers: float, seed: int) -> tuple[Array, Pose]:
-    """A scan (n, 3) float32 in {A} from a random side, 6 extents away in angle terms, and the true T_ca."""
-    import trimesh
+Cast = Callable[[Array, Array], Array]  # ranges, inf: none, of the first faces on rays (n, 3) from a point, in {C}
 
+
+def look(surface: Surface, n: int, outliers: float, seed: int, cast: Cast | None = None) -> tuple[Array, Pose]:
+    """A scan (n, 3) float32 in {A} from a random side, 6 extents away in angle terms, and the true T_ca.
+
+    ``cast`` finds the points on the surface; by default trimesh does, which takes much longer.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     T_ca = Pose(exp(rng.standard_normal(3)), np.zeros(3))
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    cast = cast or trimesh_rays(surface)
     centre = (surface.vertices.max(0) + surface.vertices.min(0)) / 2
     eye = centre - 2.0 * surface.extent * T_ca.R[:, 2]
     T_ca = Pose(T_ca.q, eye)
-    seen = (surface.vertices - eye) @ T_ca.R
-    lo, hi = (seen[:, :2] / seen[:, 2:]).min(0), (seen[:, :2] / seen[:, 2:]).max(0)
+    corners = (surface.vertices - eye) @ T_ca.R
+    lo, hi = (corners[:, :2] / corners[:, 2:]).min(0), (corners[:, :2] / corners[:, 2:]).max(0)
     hits = np.empty((0, 3))
     while len(hits) < n:
         xy = rng.uniform(lo, hi, (2 * n, 2))
         d = np.column_stack([xy, np.ones(2 * n)])
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        at, ray, _ = mesh.ray.intersects_location(np.tile(eye, (2 * n, 1)), d @ T_ca.R.T, multiple_hits=False)
-        distance = np.linalg.norm(at - eye, axis=1) + NOISE_M * rng.standard_normal(len(at))
-        hits = np.concatenate([hits, d[ray] * distance[:, None]])
+        ranges = cast(eye, d @ T_ca.R.T)
+        seen = np.isfinite(ranges)
+        distance = ranges[seen] + NOISE_M * rng.standard_normal(np.count_nonzero(seen))
+        hits = np.concatenate([hits, d[seen] * distance[:, None]])
     hits = hits[:n]
     hits = hits[np.lexsort((np.floor(hits[:, 0] / hits[:, 2] * 300), np.floor(hits[:, 1] / hits[:, 2] * 300)))]
     wrong = rng.choice(n, int(outliers * n), replace=False)
     hits[wrong] = rng.uniform(hits.min(0) - 0.5, hits.max(0) + 0.5, (len(wrong), 3))
     return hits.astype(np.float32), T_ca
+
+
+def trimesh_rays(surface: Surface) -> Cast:
+    """Rays that trimesh follows."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+
+    def cast(eye: Array, directions: Array) -> Array:
+        at, ray, _ = mesh.ray.intersects_location(np.tile(eye, (len(directions), 1)), directions, multiple_hits=False)
+        ranges = np.full(len(directions), np.inf)
+        ranges[ray] = np.linalg.norm(at - eye, axis=1)
+        return ranges
+
+    return cast
 
 
 def off(T_ca: Pose, deg: float, metres: float, seed: int) -> Pose:
@@ -72,6 +92,16 @@ def error(T_ca: Array, truth: Pose) -> tuple[float, float]:
     """Degrees, and millimetres at the target's origin."""
     d = Pose.from_matrix(T_ca) @ truth.inverse()
     return float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(d.q[:3]))))), float(1e3 * np.linalg.norm(d.t))
+
+
+def determined_error(T_ca: Array, truth: Pose, free: Array | None, extent: float) -> tuple[float, float]:
+    """As `error`, without the part along the motions d = [turn; shift] in {C} of ``free`` (6, k), None: none."""
+    d = Pose.from_matrix(T_ca) @ truth.inverse()
+    lengths = np.concatenate([2 * np.arcsin(np.clip(d.q[:3], -1.0, 1.0)) * extent, d.t])
+    if free is not None:
+        motions = np.concatenate([free[:3] * extent, free[3:]])
+        lengths = lengths - motions @ np.linalg.lstsq(motions, lengths, rcond=None)[0]
+    return float(np.degrees(np.linalg.norm(lengths[:3]) / extent)), float(1e3 * np.linalg.norm(lengths[3:]))
 
 
 @dataclass
