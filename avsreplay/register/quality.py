@@ -117,6 +117,7 @@ class PoseQuality:
         beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
         covariance, dof: (6, 6) and its degrees of freedom.  split_nis: the test of halves, NaN where it was not made.
         size, size_1s: as of ``covariance.patch_size``.
+        patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
     """
 
     points: int
@@ -136,6 +137,7 @@ class PoseQuality:
     split_nis: float
     size: float
     size_1s: float
+    patches: tuple[Any, ...]
 
 
 def evidence(
@@ -230,16 +232,16 @@ def grade(
         if weakest:
             info, P = pseudo_inverse(found.covariance), None
     elif found.overlap:
-        sums = evidence(index, visibility, points, T_ca, limits.gate_m, params.noise_m, fit.matches)
-        used = without_dominant_patches(sums)
+        used = Evidence(found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches)
         view = _directions(used)
         info = _observable_information(view, used, index.extent_m, systematic)
         weakest, free = view.words, view.motions
         if guess is not None and fit.converged:
             kept = view.nearest(T_ca, guess)  # passes over a curved surface drift along the unobservable directions
-            moved = evidence(index, visibility, points, kept, limits.gate_m)
-            fits = moved.inliers >= AS_MANY * sums.inliers and moved.rms_m <= AS_NEAR * sums.rms_m
-            T_ca = kept if fits else T_ca
+            facing = visibility.camera_c(index, points, kept) is not None
+            there = index.normal_equations(points, kept, limits.gate_m, facing=facing)
+            near = there.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * there.inliers
+            T_ca = kept if there.inliers >= AS_MANY * found.inliers and near else T_ca
     settled = P is None or not found.beyond
     size = None
     share = found.inliers / max(1, found.points)

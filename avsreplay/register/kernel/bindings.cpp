@@ -83,6 +83,14 @@ nb::ndarray<nb::numpy, T> array(std::initializer_list<size_t> shape, T** data) {
   return nb::ndarray<nb::numpy, T>(*data, shape.size(), shape.begin(), owner);
 }
 
+template <class T>
+nb::ndarray<nb::numpy, T> copied(const std::vector<T>& from, std::initializer_list<size_t> shape) {
+  T* to;
+  auto out = array<T>(shape, &to);
+  std::copy(from.begin(), from.end(), to);
+  return out;
+}
+
 Numpy matrix(const double* rows34) {
   double* T;
   Numpy out = array<double>({4, 4}, &T);
@@ -213,23 +221,10 @@ class Index {
       Team team(threads);
       e = avs::evidence(store_, code(), v, T.v, {gate, side, least, facing}, team, matches);
     }
-    const size_t m = e.patches.size();
-    double *N, *g, *c, *J, *errors, *places;
-    int64_t* count;
-    auto normals = array<double>({m, 6, 6}, &N), gradients = array<double>({m, 6}, &g), centre = array<double>({3}, &c);
-    auto counts = array<int64_t>({m}, &count);
-    auto offsets = array<double>({m, 6}, &J), sums = array<double>({m}, &errors), middles = array<double>({m, 3}, &places);
-    for (size_t k = 0; k < m; ++k) {
-      const PatchSums& from = e.patches[k];
-      for (size_t r = 0; r < 6; ++r) {
-        for (size_t q = 0; q < 6; ++q) N[36 * k + 6 * r + q] = from.rows[r][q];
-        g[6 * k + r] = from.rows[r][6], J[6 * k + r] = from.rows[r][7];
-      }
-      for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.last[a] / (double)from.points;
-      errors[k] = from.last[3], count[k] = from.points;
-    }
+    double* c;
+    auto centre = array<double>({3}, &c);
     std::memcpy(c, e.centre, sizeof e.centre);
-    return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients, offsets, sums, middles);
+    return nb::tuple(nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre) + patches(PatchArrays(e.patches)));
   }
 
   nb::tuple grade(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool camera, int64_t tested,
@@ -255,7 +250,7 @@ class Index {
     std::memcpy(c, g.centre, sizeof g.centre);
     return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
                           g.observable, g.bounded, g.beyond, array66(g.covariance.P), g.covariance.dof, g.split,
-                          g.size[0], g.size[1]);
+                          g.size[0], g.size[1], patches(g.patches));
   }
 
   nb::tuple distances(nb::handle points, const Doubles& T_ca, double most, bool known, int64_t tested, double least_facing) const {
@@ -317,6 +312,13 @@ class Index {
 
  private:
   const Code& code() const { return avs::code(portable_); }
+
+  // Counts, normals, gradients, offsets, errors and places.
+  static nb::tuple patches(const PatchArrays& from) {
+    const size_t m = from.counts.size();
+    return nb::make_tuple(copied(from.counts, {m}), copied(from.normals, {m, 6, 6}), copied(from.gradients, {m, 6}),
+                          copied(from.offsets, {m, 6}), copied(from.errors, {m}), copied(from.places, {m, 3}));
+  }
 
   // The sums are about the model's centre c, the answer about {C}'s origin: p x n grows by c x n.
   void move_to_origin(const Sums& s, double* H, double* b) const {

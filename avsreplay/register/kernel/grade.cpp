@@ -10,47 +10,6 @@ namespace {
 constexpr double SIGMA_PER_MEDIAN = 1.4826;  // standard deviation over median |e| for a normal e
 constexpr double BEYOND = 9.0 * 6;           // squared step in standard deviations: three of each of six
 
-// The sums of the patches as arrays.
-struct Arrays {
-  std::vector<double> normals, gradients, offsets, errors, places;
-  std::vector<int64_t> counts;
-
-  explicit Arrays(const std::vector<PatchSums>& patches) {
-    const size_t m = patches.size();
-    normals.resize(36 * m), gradients.resize(6 * m), offsets.resize(6 * m), errors.resize(m), places.resize(3 * m), counts.resize(m);
-    for (size_t k = 0; k < m; ++k) {
-      const PatchSums& from = patches[k];
-      for (size_t r = 0; r < 6; ++r) {
-        std::copy(from.rows[r], from.rows[r] + 6, normals.data() + 36 * k + 6 * r);
-        gradients[6 * k + r] = from.rows[r][6], offsets[6 * k + r] = from.rows[r][7];
-      }
-      for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.last[a] / (double)from.points;
-      errors[k] = from.last[3], counts[k] = from.points;
-    }
-  }
-
-  // Leaves out the patches that give too much of the information on some motion.
-  void drop() {
-    std::vector<uint8_t> keep(counts.size(), 1);
-    drop_dominant(normals.data(), counts.data(), (int64_t)counts.size(), keep.data());
-    if (std::find(keep.begin(), keep.end(), 0) == keep.end()) return;
-    for (std::vector<double>* each : {&normals, &gradients, &offsets, &errors, &places}) only(keep, *each);
-    only(keep, counts);
-  }
-
-  int64_t size() const { return (int64_t)counts.size(); }
-
- private:
-  template <class T>
-  static void only(const std::vector<uint8_t>& keep, std::vector<T>& x) {
-    const size_t each = x.size() / keep.size();
-    size_t to = 0;
-    for (size_t k = 0; k < keep.size(); ++k)
-      if (keep[k]) std::copy(x.begin() + (int64_t)(each * k), x.begin() + (int64_t)(each * (k + 1)), x.begin() + (int64_t)(each * to++));
-    x.resize(each * to);
-  }
-};
-
 // The mean of J'J with rotations about the centre, in units of the rms radius.
 Six scaled_information(const Six& total, int64_t count, const double (&centre)[3]) {
   const double *c = centre, skew[3][3] = {{0, -c[2], c[1]}, {c[2], 0, -c[0]}, {-c[1], c[0], 0}};
@@ -100,7 +59,7 @@ bool is_bounded(const Six& P, double extent) {
 }
 
 // Covariance, test of halves and error of size.
-void measure(const Arrays& sums, const GradeRule& rule, Grade& out) {
+void measure(const PatchArrays& sums, const GradeRule& rule, Grade& out) {
   const int64_t directions = (int64_t)rule.across.size() / 3;
   const double* c = out.centre;
   PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
@@ -114,7 +73,39 @@ void measure(const Arrays& sums, const GradeRule& rule, Grade& out) {
   if (directions && !single) out.split = split(table, errors, rule.across.data(), directions);
 }
 
+// Leaves the entries of the patches that are kept.
+template <class T>
+void only(const std::vector<uint8_t>& keep, std::vector<T>& x) {
+  const size_t each = x.size() / keep.size();
+  size_t to = 0;
+  for (size_t k = 0; k < keep.size(); ++k)
+    if (keep[k]) std::copy(x.begin() + (int64_t)(each * k), x.begin() + (int64_t)(each * (k + 1)), x.begin() + (int64_t)(each * to++));
+  x.resize(each * to);
+}
+
 }  // namespace
+
+PatchArrays::PatchArrays(const std::vector<PatchSums>& patches) {
+  const size_t m = patches.size();
+  normals.resize(36 * m), gradients.resize(6 * m), offsets.resize(6 * m), errors.resize(m), places.resize(3 * m), counts.resize(m);
+  for (size_t k = 0; k < m; ++k) {
+    const PatchSums& from = patches[k];
+    for (size_t r = 0; r < 6; ++r) {
+      std::copy(from.rows[r], from.rows[r] + 6, normals.data() + 36 * k + 6 * r);
+      gradients[6 * k + r] = from.rows[r][6], offsets[6 * k + r] = from.rows[r][7];
+    }
+    for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.last[a] / (double)from.points;
+    errors[k] = from.last[3], counts[k] = from.points;
+  }
+}
+
+void PatchArrays::drop() {
+  std::vector<uint8_t> keep(counts.size(), 1);
+  drop_dominant(normals.data(), counts.data(), size(), keep.data());
+  if (std::find(keep.begin(), keep.end(), 0) == keep.end()) return;
+  for (std::vector<double>* each : {&normals, &gradients, &offsets, &errors, &places}) only(keep, *each);
+  only(keep, counts);
+}
 
 Grade grade(const Store& s, const Code& code, const View& v, const double* T, const GradeRule& rule, Team& team,
             const Matches* matches) {
@@ -128,7 +119,7 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   out.noise = rule.noise > 0 ? rule.noise : std::max(SIGMA_PER_MEDIAN * e.median, rule.noise_floor);
   std::copy(e.centre, e.centre + 3, out.centre);
   out.overlap = (double)e.inliers >= std::max(rule.least_inliers, rule.least_ratio * (double)e.points);
-  Arrays sums(e.patches);
+  PatchArrays sums(e.patches);
   double gradient[6] = {}, step[6] = {};
   for (int64_t p = 0; p < sums.size(); ++p)
     for (int i = 0; i < 6; ++i) gradient[i] += sums.gradients[(size_t)(6 * p + i)];
@@ -142,7 +133,10 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   out.total = total(sums.normals.data(), sums.size());
   if (!out.overlap) return out;
   out.observable = is_observable(out.total, out.used, out.centre, rule.least_information);
-  if (!out.observable) return out;
+  if (!out.observable) {
+    out.patches = std::move(sums);
+    return out;
+  }
   out.measured = true;
   measure(sums, rule, out);
   out.bounded = is_bounded(out.covariance.P, rule.extent);

@@ -18,12 +18,24 @@ struct GradeRule {
   std::vector<double> across;    // (k, 3) directions of the test of halves
 };
 
+// The sums of the patches as arrays.
+struct PatchArrays {
+  std::vector<double> normals, gradients, offsets, errors, places;  // (m, 6, 6), (m, 6), (m, 6), (m), (m, 3)
+  std::vector<int64_t> counts;
+
+  PatchArrays() = default;
+  explicit PatchArrays(const std::vector<PatchSums>& patches);
+  void drop();  // leaves out the patches that give too much of the information on some motion
+  int64_t size() const { return (int64_t)counts.size(); }
+};
+
 struct Grade {
   int64_t points = 0, inliers = 0, used = 0;  // used: in the patches that are not left out
   double rms, noise, centre[3];
   Six total;                     // of the normals of the patches used
   double statistic = 0;          // g' N^+ g / noise^2 of all patches
   bool overlap = false, observable = false;
+  PatchArrays patches;           // those used, where there is overlap but not every motion is observable
   bool measured = false;         // what follows is known: there is overlap, and every motion is observable
   bool bounded = true, beyond = false;  // standard deviations below the extent; the residuals ask for a step
   Estimated covariance;
