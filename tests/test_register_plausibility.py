@@ -94,6 +94,34 @@ def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(sur
         assert "contradicts the pose" in found.reason
 
 
+def test_a_surface_that_continues_beyond_an_edge_is_another_object() -> None:
+    """A longer box fits three faces of the model, a box behind an edge of the model does not continue them."""
+    made = [trimesh.creation.box(size) for size in ((2.0, 1.2, 0.8), (2.5, 1.2, 0.8), (0.8, 0.6, 0.7))]
+    made[1].apply_translation((0.25, 0.0, 0.0))
+    made[2].apply_transform(trimesh.transformations.euler_matrix(0.5, 0.4, 0.6)).apply_translation((1.3, 0.1, -0.2))
+    box, longer, other = (Surface(np.array(m.vertices), np.array(m.faces, dtype=np.int32), "", "") for m in made)
+    test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
+    T_ac, rng = Pose(exp(np.array([0.6, 0.5, 0.1])), np.array([0.0, 0.0, 8.0])), np.random.default_rng(SEED)
+    for measured, continued in (([box], False), ([longer], True), ([box, other], False)):
+        points = np.vstack([T_ac.apply(view(each, 1000, T_ac.inverse().t)) for each in measured])
+        scan = points + rng.normal(0.0, 0.003, points.shape)
+        assert test.continued(scan, T_ac.inverse()) is continued
+        assert (test.check(scan, T_ac.inverse()).reason != "") is continued
+
+
+def test_points_on_faces_that_face_away_from_the_camera_are_not_of_this_model() -> None:
+    """The near side of a plate is matched to the far side of a box, and its surroundings to nothing."""
+    made = trimesh.creation.box((2.0, 1.2, 0.8))
+    box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "", "")
+    test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
+    T_ac = Pose(exp(np.array([0.1, 0.2, 0.0])), np.array([0.0, 0.0, 8.0]))
+    rng = np.random.default_rng(SEED)
+    far = np.insert(rng.uniform([-0.9, -0.5], [0.9, 0.5], (800, 2)), 2, 0.4, axis=1)
+    beside = np.insert(rng.uniform([1.5, -0.5], [1.8, 0.5], (200, 2)), 2, 0.0, axis=1)
+    assert "face away" in test.check(T_ac.apply(np.vstack([far, beside])), T_ac.inverse()).reason
+    assert test.check(T_ac.apply(far), T_ac.inverse()).reason == ""  # perhaps the camera is not at the origin
+
+
 @pytest.mark.parametrize("guess_deg", [0.1, 3.0])
 def test_most_points_outliers(registrar: Registrar, surface: Surface, guess_deg: float) -> None:
     rng, T_ac = np.random.default_rng(SEED), example_pose()

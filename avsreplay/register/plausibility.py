@@ -19,6 +19,10 @@ the information of the contradictions and of that of everything without the poin
 are on it by chance. Model surface counts with as many points as the same area that is in the scan has. Free space and
 missing surface are known only if the position of the camera is (``Visibility.camera_c``).
 
+Two more contradictions do not depend on a direction. A surface of the scan that continues beyond an edge of the model,
+in the plane of its face, belongs to another object or to one of another size. A pose that matches most points to faces
+that face away from the camera is accepted only if nearly all points are on the model, as the camera may be elsewhere.
+
 The noise is the robust standard deviation of the distances to the model, from their smaller quantiles: correct for up
 to 60 % of outliers. A wrong pose spreads the distances, and above a limit no pose is accepted.
 """
@@ -35,9 +39,9 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.quality import Visibility, not_measured
-from avsreplay.register.sampling import sample
+from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.size import normal_jacobian
-from avsreplay.register.surface_index import SurfaceIndex, kernel_module
+from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
 
 SURFACE_POINTS = 1500
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
@@ -60,8 +64,11 @@ LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of 
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
 POINTS_PER_CELL = 8.0
 GRID = 4096
-NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
-AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
+BEYOND, MIRRORED = (2.0, 5.0), 2.0  # a point beyond an edge is so many widths away, and its image so many sigmas
+LEAST_BEYOND, MOST_CONTINUED = 10, 0.5  # a surface continues beyond an edge with so many points, and this share of them
+LEAST_IMAGE = 0.1  # least distance of an image from the face that counts as on it, in gates
+CONTINUED = "the surface in the scan continues beyond the edges of the model, as that of another or a larger object"
+TURNED_AWAY = "most points are on faces that face away from the camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +194,37 @@ class PlausibilityTest:
             reason = f"distances to the model spread by {noise:.3g} m"
         elif score > MOST_CONTRADICTED:
             reason = f"in one direction {100.0 * score:.0f} % contradicts the pose: {CONTRADICTIONS[kind]}"
+        elif camera_c is None:
+            away = self._visibility.may_be_camera(T_ca) and np.count_nonzero(on) < LEAST_ALONE * len(on)
+            reason = TURNED_AWAY if away else ""
+        elif self._continued(p, found, noise, camera_c):
+            reason = CONTINUED
         return Plausibility(noise, score, covered, reason)
+
+    def continued(self, points: NDArray[Any], T_ca: Pose) -> bool:
+        """Return whether the surface in a scan (n, 3) in {A} continues beyond the edges of the model at a pose.
+
+        Then the model is of another object or too small. False where the camera is not known.
+        """
+        camera_c = self._visibility.camera_c(self._index, points, T_ca)
+        if camera_c is None:
+            return False
+        found = self._index.closest(p := T_ca.apply(points), camera_c=camera_c, most_m=self._index.reach_m)
+        return self._continued(p, found, robust_noise(np.minimum(np.sqrt(found.d2), self._index.reach_m)), camera_c)
+
+    def _continued(self, p: Array, found: Closest, noise: float, camera_c: Array) -> bool:
+        """Whether most points (n, 3) in {C} just off the model lie on the continuation of a face beyond its edge.
+
+        The image of such a point in the closest point of the model lies on the face. That of a point of another object,
+        whose surface has another direction, does not.
+        """
+        width = max(self._gate, 3.0 * noise)
+        near = (found.d2 > (BEYOND[0] * width) ** 2) & (found.d2 < (BEYOND[1] * width) ** 2)
+        if np.count_nonzero(near) < LEAST_BEYOND:
+            return False
+        image = self._index.closest(2.0 * found.foot[near] - p[near], camera_c=camera_c, most_m=self._index.reach_m)
+        on = np.count_nonzero(image.d2 < max(MIRRORED * noise, LEAST_IMAGE * self._gate) ** 2)
+        return bool(on >= LEAST_BEYOND and on > MOST_CONTINUED * np.count_nonzero(near))
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the reach."""
@@ -286,46 +323,6 @@ class _Image:
         size = max(np.sqrt(area * POINTS_PER_CELL / len(plane)), 1e-9)
         k = np.minimum((plane - plane.min(axis=0)) / size, GRID - 1.0).astype(np.int64)
         return np.asarray(k[:, 0] * GRID + k[:, 1])
-
-
-class Rays:
-    """The points (n, 3) of a scan in {A} [m] by their directions.
-
-    Attributes:
-        points: those that are finite and not at the sensor, whose directions are not known.
-        ranges: (n,) [m].
-        tree: of the directions; None with too few.
-        spacing: angle between neighbouring rays [rad].
-    """
-
-    def __init__(self, points: Array) -> None:
-        """Find the directions and their spacing."""
-        ranges = np.linalg.norm(points, axis=1)
-        known = np.isfinite(ranges) & (ranges > 0.0)
-        self.points, self.ranges = points[known], ranges[known]
-        self.tree, self.spacing = None, np.inf
-        if len(self.points) <= NEIGHBOUR:
-            return
-        directions = self.points / self.ranges[:, None]
-        self.tree = kernel_module().PointTree(directions)
-        few = directions[:: max(1, len(directions) // SPACED)].copy()
-        apart = self.tree.query(few, k=NEIGHBOUR + 1)[0][:, -1]
-        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
-
-    def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return through which points (k, 3) in {A} rays passed, and which are in directions without rays.
-
-        Args:
-            points: where the model should be.
-            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind, and all are near.
-        """
-        far = np.linalg.norm(points, axis=1)
-        if self.tree is None or not len(points):
-            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-        angle, k = self.tree.query(points / far[:, None], k=AMONG)
-        empty = angle[:, 0] > EMPTY * self.spacing
-        near = angle[:, -1] < SURROUNDED * self.spacing
-        return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty
 
 
 def robust_noise(distance: Array) -> float:

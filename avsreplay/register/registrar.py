@@ -102,8 +102,8 @@ class Registrar:
         first = self._graded(scan, guess, budget, None, halves, carried, self._restarter.healthy)
         if first.status is AlignStatus.FAILED:
             return first
-        healthy = self._restarter.healthy(first.inlier_ratio, first.rms_m)
-        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, budget)
+        sound = self._restarter.sound(scan, first, budget)
+        found, searched = (first, False) if sound else self._recovered(scan, guess, first, halves, carried, budget)
         if self._far(guess, found) and not searched:
             found = self._searched(scan, found, carried, budget)
         elif not searched:

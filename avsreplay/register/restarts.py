@@ -29,6 +29,7 @@ POINTS = 1000  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
+COMPLETE = 0.985  # with more inliers too few points are left that could continue beyond an edge of the model
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
@@ -237,6 +238,14 @@ class Restarter:
         """Return whether an alignment is a close fit of nearly all points, which needs no further test."""
         return inlier_ratio >= LEAST_RATIO and rms_m <= POOR_OF_GATE * self._target.limits.gate_m
 
+    def sound(self, points: NDArray[Any], found: Alignment, budget: Budget) -> bool:
+        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues beyond the model."""
+        if not self.healthy(found.inlier_ratio, found.rms_m) or found.inlier_ratio >= COMPLETE:
+            return self.healthy(found.inlier_ratio, found.rms_m)
+        few = self.part(points)
+        budget.spend(MEASURED_WORK * len(few))
+        return not self._test.continued(few, found.T_ac.inverse())
+
     def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
         """Return whether an alignment may be a local minimum.
 
@@ -296,8 +305,8 @@ class Restarter:
                 break
             found.append(self.graduated(points, T_ca, start, budget))
             best = self.least(found)
-            if best is tested or not self._confirmed(best, found):
-                continue
+            if best is tested or not any(self.same(best.T_ca, each.T_ca) for each in found if each is not best):
+                continue  # not yet confirmed by a second start
             budget.spend(TEST_WORK)
             if not self._test.check(points, best.T_ca).reason:
                 break
@@ -307,10 +316,6 @@ class Restarter:
     def work(self, start_m: float) -> int:
         """Return the largest number of passes of one graduated registration."""
         return PASSES * len(self._stages[start_m])
-
-    def _confirmed(self, best: Restart, found: list[Restart]) -> bool:
-        """Whether two starts led to the best pose."""
-        return any(self.same(best.T_ca, other.T_ca) for other in found if other is not best)
 
     def least(self, found: list[Restart]) -> Restart:
         """Return the pose of least cost, but the first one if none has a clearly lower cost."""

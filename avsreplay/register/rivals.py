@@ -28,10 +28,10 @@ from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
 from avsreplay.register.neighbourhood import VALLEY_WORK
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.plausibility import EMPTY, PlausibilityTest, Rays
+from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
 from avsreplay.register.restarts import TEST_WORK
-from avsreplay.register.sampling import sample
+from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
 

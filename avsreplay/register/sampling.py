@@ -19,6 +19,8 @@ STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 NEIGHBOUR = 8
+EMPTY, SPACED = 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
+AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
 SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
@@ -216,3 +218,43 @@ def _without_plane(points: Array, width_m: float) -> Array:
         return points
     off: Array = points[np.abs(points @ normals[best] - offsets[best]) >= 2.0 * width_m]
     return off
+
+
+class Rays:
+    """The points (n, 3) of a scan in {A} [m] by their directions.
+
+    Attributes:
+        points: those that are finite and not at the sensor, whose directions are not known.
+        ranges: (n,) [m].
+        tree: of the directions; None with too few.
+        spacing: angle between neighbouring rays [rad].
+    """
+
+    def __init__(self, points: Array) -> None:
+        """Find the directions and their spacing."""
+        ranges = np.linalg.norm(points, axis=1)
+        known = np.isfinite(ranges) & (ranges > 0.0)
+        self.points, self.ranges = points[known], ranges[known]
+        self.tree, self.spacing = None, np.inf
+        if len(self.points) <= NEIGHBOUR:
+            return
+        directions = self.points / self.ranges[:, None]
+        self.tree = kernel_module().PointTree(directions)
+        few = directions[:: max(1, len(directions) // SPACED)].copy()
+        apart = self.tree.query(few, k=NEIGHBOUR + 1)[0][:, -1]
+        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
+
+    def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return through which points (k, 3) in {A} rays passed, and which are in directions without rays.
+
+        Args:
+            points: where the model should be.
+            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind, and all are near.
+        """
+        far = np.linalg.norm(points, axis=1)
+        if self.tree is None or not len(points):
+            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+        angle, k = self.tree.query(points / far[:, None], k=AMONG)
+        empty = angle[:, 0] > EMPTY * self.spacing
+        near = angle[:, -1] < SURROUNDED * self.spacing
+        return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty
