@@ -154,7 +154,7 @@ def patch_size(found: Evidence, extent_m: float, patch_m: float) -> tuple[float,
     """Return the size of the target over that of the model, less 1, and its standard error, from the sums of patches.
 
     The size is fitted with the pose by linear least squares, with a patch as one point for the size. The standard
-    error is the cluster-robust one over the patches. Both are 0 where a pose explains any size.
+    error is the cluster-robust one over the patches, infinite where a pose explains any size: three faces of a box.
 
     Args:
         found: sums at the registered pose.

@@ -79,7 +79,7 @@ def size_remark(size: SizeError | None, size_1s: float) -> str:
     """Return what a row says about the size: its error, or that the view does not show one of 3 %; "" for neither."""
     if size is not None or SIGMAS * size_1s <= UNSEEN_ERROR:
         return "" if size is None else size.message
-    return f"{SIZE_UNSEEN} below {100.0 * SIGMAS * size_1s:.1f} %"
+    return f"{SIZE_UNSEEN} below {100.0 * SIGMAS * size_1s:.1f} %" if size_1s < np.inf else SIZE_UNSEEN
 
 
 def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: Array | None) -> SizeError | None:

@@ -17,7 +17,7 @@ constexpr double LEAST_TERM = 1e-12;        // the series ends with terms below 
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
 constexpr double LEAST_DOF = 12, MOST_DOF = 1e6;  // of an estimated covariance
-constexpr double LEAST_OF_SIZE = 1e-6;      // least share of the effect of a size that the pose cannot explain
+constexpr double LEAST_OF_SIZE = 1.5e-3;    // least share of the effect of a size that the pose cannot explain; patches across an edge feign 1e-3
 constexpr double LEAST_LEFT = 0.2;          // a leverage above 0.8 enlarges the residual of a patch no further
 constexpr double TINY = std::numeric_limits<double>::min();
 
@@ -351,7 +351,7 @@ std::array<double, 2> size_error(const PatchTable& t) {
     for (int j = 0; j < 6; ++j) pose_of_size[i] += inverse.v[i][j] * A[j];
   free = F;
   for (int i = 0; i < 6; ++i) free -= pose_of_size[i] * A[i], size -= pose_of_size[i] * g[i];
-  if (!(free > LEAST_OF_SIZE * F)) return {0, 0};
+  if (!(free > LEAST_OF_SIZE * F)) return {0, std::numeric_limits<double>::infinity()};
   size /= free;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < 6; ++j) pose[i] += inverse.v[i][j] * (g[j] - size * A[j]);

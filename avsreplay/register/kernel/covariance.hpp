@@ -48,8 +48,8 @@ Estimated sandwich(const double* normals, const double* gradients, int64_t m);
 
 Systematic systematic_errors(const PatchTable& patches);
 
-// Size of the target over that of the model, less 1, fitted with the pose, and its standard error over the patches; 0 and 0
-// where the pose explains any size.
+// Size of the target over that of the model, less 1, fitted with the pose, and its standard error over the patches; 0 and
+// infinity where the pose explains any size, as for three faces of a box.
 std::array<double, 2> size_error(const PatchTable& patches);
 
 // The sandwich of what `errors` leave unexplained, and their variances.
