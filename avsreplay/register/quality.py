@@ -247,7 +247,7 @@ def grade(
     share = found.inliers / max(1, found.points)
     if P is not None and settled and systematic and _other_size(found) and (sized is None or sized(share, found.rms_m)):
         size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
-        P = P if size is None else P + np.outer(size.shift, size.shift)
+        P = P + np.outer(size.shift, size.shift) if size is not None and size.significant else P
     return Alignment(
         T_ac=T_ca.inverse(),
         iterations=fit.iterations,

@@ -68,18 +68,19 @@ class SizeError:
         """Whether delta is larger than 0.5 % and than four standard errors."""
         return abs(self.delta) > max(LEAST_ERROR, SIGMAS * self.sigma)
 
-    @property
-    def message(self) -> str:
-        """The text of the row's message."""
-        larger = "larger" if self.delta > 0.0 else "smaller"
-        return f"the scan fits a target {100.0 * abs(self.delta):.1f} % {larger} than the model"
-
 
 def size_remark(size: SizeError | None, size_1s: float) -> str:
-    """Return what a row says about the size: its error, or that the view does not show one of 3 %; "" for neither."""
-    if size is not None or SIGMAS * size_1s <= UNSEEN_ERROR:
-        return "" if size is None else size.message
-    return f"{SIZE_UNSEEN} below {100.0 * SIGMAS * size_1s:.1f} %" if size_1s < np.inf else SIZE_UNSEEN
+    """Return what a row says about the size: its error, or that the view does not show one of 3 %; "" for neither.
+
+    ``size``: the fit to the points, None if it was not made; ``size_1s``: standard error from the sums of patches.
+    """
+    if size is not None and size.significant:
+        larger = "larger" if size.delta > 0.0 else "smaller"
+        return f"the scan fits a target {100.0 * abs(size.delta):.1f} % {larger} than the model"
+    error = SIGMAS * max(size_1s, 0.0 if size is None else size.sigma)
+    if error <= UNSEEN_ERROR:
+        return ""
+    return f"{SIZE_UNSEEN} below {100.0 * error:.1f} %" if error < np.inf else SIZE_UNSEEN
 
 
 def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: Array | None) -> SizeError | None:
@@ -92,14 +93,13 @@ def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: 
         camera_c: (3,) position of the camera in {C} [m] if only faces towards it are matched.
 
     Returns:
-        The error without the bias of the noise; None if it is not significant.
+        The error, without the bias of the noise if it is significant; None without a fit.
     """
     rows = _fitted(index, T_ca.apply(points[:: max(1, len(points) // POINTS)]), camera_c)
     if rows is None or not (found := _size_of(index, rows)).significant:
-        return None
+        return None if rows is None else found
     bias = _bias_of(index, rows, camera_c)
-    both = SizeError(found.delta - bias, float(np.hypot(found.sigma, 0.5 * bias)), found.shift)
-    return both if both.significant else None
+    return SizeError(found.delta - bias, float(np.hypot(found.sigma, 0.5 * bias)), found.shift)
 
 
 @value_class
@@ -142,8 +142,7 @@ def fitted_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> SizeEr
     Returns:
         The fit, with the bias of the noise; None with fewer than 50 residuals, or if a pose explains any size.
     """
-    rows = _fitted(index, p, camera_c)
-    return None if rows is None else _size_of(index, rows)
+    return None if (rows := _fitted(index, p, camera_c)) is None else _size_of(index, rows)
 
 
 def _size_of(index: SurfaceIndex, rows: _Rows) -> SizeError:
@@ -165,8 +164,7 @@ def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
         The mean over noise of both signs, in which terms linear in the noise cancel. A fit that the noise prevents
         counts with the largest error; 0 if there is no fit without it.
     """
-    rows = _fitted(index, p, camera_c)
-    return 0.0 if rows is None else _bias_of(index, rows, camera_c)
+    return 0.0 if (rows := _fitted(index, p, camera_c)) is None else _bias_of(index, rows, camera_c)
 
 
 def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
