@@ -65,19 +65,22 @@ def errors(chart: Array) -> Array: ...
 def body(chart: Array, P: Array, largest: float) -> Array: ...
 def transition(chart: Array, h: float, path: Array) -> tuple[Array, Array]: ...
 def carry(
-    chart: Array,
-    base: Array,
+    charts: Array,
+    references: Array,
     P: Array,
     h: float,
     path: Array,
-    torque: tuple[float, float, float],
+    torque: float,
     force: float,
     q: Array,
     t: Array,
     root: Array,
     factors: tuple[float, float],
     weight: float,
-) -> tuple[Array, Array, Array, float, float]: ...
+) -> tuple[Array, Array, Array, Array]: ...
+def without_drift(
+    chart: Array, u: Array, onset: float, times: Array, centre: Array, q: Array, t: Array, back: bool
+) -> tuple[Array, Array]: ...
 def roots(C: Array) -> tuple[Array, Array]: ...
 def above(P: Array, least: float) -> bool: ...
 def impulses(

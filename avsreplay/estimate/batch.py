@@ -14,6 +14,7 @@ of the residuals, because those of registration are correlated.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,6 +101,13 @@ class Poses:
         """Some of measured poses."""
         shares = None if self.shares is None else self.shares[which]
         return Poses(self.times_s[which], self.q[which], self.t[which], self.C[which], shares=shares, arc=self.arc)
+
+    def moved(self, q: Array, t: Array) -> Poses:
+        """Other poses with the same instants and errors."""
+        out = copy(self)
+        object.__setattr__(out, "q", q)
+        object.__setattr__(out, "t", t)
+        return out
 
     def latest(self, count: int, epoch_s: float) -> Poses:
         """The last ``count`` poses, with times from ``epoch_s``."""

@@ -6,8 +6,6 @@ it. About this fit the problem is linear in the initial values, the acceleration
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,13 +15,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents, drive_of
-from avsreplay.estimate.dynamics import (
-    NO_DRIVE,
-    propagate_state,
-    ratios,
-    rotation_history,
-    translated,
-)
+from avsreplay.estimate.dynamics import translated
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.work import Parts
@@ -104,16 +96,9 @@ def without_drift(poses: Poses, about: Chart, onset_s: float, u: Array, back: bo
     They have the same errors in {C}, relative to free motion, as the poses relative to that with u. ``back``: the
     inverse.
     """
-    x, times = to_state(about), poses.times_s
-    since, late = np.maximum(times - onset_s, 0.0), times > onset_s
-    q_free, at = rotation_history(x, times).q, propagate_state(x, onset_s)[0]
-    q_driven, centre = q_free.copy(), translated(x, times, poses.arc)[0]
-    q_driven[late] = _motion.follow(at.q_ab, at.w_b, ratios(x.sigma), NO_DRIVE, since[late], drive_of(x, u))[0]
-    moved = centre + 0.5 * since[:, None] ** 2 * u[3:]
-    (q_from, r_from), (q_to, r_to) = ((q_free, centre), (q_driven, moved))[:: 1 if back else -1]
-    turn = geometry.multiply(q_to, geometry.conjugate(q_from))
-    away = (geometry.matrix(turn) @ (poses.t - r_from)[:, :, None])[:, :, 0]
-    return replace(poses, q=geometry.multiply(turn, poses.q), t=r_to + away)
+    centre = translated(to_state(about), poses.times_s, poses.arc)[0]
+    motions = about.flat, u, onset_s, poses.times_s, centre
+    return poses.moved(*_motion.without_drift(*motions, poses.q, poses.t, back))
 
 
 def equivalents(chart: Chart, times_s: Array, onset_s: float = 0.0, u: Array = NO_ACCELERATION) -> Array:

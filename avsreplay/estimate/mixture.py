@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -129,31 +128,31 @@ def carried(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         orbit: the relative orbit that the target is on; None for free motion.
     """
-    pair, found = (float(factors[0]), float(factors[1])), []
-    for c in components:
-        density = torque_density(to_state(c.chart).sigma, noise[0])
-        h = (t_ns - c.t_ns) * 1e-9
-        path = translation(h, None if orbit is None else orbit.at(c.t_ns))
-        chart, reference, P, chi2, log_det = _motion.carry(
-            c.chart.flat,
-            (c.reference or c.chart).flat,
-            c.P,
-            h,
-            path,
-            density,
-            noise[1] ** 2,
-            pose.q,
-            pose.t,
-            root,
-            pair,
-            weight,
-        )
-        after = Component(c.weight, c.quadrature, t_ns, Chart(chart), definite(P), c.share, Chart(reference))
-        found.append((after, chi2 + log_det))
-    best = min(value for _, value in found)
-    weights = [c.weight * math.exp(0.5 * (best - value)) for c, value in found]
+    h = (t_ns - components[0].t_ns) * 1e-9
+    charts, references, P, misfits = _motion.carry(
+        np.array([c.chart.flat for c in components]),
+        np.array([(c.reference or c.chart).flat for c in components]),
+        np.array([c.P for c in components]),
+        h,
+        translation(h, None if orbit is None else orbit.at(components[0].t_ns)),
+        noise[0],
+        noise[1] ** 2,
+        pose.q,
+        pose.t,
+        root,
+        (float(factors[0]), float(factors[1])),
+        weight,
+    )
+    found = misfits.tolist()
+    best = min(found)
+    weights = [c.weight * math.exp(0.5 * (best - value)) for c, value in zip(components, found, strict=True)]
     total = sum(weights)
-    return tuple(replace(c, weight=weight / total) for (c, _), weight in zip(found, weights, strict=True))
+    return tuple(
+        Component(
+            weights[k] / total, c.quadrature, t_ns, Chart(charts[k]), definite(P[k]), c.share, Chart(references[k])
+        )
+        for k, c in enumerate(components)
+    )
 
 
 def not_worse(

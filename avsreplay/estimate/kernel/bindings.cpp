@@ -404,20 +404,66 @@ nb::tuple transition_of(const Flat& from, double h, const Matrix<6, 6>& path) {
   return nb::make_tuple(flat(c), made(F));
 }
 
-// Chart and P (20, 20) h seconds later and corrected by a pose; its chi-square and the log determinant.
-nb::tuple carry_of(const Flat& from, const Flat& along, const Matrix<DIM, DIM>& P0, double h, const Matrix<6, 6>& path,
-                   const Three& torque, double force, const Vector<4>& q, const Vector<3>& p, const Matrix<SEEN, SEEN>& root, const Two& factors,
-                   double weight) {
-  Chart c = chart(from), base = chart(along);
-  Square P;
-  std::memcpy(P, P0.data(), sizeof P);
+// The poses (n) as they would be without an acceleration since an instant, or with it where `back`: turned and moved by
+// the difference of the two motions from a chart. `centre` is the centre of mass in free motion.
+nb::tuple without_drift(const Flat& from, const Vector<SEEN>& u, double onset, const Times& times, const Matrix<-1, 3>& centre,
+                        const Matrix<-1, 4>& q, const Matrix<-1, 3>& p, bool back) {
+  const size_t n = times.shape(0);
+  if (centre.shape(0) != n || q.shape(0) != n || p.shape(0) != n)
+    throw std::invalid_argument("times, centre, q and p must be equally many");
+  double *turned, *moved, t = 0;
+  Numpy qs = array({n, 4}, &turned), ps = array({n, 3}, &moved);
+  const State x = state_of(chart(from));
+  double join[3][2];
+  Body body = body_of(x, join), driven = body;
+  Turn free = turn_of(x), pushed = free;
+  for (size_t k = 0; k < n; t = times(k++)) {
+    advance(free, body, times(k) - t);
+    if (t <= onset && onset < times(k)) {
+      const V3 drive = matrix(quad(x.q_bc)) * vector(u.data());
+      advance(pushed, driven, onset - t);
+      std::memcpy(driven.drive, drive.x, sizeof driven.drive);
+      t = onset;
+    }
+    advance(pushed, driven, times(k) - t);
+    const double since = std::max(times(k) - onset, 0.0);
+    V3 away = 0.5 * since * since * vector(u.data() + 3), to = vector(centre.data() + 3 * k), was = to + away;
+    if (back) std::swap(to, was);
+    Quad turn = quad(free.q) * conjugate(quad(pushed.q));
+    if (back) turn = conjugate(turn);
+    const Quad seen = turn * quad(q.data() + 4 * k);
+    const V3 place = to + matrix(turn) * (vector(p.data() + 3 * k) - was);
+    std::memcpy(turned + 4 * k, &seen, sizeof seen);
+    std::memcpy(moved + 3 * k, place.x, sizeof place.x);
+  }
+  return nb::make_tuple(qs, ps);
+}
+
+// Of the components of a mixture: charts, references and P (n, 20, 20) h seconds later and corrected by a pose, and the
+// chi-square of the pose with the log determinant of its covariance (n).
+nb::tuple carry_of(const Matrix<-1, CHART>& from, const Matrix<-1, CHART>& along, const Matrix<-1, DIM, DIM>& P0, double h,
+                   const Matrix<6, 6>& path, double torque, double force, const Vector<4>& q, const Vector<3>& p,
+                   const Matrix<SEEN, SEEN>& root, const Two& factors, double weight) {
+  const size_t n = from.shape(0);
+  if (along.shape(0) != n || P0.shape(0) != n) throw std::invalid_argument("charts and covariances must be equally many");
+  double *charts, *references, *P, *misfit, density[3], told[2];
+  Numpy first = array({n, (size_t)CHART}, &charts), second = array({n, (size_t)CHART}, &references);
+  Numpy third = array({n, (size_t)DIM, (size_t)DIM}, &P), last = array({n}, &misfit);
+  std::memcpy(charts, from.data(), n * sizeof(Chart));
+  std::memcpy(references, along.data(), n * sizeof(Chart));
+  std::memcpy(P, P0.data(), n * sizeof(Square));
   Measured pose = {};
   std::memcpy(&pose.q, q.data(), sizeof pose.q);
   std::memcpy(&pose.p, p.data(), sizeof pose.p);
   std::memcpy(pose.root, root.data(), sizeof pose.root);
-  double told[2];
-  carry(c, base, P, h, as<double[6][6]>(path.data()), torque.data(), force, pose, factors.data(), weight, told);
-  return nb::make_tuple(flat(c), flat(base), made(P), told[0], told[1]);
+  for (size_t k = 0; k < n; ++k) {
+    Chart& one = reinterpret_cast<Chart*>(charts)[k];
+    torque_density(state_of(one), torque, density);
+    carry(one, reinterpret_cast<Chart*>(references)[k], reinterpret_cast<Square*>(P)[k], h,
+          as<double[6][6]>(path.data()), density, force, pose, factors.data(), weight, told);
+    misfit[k] = told[0] + told[1];
+  }
+  return nb::make_tuple(first, second, third, last);
 }
 
 // Of covariances C (n, 6, 6): roots (n, 6, 6) with root C root' = 1, and the inverses (n, 2, 3, 3) of the diagonal blocks.
@@ -551,8 +597,10 @@ NB_MODULE(_motion, m) {
   m.def("errors", &errors, nb::arg("chart"));
   m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
-  m.def("carry", &carry_of, nb::arg("chart"), nb::arg("base"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
+  m.def("carry", &carry_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
+  m.def("without_drift", &without_drift, nb::arg("chart"), nb::arg("u"), nb::arg("onset"), nb::arg("times"), nb::arg("centre"),
+        nb::arg("q"), nb::arg("t"), nb::arg("back"));
   m.def("roots", &roots_of, nb::arg("C"));
   m.def("above", &above_of, nb::arg("P"), nb::arg("least"));
   m.def("impulses", &impulses, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"),

@@ -106,6 +106,13 @@ Body body_of(const State& x, double join[3][2]) {
   return {{a, b, -(a + b) / one}, {0, 0, 0}, DERIVATIVE_TAIL};
 }
 
+void torque_density(const State& x, double torque, double density[3]) {
+  const double s1 = x.sigma[0], s2 = x.sigma[1];
+  const double B[3] = {1 + (2 + s1 * s2 + s1) / (1 - s2), 1 + (2 + s1 * s2 - s2) / (1 + s1),
+                       1 + (2 + s1 - s2) / (1 + s1 * s2)};
+  for (int k = 0; k < 3; ++k) density[k] = torque == 0 ? 0 : (torque * B[k]) * (torque * B[k]);
+}
+
 // d = [theta; v] in {C}: estimated relative to measured pose. Returns chi-square.
 double Problem::residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const {
   const V3 theta = rotation_vector(conjugate(pose.q) * (quad(turn.q) * quad(x.q_bc)));

@@ -154,6 +154,9 @@ void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6
 Turn turn_of(const State& x);
 Body body_of(const State& x, double join[3][2]);
 
+// The variance that the disturbance torque of a root density adds to the rate per second: diagonal of torque^2 B B'.
+void torque_density(const State& x, double torque, double density[3]);
+
 // Variances of the grasp point's position, velocity and half-angle attitude t seconds after the state x with covariance
 // P, `flow` being the rotation since x.
 void forecast(const State& x, const Square P, double force_density, double t, const Flow& flow, double variances[3]);
