@@ -22,11 +22,9 @@ from typing import IO, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
 
-STDOUT = Path("-")
-_NAME_BYTES = 255
+STDOUT, _NAME_BYTES = Path("-"), 255
 _PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
-_CLEANED: set[Path] = set()
-_COUNTER = itertools.count()
+_CLEANED, _COUNTER = set[Path](), itertools.count()
 
 
 def is_stream(path: Path) -> bool:
@@ -247,6 +245,8 @@ def _publish(part: Path, place: Path, overwrite: bool) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> UnreadableInput:
+    if _PART.fullmatch(path.parent.name):  # the final name of a folder, not the temporary one
+        path = path.parent.with_name(path.parent.name[1:].rsplit(".", 3)[0]) / path.name
     hint = "nothing was changed; check the folder, its rights and its space"
     return UnreadableInput(f"cannot be written: {error.strerror or error}", where=str(path), hint=hint)
 

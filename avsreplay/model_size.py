@@ -88,7 +88,7 @@ def compare_sizes(
     if not clouds:
         cropped = options.crop_range is not None or options.crop_box is not None
         empty = "no points are left in the examined scans; widen the crop"
-        return [Advice("check", "scans", empty if cropped else "the examined scans hold no points")]
+        return [Advice("check", "scans", empty if cropped else "the examined scans hold fewer than ten points")]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
         text = f"there is no model; the scans measure {_metres(scan_m)}"

@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import click
@@ -148,6 +149,23 @@ def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_fo
     header = json.loads((result / "run.json").read_text())
     assert header["interrupted_after"] == len(rows) >= 28
     assert not (result / "resume.bin").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_sigterm_keeps_the_scans_so_far_and_leaves_no_temporary_file(fixtures_folder, tmp_path):
+    result = tmp_path / "result"
+    command = [sys.executable, "-m", "avsreplay", "run", str(fixtures_folder / "spin-raster.mcap"), "-o", str(result)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not any(tmp_path.glob(".result.*.part/result.mcap")):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=120)
+    assert process.returncode == 143, err
+    assert err.splitlines()[-1] == "avsreplay: interrupted"
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["result"])  # nothing before the first scan
+    if result.exists():
+        assert json.loads((result / "run.json").read_text())["interrupted_after"] >= 1
 
 
 def test_a_closed_standard_input_is_one_line(monkeypatch):

@@ -57,6 +57,16 @@ def grown(fixes: tuple[PoseFix, ...], *counts: int):
     return poses, fitted, prior
 
 
+def test_poses_almost_at_one_instant_do_not_determine_the_first_rate() -> None:
+    """Stamps that step back are replaced by times 1 ns after the one before: a difference of poses is no rate then."""
+    world = tumbling.draw(3, mu_deg=80.0, seconds=10.0)
+    first, second, *others = seen(world, 3, rot_deg=0.1)[:6]
+    fixes = (first, second, *(replace(fix, t_ns=second.t_ns + k) for k, fix in enumerate(others, 1)))
+    found, expected = rough_state(fixes), rough_state((first, second))
+    assert np.linalg.norm(found.w_b) < 10.0 * np.linalg.norm(expected.w_b)
+    assert np.linalg.norm(found.v_a) < 10.0 * np.linalg.norm(expected.v_a)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_chart_and_state_are_inverse(seed: int) -> None:
     x = tumbling.draw(seed, mu_deg=80.0, seconds=1.0).states[0]

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -67,6 +68,16 @@ def test_a_full_disk_is_one_line_and_keeps_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(UnreadableInput, match="No space left on device; nothing was changed"), output_path(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert path.read_text() == "old"
+
+
+def test_an_error_in_a_file_of_a_folder_names_the_folder_and_not_its_temporary_name(tmp_path: Path) -> None:
+    with (
+        pytest.raises(UnreadableInput, match=rf"{re.escape(str(tmp_path / 'result' / 'a.txt'))}: cannot be written"),
+        output_folder(tmp_path / "result") as part,
+        output_path(part / "a.txt"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
 
 
 @posix

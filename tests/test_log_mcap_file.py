@@ -124,6 +124,16 @@ def test_inserted_or_removed_bytes_damage_one_place(
         assert losses
 
 
+def test_a_second_log_behind_the_first_one_is_a_loss(whole: dict[str, Path], tmp_path: Path) -> None:
+    data, other = whole["none"].read_bytes(), whole["lz4"].read_bytes()
+    for behind, count in ((other, 1), (bytes(1000), 0)):
+        (tmp_path / "joined.mcap").write_bytes(data + behind)
+        found, losses = read(tmp_path / "joined.mcap")
+        assert len(found) == len(CLOUDS)
+        assert all(map(same, found))
+        assert [(loss.offset, loss.bytes) for loss in losses] == [(len(data), len(other))] * count
+
+
 def test_a_lost_first_chunk_keeps_the_topics_of_the_summary(whole: dict[str, Path], tmp_path: Path) -> None:
     begin, end = chunks(whole["zstd"])[0]
     found, losses = read(flipped(whole["zstd"], tmp_path / "x.mcap", (begin + end) // 2))

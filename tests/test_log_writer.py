@@ -208,6 +208,15 @@ def test_a_full_disk_keeps_the_complete_chunks(tmp_path: Path, monkeypatch: pyte
     assert all(a.points.tobytes() == b.points.tobytes() for a, b in zip(back, clouds, strict=False))
 
 
+def test_a_full_disk_leaves_no_file_without_a_complete_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "open", lambda self, mode="r": _Full(io.FileIO(self, mode)))
+    monkeypatch.setattr(_Full, "room", 10)
+    with pytest.raises(UnreadableInput, match="No space left on device; nothing is kept"):
+        LogWriter(tmp_path / "a.mcap", LogHeader())
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_float64_points_are_preserved(tmp_path: Path) -> None:
     cloud = np.random.Generator(np.random.PCG64(5)).normal(size=(50, 3))
     with LogWriter(tmp_path / "a.mcap", LogHeader(), point_type="float64") as writer:

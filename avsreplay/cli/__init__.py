@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import io
 import os
+import signal
 import sys
 import tempfile
 import traceback
@@ -64,7 +65,8 @@ Examples:
 \b
 Exit codes: 0 ok, 1 the requested check failed, 2 usage, 3 a file cannot
             be read or written, 4 finished but data was lost, 70 internal
-            error, 130 interrupted, 141 standard output was closed."""
+            error, 130 interrupted (129 and 143 by SIGHUP and SIGTERM), 141
+            standard output was closed."""
 
 
 class _Commands(click.Group):
@@ -220,7 +222,7 @@ def entry_point() -> None:
     """Run a command of the arguments of this process and exit with its code; every error is one line on stderr."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
-    output = _standard_output()
+    output, received = _standard_output(), _end_as_interrupt()
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:
@@ -231,7 +233,7 @@ def entry_point() -> None:
     except click.ClickException as error:
         code = _fail(_with_help(error), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        code = _fail("interrupted", 130)
+        code = _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
     except OSError as error:
         code = _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
     except Exception as error:
@@ -242,6 +244,22 @@ def entry_point() -> None:
         closed = isinstance(output.failure, BrokenPipeError)
         code = 141 if closed else _fail(f"standard output: {output.failure.strerror or output.failure}", 3)
     sys.exit(code)
+
+
+def _end_as_interrupt() -> list[int]:
+    """Let SIGTERM and SIGHUP, unless they are ignored, act as Ctrl-C; the returned list receives their numbers."""
+    received: list[int] = []
+
+    def interrupt(number: int, _frame: object) -> None:
+        received.append(number)
+        signal.raise_signal(signal.SIGINT)
+
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP; a thread other than the main one sets no handler
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            with contextlib.suppress(ValueError):
+                signal.signal(number, interrupt)
+    return received
 
 
 def _with_help(error: click.ClickException) -> str:

@@ -216,8 +216,9 @@ def rough_state(fixes: tuple[PoseFix, ...]) -> State:
 
 
 def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
-    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``."""
-    found = [mean_rates((a, b)) for a, b in zip(fixes, fixes[apart:], strict=False)]
+    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``, without those almost at one instant."""
+    least = 1e-3 * (fixes[-1].t_ns - fixes[0].t_ns) / max(1, len(fixes) - 1)
+    found = [mean_rates((a, b)) for a, b in zip(fixes, fixes[apart:], strict=False) if b.t_ns - a.t_ns >= least]
     return np.median([w for w, _ in found], axis=0), np.median([v for _, v in found], axis=0)
 
 

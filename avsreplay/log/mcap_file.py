@@ -113,11 +113,25 @@ class McapFile(Recording):
         self._settle()
         if len(self.losses) >= _MAX_LOSSES:
             self._lose(Loss("damaged at too many places: the rest is not read", at, self._size - at))
-        elif not (self.closed_properly or self._open_end):
+        elif self.closed_properly:
+            self._after_end(self.data_end[0] + 13)
+        elif not self._open_end:
             self._lose(
                 Loss("the file was not closed: messages that its recorder had not yet written are lost", self._size, 0)
             )
         self._account(summary)
+
+    def _after_end(self, at: int) -> None:
+        """List a second log behind the footer of this one, as in two files that were joined."""
+        opcode = mcap.DATA_END
+        while opcode != mcap.FOOTER and at + 9 <= self._size:
+            head = self._file.read(at, 9)
+            opcode, at = head[0], at + 9 + int.from_bytes(head[1:], "little")
+        end = at + len(mcap.MAGIC)
+        if end + 8 <= self._size and self._file.read(end, 8) == mcap.MAGIC:
+            self._lose(
+                Loss("another log follows the end of this one: replay each file by itself", end, self._size - end)
+            )
 
     def _step(self, at: int, summary: SummarySection) -> int:
         """Process one record and return the offset of the next one."""

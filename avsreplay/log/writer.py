@@ -312,8 +312,8 @@ class LogWriter:
 
     def _broken(self, why: str) -> None:
         self._keep_complete()
-        place = "" if self._pipe else f"{self._complete} complete bytes are kept in {self._partial}"
-        hint = place or "check its reader"
+        kept = f"{self._complete} complete bytes are kept in {self._partial}" if self._complete else "nothing is kept"
+        hint = "check its reader" if self._pipe else kept
         raise UnreadableInput(f"cannot be written: {why}", where=str(self._path), hint=hint) from None
 
     def _keep_complete(self) -> None:
@@ -324,6 +324,8 @@ class LogWriter:
             self._stream.close()
         if not self._pipe and self._partial.is_file():
             os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
+            if not self._complete and not self._direct:
+                self._partial.unlink()
 
     def _discard(self) -> None:
         with contextlib.suppress(OSError):
