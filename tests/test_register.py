@@ -421,12 +421,29 @@ def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.nda
     assert Visibility(inward).camera_c(model, scan, T_ca) is None
 
 
-def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_rejected(surface: Surface) -> None:
+def test_an_origin_inside_the_model_or_behind_the_measured_sides_is_no_camera(surface: Surface) -> None:
     model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
     near = view(surface, 3000, T_ca.t)
     assert Visibility(surface).camera_c(model, near, Pose.identity()) is None
     behind = view(surface, 3000, -T_ca.t)  # the sides that a camera on the other side would see
     assert Visibility(surface).camera_c(model, example_pose().apply(behind), T_ca) is None
+
+
+@pytest.mark.parametrize("distance", [0.3, 0.8])
+def test_a_camera_beside_the_target_sees_one_side_of_a_panel(distance: float) -> None:
+    """With both sides of it, noise as large as the panel is thick would move the pose towards its middle."""
+    parts = [box([-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]), box([1.0, -0.5, 0.1], [4.0, 0.5, 0.12])]
+    vertices = np.concatenate([part.vertices for part in parts])
+    surface = Surface(vertices, np.concatenate([parts[0].faces, parts[1].faces + 8]), "box and panel", "")
+    eye = np.array([2.0, -1.8, 0.6 + distance])
+    ideal, rng, chi2 = view(surface, 9000, eye) - eye, _rng(), []
+    for _ in range(4):
+        scan = ideal * (1.0 + rng.normal(0, 0.02, (len(ideal), 1)) / np.linalg.norm(ideal, axis=1, keepdims=True))
+        found = Registrar(surface).register(scan, Pose(geometry.IDENTITY_QUAT, -eye))
+        error = found.T_ac.inverse() @ Pose(geometry.IDENTITY_QUAT, -eye)
+        d = np.concatenate([geometry.log(error.q), error.t])
+        chi2.append(d @ np.linalg.solve(found.covariance, d))
+    assert sum(chi2) < 58.61  # 99.99 % point of chi-square with 24 degrees of freedom
 
 
 def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.ndarray) -> None:

@@ -32,6 +32,7 @@ from avsreplay.register.surface_index import Closest, SurfaceIndex
 
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
+LEAST_SEEN, NEAR_FACE_OF_EXTENT = 0.85, 0.01  # share of points so near to a face towards a camera close to the model
 FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
 TESTED_POINTS = 200
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
@@ -52,9 +53,9 @@ class Visibility:
     thickness of the panel, the measured front is next to the back of the model, and plain ICP converges there: on the
     built-in target, started 3 deg and 5 cm off, in every third view.
 
-    AUTO applies it if the mesh has a closed part, encloses a positive volume, and the origin of
-    {A} is at least a quarter of the extent outside the bounding box of the model. If fewer than 40 % of the closest
-    faces of the scan face the origin, the camera was elsewhere and both sides are matched.
+    AUTO applies it if the mesh has a closed part and encloses a positive volume. If fewer than 40 % of the closest faces
+    of the scan face the origin of {A}, the camera was elsewhere and both sides are matched. Nearer to the bounding box
+    of the model than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
 
     Attributes:
         sided: the faces of this surface have a known outer side.
@@ -78,16 +79,25 @@ class Visibility:
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
-        faces = self.may_be_camera(T_ca) and index.faces_camera(points, T_ca, TESTED_POINTS, LEAST_FACING)
+        faces = self.faced(index, points, T_ca) and index.faces_camera(points, T_ca, TESTED_POINTS, LEAST_FACING)
         return T_ca.t if faces else None
 
     def distances(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, most_m: float) -> tuple[Array, int]:
         """Return the distances (n,) [m] of a scan to the faces that the camera sees, at most ``most_m``; the work."""
-        return index.distances(points, T_ca, most_m, self.may_be_camera(T_ca), TESTED_POINTS, LEAST_FACING)
+        return index.distances(points, T_ca, most_m, self.faced(index, points, T_ca), TESTED_POINTS, LEAST_FACING)
 
     def may_be_camera(self, T_ca: Pose) -> bool:
-        """Return whether the test can apply: the outer sides are known, and the origin of {A} is clear of the model."""
+        """Return whether the outer sides are known, and the origin of {A} is clear of the bounding box of the model."""
         return self.sided and self._clear(T_ca.t)
+
+    def faced(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> bool:
+        """Return whether the test can apply to a scan (n, 3): ``may_be_camera``, or nearly all its faces are seen."""
+        if not self.sided or self._clear(T_ca.t):
+            return self.sided
+        few, near = T_ca.apply(points[:: max(1, len(points) // TESTED_POINTS)]), NEAR_FACE_OF_EXTENT * self._extent
+        every, seen = (np.sqrt(index.closest(few, camera_c=eye).d2) for eye in (None, T_ca.t))
+        on = every < index.reach_m
+        return int(np.count_nonzero(seen[on] < every[on] + near)) >= LEAST_SEEN * max(1, int(np.count_nonzero(on)))
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
         """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin; None if the camera is not there."""
@@ -295,7 +305,7 @@ def _grade(
 ) -> PoseQuality:
     """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the test of halves."""
     extent = index.extent_m
-    camera = (visibility.may_be_camera(fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
+    camera = (visibility.faced(index, points, fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
     noise = (params.noise_m or 0.0, NOISE_FLOOR_OF_GATE * gate_m)
     overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
     step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
