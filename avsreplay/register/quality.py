@@ -53,9 +53,9 @@ class Visibility:
     thickness of the panel, the measured front is next to the back of the model, and plain ICP converges there: on the
     built-in target, started 3 deg and 5 cm off, in every third view.
 
-    AUTO applies it if the mesh has a closed part and encloses a positive volume. If fewer than 40 % of the closest faces
-    of the scan face the origin of {A}, the camera was elsewhere and both sides are matched. Nearer to the bounding box
-    of the model than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
+    AUTO applies it if the mesh has a closed part and encloses a positive volume. If fewer than 40 % of the closest
+    faces of the scan face the origin of {A}, the camera was elsewhere and both sides are matched. Nearer to the
+    bounding box of the model than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
 
     Attributes:
         sided: the faces of this surface have a known outer side.
