@@ -55,7 +55,7 @@ class Visibility:
 
     AUTO applies it if the mesh has a closed part and encloses a positive volume. If fewer than 40 % of the closest
     faces of the scan face the origin of {A}, the camera was elsewhere and both sides are matched. Nearer to the
-    bounding box of the model than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
+    bounding box than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
 
     Attributes:
         sided: the faces of this surface have a known outer side.
