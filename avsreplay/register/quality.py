@@ -88,11 +88,13 @@ class Visibility:
 
     def may_be_camera(self, T_ca: Pose) -> bool:
         """Return whether the outer sides are known, and the origin of {A} is clear of the bounding box of the model."""
-        return self.sided and self._clear(T_ca.t)
+        low, high, clear = self._box
+        outside = np.maximum(np.maximum(low - T_ca.t, T_ca.t - high), 0.0)
+        return self.sided and float(np.linalg.norm(outside)) >= clear
 
     def faced(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether the test can apply to a scan (n, 3): ``may_be_camera``, or nearly all its faces are seen."""
-        if not self.sided or self._clear(T_ca.t):
+        if not self.sided or self.may_be_camera(T_ca):
             return self.sided
         few, near = T_ca.apply(points[:: max(1, len(points) // TESTED_POINTS)]), NEAR_FACE_OF_EXTENT * self._extent
         every, seen = (np.sqrt(index.closest(few, camera_c=eye).d2) for eye in (None, T_ca.t))
@@ -107,11 +109,6 @@ class Visibility:
             return None
         direction: Array = -centre / distance
         return direction
-
-    def _clear(self, camera_c: Array) -> bool:
-        low, high, clear = self._box
-        outside = np.maximum(np.maximum(low - camera_c, camera_c - high), 0.0)
-        return float(np.linalg.norm(outside)) >= clear
 
 
 @value_class
