@@ -226,7 +226,8 @@ def grade(
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
     found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic)
-    if found.overlap and _same(fit.T_ca, guess) and found.statistic > UNCHANGED:
+    same = guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes()
+    if found.overlap and same and found.statistic > UNCHANGED:
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(failed, message="returned its guess unchanged, although the residuals require a step")
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
@@ -283,10 +284,6 @@ def _message(settled: bool, size: SizeError | None, size_1s: float) -> str:
     if not settled:
         return "the back end reports convergence, but its pose is not at a minimum of the distances"
     return size_remark(size, size_1s)
-
-
-def _same(T_ca: Pose, guess: Pose | None) -> bool:
-    return guess is not None and (T_ca.q.tobytes(), T_ca.t.tobytes()) == (guess.q.tobytes(), guess.t.tobytes())
 
 
 def _grade(
