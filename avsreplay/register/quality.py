@@ -107,8 +107,7 @@ class Visibility:
         distance = float(np.linalg.norm(centre))
         if not self._known or distance < FAR_OF_EXTENT * self._extent:
             return None
-        direction: Array = -centre / distance
-        return direction
+        return frozen(-centre / distance)
 
 
 @value_class
@@ -187,8 +186,7 @@ def instants(
     times = np.asarray(times_s, dtype=np.float64)
     mean = float(times.mean()) if len(times) else 0.0
     J = normal_jacobian(moved[near], found.normal[near])
-    M: Array = mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
-    return M
+    return frozen(mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J))
 
 
 def _matched(
