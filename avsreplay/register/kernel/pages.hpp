@@ -26,18 +26,19 @@ inline void keep_freed_memory() {
 template <class T>
 struct Pages {
   using value_type = T;
-  static constexpr std::size_t CACHE_LINE = 64, HUGE_PAGE = std::size_t{1} << 21, LARGE_ARRAY = 2 * HUGE_PAGE;
+  static constexpr std::size_t CACHE_LINE = 64, HUGE_PAGE = std::size_t{1} << 21, LARGE_ARRAY = HUGE_PAGE / 2;
 
   Pages() = default;
   template <class U>
   Pages(const Pages<U>&) {}
 
   static std::size_t alignment(std::size_t n) { return n * sizeof(T) < LARGE_ARRAY ? CACHE_LINE : HUGE_PAGE; }
+  static std::size_t bytes(std::size_t n) { return (n * sizeof(T) + alignment(n) - 1) / alignment(n) * alignment(n); }
 
   T* allocate(std::size_t n) {
-    void* p = ::operator new(n * sizeof(T), std::align_val_t(alignment(n)));
+    void* p = ::operator new(bytes(n), std::align_val_t(alignment(n)));
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    if (alignment(n) == HUGE_PAGE) ::madvise(p, n * sizeof(T), MADV_HUGEPAGE);
+    if (alignment(n) == HUGE_PAGE) ::madvise(p, bytes(n), MADV_HUGEPAGE);
 #endif
     return static_cast<T*>(p);
   }

@@ -275,10 +275,7 @@ class Search {
 
   // The room of the lane in its block, which has this room.
   float in_block(float block) const {
-    float lanes[LANES], second = FAR;
-    store8(lanes, first_lanes_);
-    for (int k = 0; k < LANES; ++k)
-      if (k != lane_ % LANES && lanes[k] < second) second = lanes[k];
+    const float second = least(select(expand(0xffu & ~(1u << lane_ % LANES)), first_lanes_, f8(FAR)));
     return second < first_ ? 0.f : std::min(block, half(std::sqrt(first_), std::sqrt(second)));
   }
 
