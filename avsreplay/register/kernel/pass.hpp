@@ -45,8 +45,8 @@ static void read(const View& v, int64_t first, int n, const double* T, Strip& c)
 
 static inline Treat treat(const Kept& k, const Strip& c, int i) {
   const double x = c.c[0][i] - k.x, y = c.c[1][i] - k.y, z = c.c[2][i] - k.z, moved2 = x * x + y * y + z * z;
-  if (moved2 < (double)k.radius2) return KEPT;
-  return moved2 < (double)k.block2 ? IN_BLOCK : moved2 < (double)k.pair2 ? IN_PAIR : SEARCHED;
+  // Without branches, which could not be predicted: a room is at least as large as those inside it.
+  return (Treat)(SEARCHED + (moved2 < (double)k.pair2) + (moved2 < (double)k.block2) + (moved2 < (double)k.radius2));
 }
 
 // Moves a strip and decides what is searched. Returns how many of the points are not finite.

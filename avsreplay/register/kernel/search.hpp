@@ -201,14 +201,12 @@ class Search {
     const unsigned may = o_.facing.may[block], sure = o_.facing.sure[block];
     if (may != 0xffu) d = select(expand(may), d, f8(FAR));
     const float nearest = least(d);
-    if (nearest < first_) {
-      third_ = other_, other_ = first_, other_block_ = first_block_;
-      first_ = nearest, first_block_ = block, first_lanes_ = d;
-    } else if (nearest < other_) {
-      third_ = other_, other_ = nearest, other_block_ = block;
-    } else {
-      third_ = nearest < third_ ? nearest : third_;
-    }
+    // Without branches, which could not be predicted.
+    const bool is_first = nearest < first_, is_other = nearest < other_;
+    third_ = smaller(third_, larger(other_, nearest)), other_ = smaller(other_, larger(first_, nearest)), first_ = smaller(first_, nearest);
+    other_block_ = is_first ? first_block_ : is_other ? block : other_block_;
+    first_block_ = is_first ? block : first_block_;
+    first_lanes_ = select(expand(is_first ? 0xffu : 0u), d, first_lanes_);
     if (!(nearest < exact_)) return;
     if (sure == may)
       tighten(nearest);
@@ -280,6 +278,9 @@ class Search {
   }
 
   float half(float nearest, float next) const { return 0.5f * (next - nearest) - 3.f * s_.slack; }
+
+  static float smaller(float a, float b) { return b < a ? b : a; }
+  static float larger(float a, float b) { return a < b ? b : a; }
 
   static constexpr float FAR = 3e38f;
   static constexpr int MOST_WAITING = 8;
