@@ -185,13 +185,17 @@ def _errors(
     args: argparse.Namespace,
 ) -> dict[str, tuple[float, float]]:
     """The error of each method in the motions that `register` reports as determined by this view."""
-    scan, truth = look(mesh, args.scan, start[0], side, lambda eye, rays: registrar.index.cast(eye, rays)[0])
+    scan, truth = look(mesh, args.scan, start[0], side, partial(_ranges, registrar))
     guess = off(truth, *start[1:], 100 + side)
     found = registrar.register(scan, guess.inverse())
     kinds = ("GICP", "PLANE_ICP")
     makers = {kind: partial(small_gicp, points, scan, guess, kind, 200, EPS_RAD) for kind in kinds}
     poses = {"register": found.T_ac.inverse().matrix, **{name: case.run()[0] for name, case in peers(makers)}}
     return {name: determined_error(T_ca, truth, found.free, mesh.extent) for name, T_ca in poses.items()}
+
+
+def _ranges(registrar: Registrar, eye: Array, rays: Array) -> Array:
+    return registrar.index.cast(eye, rays)[0]
 
 
 def _median(x: Array) -> str:
@@ -314,8 +318,9 @@ def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
             f"\n{mesh.name}: {len(mesh.faces)} triangles, index {built:.2f} s ({clock:.2f} s by the clock, 2 threads)"
         )
         one, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
+        cast = partial(_ranges, one)
         for n in (1_000, 4_000) if args.quick else (1_000, 10_000, 100_000, 1_000_000):
-            scan, truth = look(mesh, n, 0.0, 3)
+            scan, truth = look(mesh, n, 0.0, 3, cast)
             guess = off(truth, 3.0, 0.05, 4)
             cases = {"1": Case(registered(one, scan, guess)), "2": Case(registered(two, scan, guess))}
             cases["align"] = Case(aligned(one, scan, guess))
@@ -331,25 +336,25 @@ def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 
 def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Grading a registration with the neighbours that the alignment kept, and without them."""
-    spacecraft = [shared("spacecraft-meshes", "HST.obj"), shared("stanford-bunny", "bun_zipper.ply")]
-    for mesh in (surface, *(scaled(m) for m in spacecraft if m is not None)):
+    """The parts of `register` in tracking; the quality of the pose also without the neighbours that `align` kept."""
+    for mesh in [*real_meshes(surface, args), stage()]:
         one = Registrar(mesh, RegisterParams(index_cache=False))
-        scan, truth = look(mesh, args.scan, 0.0, 3)
+        scan, truth = look(mesh, args.scan, 0.0, 3, partial(_ranges, one))
         guess = off(truth, 0.5, 0.01, 4)
         fit = one._backend.align(scan, guess)
-        rest = (one.limits, one.params, False, one._accuracy)
+        rest = (one._accuracy, True, guess)
         cases = {
-            name: Case(partial(_graded, one, scan, each, rest))
-            for name, each in (("kept", fit), ("none", replace(fit, matches=None)))
+            "register": Case(registered(one, scan, guess)),
+            "align": Case(aligned(one, scan, guess)),
+            "quality": Case(partial(_graded, one, scan, fit, (one.limits, one.params, False, *rest))),
+            "with halves": Case(partial(_graded, one, scan, fit, (one.limits, one.params, True, *rest))),
+            "every search": Case(
+                partial(_graded, one, scan, replace(fit, matches=None), (one.limits, one.params, False, *rest))
+            ),
         }
-        cases["register"] = Case(registered(one, scan, guess))
         in_turn(cases, args.reps)
-        ms = {name: 1e3 * min(case.cpu) for name, case in cases.items()}
-        gain = ratio(cases["none"].cpu, cases["kept"].cpu)
         print(
-            f"{mesh.name}: grading {ms['kept']:.2f} ms of {ms['register']:.2f} ms of register (least); without kept "
-            f"neighbours {gain:.2f}x"
+            f"{mesh.name}:", ", ".join(f"{name} {1e3 * statistics.median(c.cpu):.2f} ms" for name, c in cases.items())
         )
 
 

@@ -73,7 +73,7 @@ class Search {
     const uint32_t first = seed < 0 ? NO_CHILD : (uint32_t)seed / LANES;
     if (seed >= 0) visit(first);
     if (!list || !in_list(list, first)) {
-      first_ = other_ = third_ = FAR, waiting_ = 0;  // the tree comes to the same blocks again
+      first_ = other_ = third_ = FAR, first_lanes_ = f8(FAR), waiting_ = 0;  // the tree comes to the same blocks again
       in_tree();
     }
     resolve(true);
@@ -225,8 +225,19 @@ class Search {
     }
   }
 
+  // Whether only one lane may be the nearest, or none: then the search is at its end.
+  bool is_alone() {
+    const unsigned left = bits(first_lanes_ < f8(exact_));
+    if (other_ < exact_ || (left & (left - 1)) != 0) return false;
+    if (left == 0) return true;
+    if ((o_.facing.sure[first_block_] & left) == 0) return false;
+    lane_ = (int32_t)(LANES * first_block_) + lowest_bit(left);
+    return true;
+  }
+
   // Measures exactly what waits and may still be the nearest. What is alone at the end need not be measured.
   void resolve(bool end) {
+    if (end && lane_ < 0 && is_alone()) return;
     uint32_t lanes[4];
     int n = 0;
     for (int i = 0; i < waiting_; ++i) {
@@ -294,7 +305,7 @@ class Search {
   float least_ = FAR;   // least squared distance of a lane that counts
   float first_ = FAR, other_ = FAR, third_ = FAR;  // least of the lanes that may count, by blocks
   uint32_t first_block_ = NO_CHILD, other_block_ = NO_CHILD;
-  F8 first_lanes_{};    // squared distances in that block
+  F8 first_lanes_ = f8(FAR);  // squared distances in that block
   int waiting_ = 0;
   int64_t compared_ = 0;
   uint32_t wait_block_[MOST_WAITING];
