@@ -30,7 +30,6 @@ from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.restarts import (
     FAR_WORK,
     MEASURED_WORK,
-    POOR_OF_GATE,
     STOP_OF_EXTENT,
     Budget,
     Restart,
@@ -47,11 +46,12 @@ UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, 
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
 NOT_COMPARED = "no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
+BIAS_OF_GATE = 0.2  # with a smaller rms distance, in gates, the bias of the noise is not significant
 BIAS_POINTS = 1000  # of the simulated scan by which the bias of the noise is found
 LEAST_FOR_BIAS = 30  # with fewer rays that meet the model no scan is simulated
 UNCERTAIN_CHI2 = 4.0  # 6 unknowns less 2: the part of an estimated bias that chance explains
 CREDIBLE = 3.0  # standard deviations beyond which a point is not one of the model with noise
-BIAS_ROUNDS, SMALL_STEP = 4, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
+BIAS_ROUNDS, SMALL_STEP = 2, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
 
 
@@ -130,7 +130,7 @@ class Neighbourhood:
             budget: work that is left; it need not suffice.
         """
         P = found.covariance
-        if P is None or found.rms_m <= POOR_OF_GATE * self._target.limits.gate_m:
+        if P is None or found.rms_m <= BIAS_OF_GATE * self._target.limits.gate_m:
             return found
         few = scan[:: max(1, len(scan) // BIAS_POINTS)]
         b, better = self._bias(few, found.T_ac.inverse(), P, budget)
@@ -162,15 +162,17 @@ class Neighbourhood:
             budget: of the scan.
 
         Returns:
-            d = [theta; v] in {C}, T_ac_true = T_ac Exp(d); zero with fewer than 30 rays that meet the model.
+            d = [theta; v] in {C}, T_ac_true = T_ac Exp(d); zero with fewer than 30 rays that meet the model. The ranges
+            are not compared where chance explains d.
         """
         target, d = self._target, np.zeros(6)
         width = self._restarter.width(self._restarter.measure(few, T_ca))
         budget.spend(MEASURED_WORK * len(few))
         camera_c = target.visibility.camera_c(target.index, few, T_ca)
         p, back, true = T_ca.apply(few), T_ca.inverse(), Pose.identity()
-        first = at = _Noiseless.of(target.index, p, camera_c, true)
-        for _ in range(BIAS_ROUNDS):
+        first = _Noiseless.of(target.index, p, camera_c, true)
+        for k in range(BIAS_ROUNDS):
+            at = _Noiseless.of(target.index, p, camera_c, true.inverse()) if k else first
             budget.spend(at.work)
             if len(at.points) < LEAST_FOR_BIAS:
                 return np.zeros(6), False
@@ -182,9 +184,12 @@ class Neighbourhood:
             step = fit.T_ca @ back
             true = step @ true
             d, last = (np.concatenate([geometry.log(each.q), each.t]) for each in (true, step))
-            at = _Noiseless.of(target.index, p, camera_c, true.inverse())
             if last @ np.linalg.solve(P, last) < SMALL_STEP:
                 break
+        if d @ np.linalg.solve(P, d) <= UNCERTAIN_CHI2:
+            return d, False
+        at = _Noiseless.of(target.index, p, camera_c, true.inverse())
+        budget.spend(at.work)
         return d, at.cost(first.noise_m) < first.cost(first.noise_m)
 
     def along_valley(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Pose | None:
