@@ -94,7 +94,7 @@ class Poses:
         """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where ``problem`` is linearised."""
         if problem.poses is self and chart is None:
             return problem.core.d
-        own = Problem(self, problem.prior, problem.factors)
+        own = problem if problem.poses is self else Problem(self, problem.prior, problem.factors)
         return own.core.residuals((problem.chart if chart is None else chart).flat)[2]
 
     def some(self, which: slice | NDArray[np.bool_]) -> Poses:

@@ -26,7 +26,7 @@ from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents
 from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
-from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite
+from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, ROUNDING, definite
 from avsreplay.estimate.mixture import Component, volumes
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
@@ -42,7 +42,6 @@ _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
-_DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
 SPHERE = 3.0  # tr I / I of a sphere
 _TORQUE, _TORQUES = 0.1, (3e-4, 1e-4, 3e-5, 1e-5)  # probability of a constant torque; 1 sigma, equally likely [rad/s2]
 
@@ -203,14 +202,14 @@ def unseen_torque(problem: Problem, after_s: float) -> Array:
     e, H = problem.core.rows()
     T, times = to_errors(problem.chart), np.append(problem.poses.times_s, after_s)
     try:
-        B = drift_equivalents(to_state(problem.chart), times)[:, :_DISTURBED, :3]
+        B = drift_equivalents(to_state(problem.chart), times)[:, :REACHED, :3]
     except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
         return np.zeros((DIM, DIM))
-    J, C = (H @ T).reshape(-1, DIM), (H[:, :, :_DISTURBED] @ B[:-1]).reshape(-1, 3)
+    J, C = (H @ T).reshape(-1, DIM), (H[:, :, :REACHED] @ B[:-1]).reshape(-1, 3)
     P, cross, total = problem.covariance, J.T @ C, np.zeros((3, 3))
     newton = P @ problem.core.normal()[1]  # to the minimum of the linearised cost, which a fit reaches approximately
     moved = -P @ cross
-    moved[:_DISTURBED] += np.linalg.solve(T[:_DISTURBED, :_DISTURBED], B[-1])
+    moved[:REACHED] += np.linalg.solve(T[:REACHED, :REACHED], B[-1])
     precision, found = C.T @ C - cross.T @ P @ cross, -C.T @ e.reshape(-1) - cross.T @ newton
     for one_sigma in _TORQUES:
         scaled = one_sigma**2 * precision + np.eye(3)
@@ -344,7 +343,7 @@ def process_noise_pass(
     if pin is not None:
         k = P @ pin.row / float(pin.row @ P @ pin.row + pin.one_sigma**2)
         y, P = y - k * (pin.error(chart) * pin.one_sigma + float(pin.row @ y)), P - np.outer(k, pin.row @ P)
-    into = np.asarray(np.linalg.inv(to_errors(chart)[:_DISTURBED, :_DISTURBED]))
+    into = np.asarray(np.linalg.inv(to_errors(chart)[:REACHED, :REACHED]))
     density = torque_density(to_state(chart).sigma, noise[0])
     problem.core.linearise(chart.flat)
     return problem.core.smooth(y, 0.5 * (P + P.T), into, density, noise[1] ** 2)

@@ -16,13 +16,13 @@ from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents, drive_of
 from avsreplay.estimate.dynamics import translated
+from avsreplay.estimate.error_state import REACHED
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 NO_ACCELERATION = np.zeros(6)
-REACHED = 12  # error states that a disturbance reaches: attitude to velocity
 
 
 @value_class

@@ -18,12 +18,11 @@ from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import DrivenBelief, followed
 from avsreplay.estimate.driven_fit import (
-    REACHED,
     DrivenFit,
     without_drift,
 )
 from avsreplay.estimate.dynamics import torque_density
-from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, definite
+from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, definite
 from avsreplay.estimate.noise_levels import NoiseLevels, mean_share
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.work import Parts

@@ -15,6 +15,7 @@ from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
 
 DIM = 20
+REACHED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on chart steps of these alone
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
 ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative

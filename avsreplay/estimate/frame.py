@@ -18,6 +18,7 @@ since the first scan. In that frame the motion is free, and the error states and
 from __future__ import annotations
 
 from dataclasses import field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -106,8 +107,8 @@ class EstimatorFrame:
         return self._converted(belief, 1.0)
 
     def belief_out(self, belief: Belief) -> Belief:
-        """Convert a belief from the estimator's coordinates to {C} and {A}."""
-        return self._converted(belief, -1.0)
+        """Convert a belief from the estimator's coordinates to {C} and {A}; the last ones are kept."""
+        return _belief_out(self, belief)
 
     def position_out(self, r_a: Array, t_ns: int) -> Array:
         """Convert a position (3,) [m] of the centre of mass at an instant [ns] from the falling frame to {A}."""
@@ -122,7 +123,7 @@ class EstimatorFrame:
             c_b = c_b + sign * geometry.rotate(geometry.matrix(x.q_bc), self.centre_c)
         if not (self.falls or self.shifted):
             return x
-        return State(x.q_ab, x.w_b, r_a, v_a, x.sigma, c_b, x.q_bc)
+        return State.of(np.concatenate((x.q_ab, x.w_b, r_a, v_a, x.sigma, c_b, x.q_bc)))
 
     def _converted(self, belief: Belief, sign: float) -> Belief:
         """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu x]) A(mu)."""
@@ -143,3 +144,8 @@ class EstimatorFrame:
         """Displacement and velocity of the falling frame in {A} at an instant."""
         tau = (t_ns - self.epoch_ns) * 1e-9
         return 0.5 * tau * tau * self.acceleration, tau * self.acceleration
+
+
+@lru_cache(maxsize=2)
+def _belief_out(frame: EstimatorFrame, belief: Belief) -> Belief:
+    return frame._converted(belief, -1.0)

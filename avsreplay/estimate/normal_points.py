@@ -24,6 +24,7 @@ _GROSS = 100.0  # squared difference of a gross error over the median of all pos
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _FREE = (1e2, 1e3, 1e1)  # 1 sigma of arm [m], position [m] and velocity [m/s] before the positions
 _LEAST_M = 1e-6  # least 1 sigma of a displacement [m]
+_ANY_PRIOR = Prior(Chart(np.zeros(34)), np.eye(DIM))  # of residuals, which do not depend on it
 
 
 @value_class
@@ -126,7 +127,7 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     if n <= min(most, _FEW):
         return poses
     first = _parts(rate * (poses.times_s - poses.times_s[0]), most)
-    d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
+    d = poses.residuals(Problem(poses, _ANY_PRIOR, factors), reference)
     white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
     sizes = np.diff(first, append=n)

@@ -21,7 +21,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
 from avsreplay.estimate.dynamics import process_noise
-from avsreplay.estimate.error_state import rotation
+from avsreplay.estimate.error_state import REACHED, rotation
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
@@ -39,7 +39,6 @@ FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are est
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
 _LONGEST = 3.0  # interval between two of them over the median
 _MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
-_MOTION = 12  # error states attitude to velocity, which a change of the velocities reaches
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -139,7 +138,7 @@ def window_of(
         flat += across + across.T + seen @ start.P_u @ seen.T
     flat = 0.5 * (flat + flat.T)
     whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
-    late = np.concatenate([since_each(whiten, rows[:, :, :_MOTION]), np.zeros((1, 6 * n, _MOTION))])
+    late = np.concatenate([since_each(whiten, rows[:, :, :REACHED]), np.zeros((1, 6 * n, REACHED))])
     return Window(times, y.reshape(-1), flat, whiten, late, poses, R, tuple(rotation(x.q_ab).T for x in states))
 
 

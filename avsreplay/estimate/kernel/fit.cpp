@@ -47,6 +47,22 @@ void congruent(const Square T, const Square A, Square out) {
       for (int c = 0; c < DIM; ++c) out[r][c] += T[i][r] * AT[i][c];
 }
 
+// A += H' H in the first N columns of H, of which the upper triangle counts, and b -= H' e.
+template <int N, int W>
+void accumulate(const double (&H)[SEEN][W], const double e[SEEN], double A[N][N], double b[N]) {
+  for (int r = 0; r < N; ++r) {
+    double s[N];
+    const int first = r & ~3;  // in groups of four
+    std::memcpy(s, A[r], sizeof s);
+    for (int i = 0; i < SEEN; ++i) {
+      const double h = H[i][r];
+      for (int c = first; c < N; ++c) s[c] += h * H[i][c];
+      b[r] -= h * e[i];
+    }
+    std::memcpy(A[r], s, sizeof s);
+  }
+}
+
 // S^-1 Q S^-T of a flow: its noise propagated back to the start.
 void at_start(const Flow& flow, double out[6][6]) {
   double back[6][6];
@@ -299,17 +315,7 @@ void Problem::normal(Square A, double b[DIM]) const {
   Rows H;
   for (size_t k = 0; k < poses.size(); ++k) {
     whitened(k, e, H);
-    for (int r = 0; r < DIM; ++r) {
-      double s[DIM];
-      const int first = r & ~3;  // the upper triangle, in groups of four
-      std::memcpy(s, B[r], sizeof s);
-      for (int i = 0; i < SEEN; ++i) {
-        const double h = H[i][r];
-        for (int c = first; c < DIM; ++c) s[c] += h * H[i][c];
-        g[r] -= h * e[i];
-      }
-      std::memcpy(B[r], s, sizeof s);
-    }
+    accumulate<DIM>(H, e, B, g);
   }
   for (int r = 0; r < DIM; ++r)
     for (int c = 0; c < r; ++c) B[r][c] = B[c][r];
@@ -494,17 +500,7 @@ void Driven::normal() {
     in_steps<DIM + PUSHED>(k, e, H);
     for (auto& row : H)
       for (int c = 0; c < SEEN; ++c) row[DIM + c] *= open[c];
-    for (int r = 0; r < JOINT; ++r) {
-      const int first = r & ~1;  // the upper triangle, in pairs
-      double s[JOINT];
-      std::memcpy(s, A[r], sizeof s);
-      for (int i = 0; i < SEEN; ++i) {
-        const double h = H[i][r];
-        for (int c = first; c < JOINT; ++c) s[c] += h * H[i][c];
-        b[r] -= h * e[i];
-      }
-      std::memcpy(A[r], s, sizeof s);
-    }
+    accumulate<JOINT>(H, e, A, b);
   }
   for (int r = 0; r < JOINT; ++r)
     for (int c = r; c < JOINT; ++c) {
