@@ -251,18 +251,16 @@ def angle(q: ArrayLike) -> Array:
     return np.asarray(2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3])))
 
 
-def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
-    """Interpolate between two rotations at constant rate along the shorter arc.
+def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array) -> Array:
+    """Return points (n, 3) moved by R p + t, each at its own one of ``times`` (n,).
 
-    Args:
-        q0: (4,) unit quaternion at fraction 0.
-        q1: (4,) unit quaternion at fraction 1.
-        fraction: position between the two.
-
-    Returns:
-        (4,) unit quaternion.
+    R (k, 3, 3) and t (k, 3) hold at evenly spaced ``knots`` (k,); in between, the moved points are interpolated.
     """
-    return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
+    at = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, len(knots) - 1.0)
+    low = np.minimum(at.astype(int), len(knots) - 2)
+    part = (at - low)[:, None]
+    moved = [np.einsum("nij,nj->ni", R[k], points) + t[k] for k in (low, low + 1)]
+    return np.asarray((1.0 - part) * moved[0] + part * moved[1])
 
 
 def across(axis: Array) -> Array:

@@ -143,7 +143,7 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, EPOCH_NS)
-        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_pose)
+        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses)
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
     done = tally.recorded(output, writer.bytes, header)
@@ -175,11 +175,18 @@ def record_source(
         epoch_ns = opened.scan_at(0).log_ns if len(opened) else 0
         moved = opened.options.fixed_frame is not None or opened.options.sensor_topic is not None
         header, due = _labelled(opened.header, options, epoch_ns, moving=moved), opened.info().scans
+        header = replace(header, sensor_at_stamp=moved)
         with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
             # registration and faults need the position of the sensor: a log holds its frame and its poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
-            tally = _fold(pairs, opened.truth_of, writer, true_clock=False, camera_of=lambda scan: scan.sensor)
+            tally = _fold(
+                pairs,
+                opened.truth_of,
+                writer,
+                true_clock=False,
+                camera_of=lambda s: [(0, s.sensor)] if s.sensor else [],
+            )
         done = tally.recorded(output, writer.bytes, header, tuple(opened.losses))
         frame = f"scans are in the frame of the sensor, which moves in '{ROOT_FRAME}'; a replay transforms them to it"
         return replace(done, note="; ".join(each for each in (frame if moved else "", done.note) if each))
@@ -235,9 +242,12 @@ def _fold(
     truth_of: Callable[[Scan], Truth],
     writer: LogWriter,
     true_clock: bool,
-    camera_of: Callable[[Scan], Pose | None] | None = None,
+    camera_of: Callable[[Scan], list[tuple[int, Pose]]],
 ) -> _Tally:
-    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or None)."""
+    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or None).
+
+    ``camera_of`` gives the poses of a moving camera, each with the time after the stamp [ns].
+    """
     tally = _Tally()
     for before, scan in pairs:
         if before.status is ScanStatus.DAMAGED:
@@ -250,9 +260,9 @@ def _fold(
         truth = truth_of(before)
         if truth.pose is not None:
             writer.write_truth(before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state)
-        camera = camera_of(before) if camera_of else None
-        if camera is not None:
-            writer.write_camera(before.log_ns, before.log_ns if true_clock else before.t_ns, camera)
+        for after_ns, camera in camera_of(before):
+            stamp_ns = before.log_ns if true_clock else before.t_ns
+            writer.write_camera(before.log_ns + after_ns, stamp_ns + after_ns, camera)
         tally.add(scan)
     return tally
 

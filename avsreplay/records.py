@@ -197,7 +197,8 @@ class LogHeader:
 
     Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults ``labels``, initial
     belief ``start``, ``truth`` at the first scan, ``notes`` by name, and the frame of its transforms in which start,
-    truth and poses are, ``fixed_frame`` ("": that of the clouds).
+    truth and poses are, ``fixed_frame`` ("": that of the clouds). ``sensor_at_stamp``: points with times of their own
+    are in the frame that the sensor has at the stamp of their cloud, not in that at their own time.
     """
 
     surface: Surface | None = None
@@ -208,6 +209,7 @@ class LogHeader:
     truth: State | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
     fixed_frame: str = ""
+    sensor_at_stamp: bool = False
 
 
 @value_class

@@ -94,14 +94,15 @@ def test_pose_from_matrix_restores_orthonormality():
     np.testing.assert_allclose(pose.R.T @ pose.R, np.eye(3), atol=1e-15)
 
 
-def test_slerp_turns_at_constant_rate_the_short_way():
-    a, b = batch(1, seed=7)[0], batch(1, seed=8)[0]
-    whole = geometry.angle(geometry.multiply(geometry.conjugate(a), b))
-    for fraction in (0.0, 0.25, 1.0):
-        part = geometry.slerp(a, b, fraction)
-        assert geometry.angle(geometry.multiply(geometry.conjugate(a), part)) == pytest.approx(
-            fraction * whole, abs=1e-12
-        )
+def test_points_are_moved_by_the_motion_at_their_own_times():
+    turns, shifts, rng = batch(3, seed=7), np.arange(9.0).reshape(3, 3), np.random.default_rng(1)
+    points, knots = rng.normal(size=(50, 3)), np.array([-1.0, 0.0, 1.0])
+    times = np.repeat([-1.0, -0.25, 0.0, 0.5, 1.0], 10)
+    R = geometry.matrix(turns)
+    found = geometry.moved_in_time(points, times, knots, R, shifts)
+    for low, part, k in ((0, 0.0, 0), (0, 0.75, 10), (1, 0.0, 20), (1, 0.5, 30), (1, 1.0, 40)):
+        a, b = (points[k : k + 10] @ R[i].T + shifts[i] for i in (low, low + 1))
+        np.testing.assert_allclose(found[k : k + 10], (1 - part) * a + part * b, atol=1e-14)
 
 
 def test_frozen_cannot_be_written_and_checks_its_shape():

@@ -15,6 +15,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation, Slerp
 from true_scans import true_scans
 
 from avsreplay import geometry
@@ -260,7 +261,7 @@ def test_truth_is_interpolated_between_stamps_but_not_across_a_gap(tmp_path: Pat
                 ("/gt", POSE, 2, pose_stamped(start + half, "c", b)),
                 ("/gt", POSE, 3, pose_stamped(start + 9 * SECOND, "c", b))]  # fmt: skip
     found = read(mcap(tmp_path / "a.mcap", messages), truth_topic="/gt", truth_gap_s=0.6)
-    middle = Pose(geometry.slerp(a.q, b.q, 0.5), 0.5 * (a.t + b.t))
+    middle = Pose(Slerp([0, 1], Rotation.from_quat([a.q, b.q]))(0.5).as_quat(), 0.5 * (a.t + b.t))
     np.testing.assert_allclose(found[0].truth.matrix, middle.matrix, atol=1e-15)
     assert all(s.truth is None for s in found[1:])
 

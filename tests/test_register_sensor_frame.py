@@ -18,6 +18,7 @@ from avsreplay.register import RegisterParams, Registrar, SensorFrame
 from avsreplay.run import Job, Run
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
+RASTER = FIXTURE.with_name("spin-raster.mcap")
 SENSOR = Pose(geometry.exp([0.4, -1.1, 2.0]), np.array([80.0, -45.0, 10.0]))
 
 
@@ -50,9 +51,9 @@ def test_without_a_sensor_pose_the_registrar_is_used_as_it_is(scene):
     assert found.T_ac.t.tobytes() == plain.T_ac.t.tobytes()
 
 
-def _far_log(log: Path, fixed_frame: str = "map") -> Path:
+def _far_log(log: Path, fixed_frame: str = "map", raw: Path = FIXTURE) -> Path:
     """The fixture, seen by a camera 90 m from the origin of the fixed frame that the header names."""
-    with open_source(FIXTURE) as source:
+    with open_source(raw) as source:
         header = replace(source.header, start=None, truth=None, scenario="", labels=())
         with LogWriter(log, replace(header, fixed_frame=fixed_frame)) as writer:
             for scan in source.scans():
@@ -99,3 +100,52 @@ def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path)
         if row.gamma:
             assert row.reg_pos_err_m == pytest.approx(other.reg_pos_err_m, abs=1e-4)
             assert row.inliers == pytest.approx(other.inliers, abs=2)
+
+
+def _turning(after_s: float) -> Pose:
+    """Pose of a sensor that turns and moves; between two instants the position is interpolated by the reader."""
+    return Pose(
+        geometry.multiply(SENSOR.q, geometry.exp(after_s * np.array([0.1, -0.2, 0.15]))), SENSOR.t + 0.3 * after_s
+    )
+
+
+def _turning_log(log: Path, raw: Path = RASTER) -> float:
+    """A log with points at their own times, measured by that sensor; returns the duration of a scan [s]."""
+    with open_source(raw) as source:
+        header = replace(source.header, start=None, truth=None, scenario="", labels=(), fixed_frame="map")
+        first = source.scan_at(0).t_ns
+        with LogWriter(log, header) as writer:
+            for scan in source.scans():
+                t_s, times = (scan.t_ns - first) * 1e-9, scan.times_s.astype(np.float64)
+                poses = [_turning(t_s + after) for after in times]
+                seen = [T.inverse().apply(p) for T, p in zip(poses, SENSOR.apply(scan.points), strict=True)]
+                last = float(times.max())
+                for after in np.linspace(0.0, last, 9):
+                    ns = round(after * 1e9)
+                    writer.write_camera(scan.log_ns + ns, scan.t_ns + ns, _turning(t_s + float(after)))
+                writer.write(replace(scan, points=np.array(seen)))
+                writer.write_truth(scan.log_ns, scan.t_ns, SENSOR @ source.truth_of(scan).pose)
+    return last
+
+
+def test_each_point_is_moved_from_the_frame_that_its_sensor_has_at_the_time_of_the_point(tmp_path):
+    log, copy = tmp_path / "turning.mcap", tmp_path / "copy.mcap"
+    assert _turning_log(log) > 0.05
+    record_source(log, copy, SourceOptions(), RecordOptions())
+    with open_source(RASTER) as plain, open_source(log) as turning, open_source(copy) as again:
+        for seq in (0, 2):
+            expected = SENSOR.apply(plain.scan_at(seq).points)
+            np.testing.assert_allclose(turning.scan_at(seq).points, expected, atol=2e-5)
+            np.testing.assert_allclose(again.scan_at(seq).points, expected, atol=3e-5)
+            np.testing.assert_array_equal(again.scan_at(seq).times_s, plain.scan_at(seq).times_s)
+        assert again.header.sensor_at_stamp
+        assert not turning.header.sensor_at_stamp
+
+
+def test_a_scan_without_the_pose_of_its_sensor_at_the_last_point_is_damaged(tmp_path):
+    log = _far_log(tmp_path / "far.mcap", raw=RASTER)
+    with open_source(log) as source:
+        found = list(source.scans())
+    assert [scan.status.value for scan in found[:-1]] == ["ok"] * (len(found) - 1)
+    assert found[-1].status.value == "damaged"
+    assert "pose of the sensor is unknown" in found[-1].note

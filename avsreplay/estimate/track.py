@@ -300,11 +300,7 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], x: State) -> Array:
         return points
     knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
     rotations, offsets = _to_scan_instant(x, knots)
-    position = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, _KNOTS - 1.0)
-    low = np.minimum(position.astype(int), _KNOTS - 2)
-    part = (position - low)[:, None]
-    moved = [np.einsum("nij,nj->ni", rotations[k], points) + offsets[k] for k in (low, low + 1)]
-    return np.asarray((1.0 - part) * moved[0] + part * moved[1])
+    return geometry.moved_in_time(points, times, knots, rotations, offsets)
 
 
 def with_scan_duration(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:

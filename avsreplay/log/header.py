@@ -52,8 +52,8 @@ def encode_header(header: LogHeader) -> dict[str, str]:
         "model": _json(None if header.surface is None else header.surface.name),
         "model_sha256": _json(None if header.surface is None else header.surface.sha256),
     }
-    if header.fixed_frame:
-        values["fixed_frame"] = _json(header.fixed_frame)
+    moving = {"fixed_frame": header.fixed_frame, "sensor_at_stamp": header.sensor_at_stamp}
+    values.update({name: _json(value) for name, value in moving.items() if value})
     return {**values, "crc32": f"{_checksum(values):08x}"}
 
 
@@ -76,6 +76,7 @@ def decode_header(values: Mapping[str, str]) -> LogHeader:
             truth=_to_state(_loads(values["truth"])),
             notes={str(name): str(text) for name, text in dict(_loads(values["notes"])).items()},
             fixed_frame=_to_frame(_loads(values.get("fixed_frame", '""'))),
+            sensor_at_stamp=_loads(values.get("sensor_at_stamp", "false")) is True,
         )
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"header record: {str(error)[:120]}") from None

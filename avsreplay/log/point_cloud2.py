@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.errors import value_class
-from avsreplay.geometry import MeasuredPose
+from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
 from avsreplay.log.options import SourceOptions
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256
+_KNOTS = 17  # instants of a scan at which the pose of a moving sensor is looked up
 MAX_COORDINATE_M = 1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
 _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity")
 _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
@@ -104,6 +107,28 @@ def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
     if options.scan_duration_s is None or cloud.places is None:
         return cloud
     return replace(cloud, times_s=np.float32(options.scan_duration_s) * cloud.places, places=None)
+
+
+def at_stamp(cloud: Cloud, sensor_at: Callable[[int], Pose]) -> Cloud:
+    """Return a cloud in the frame that its sensor has at the stamp; each point is moved from the frame at its own time.
+
+    Args:
+        cloud: in the frame of the moving sensor.
+        sensor_at: the pose of the sensor so many nanoseconds after the stamp.
+
+    Raises:
+        BadMessage: the time of a point is not finite.
+    """
+    if cloud.times_s is None or not cloud.times_s.any():
+        return cloud
+    times = cloud.times_s.astype(np.float64)
+    if not np.isfinite(times).all():
+        raise BadMessage("the time of a point is not finite")
+    knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
+    T_sa = sensor_at(0).inverse()
+    steps = [T_sa @ sensor_at(round(1e9 * after)) for after in knots.tolist()]
+    R, t = np.stack([step.R for step in steps]), np.stack([step.t for step in steps])
+    return replace(cloud, points=geometry.moved_in_time(cloud.points.astype(np.float64), times, knots, R, t))
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:

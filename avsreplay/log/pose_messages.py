@@ -230,7 +230,8 @@ class PoseTrack:
             return None
         a, b, fraction = self._row(right - 1), self._row(right), (t_ns - before) / (after - before)
         out = a + fraction * (b - a)
-        out[3:7] = geometry.slerp(a[3:7], b[3:7], fraction)
+        turn = geometry.multiply(geometry.conjugate(a[3:7]), b[3:7])
+        out[3:7] = geometry.normalise(geometry.multiply(a[3:7], geometry.exp(fraction * geometry.log(turn))))
         return out
 
 

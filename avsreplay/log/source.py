@@ -20,7 +20,7 @@ from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions
-from avsreplay.log.point_cloud2 import Cloud, selected
+from avsreplay.log.point_cloud2 import Cloud, at_stamp, selected
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
@@ -299,6 +299,8 @@ class Source:
         cloud = selected(cloud, self.options)
         if self._ground_truth.sensor is None:
             return cloud
+        if not self.header.sensor_at_stamp:
+            cloud = at_stamp(cloud, lambda after_ns: self._sensor(t_ns + after_ns, cloud.frame))
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
 
     def _place_of_sensor(self, t_ns: int, frame: str) -> Pose | None:

@@ -81,15 +81,21 @@ class Simulation:
         kinds += [each.name for each in others if each.duration_s is not None]
         return Truth(state.T_ac, state, next(iter(kinds), None))
 
-    def camera_pose(self, scan: Scan) -> Pose | None:
-        """Return the pose of the camera in the fixed frame as its topic reports it; None for a camera at rest.
+    def camera_poses(self, scan: Scan) -> list[tuple[int, Pose]]:
+        """Return the poses of a moving camera in the fixed frame as its topic reports them; none for one at rest.
 
         Args:
             scan: A scan of ``scans``.
+
+        Returns:
+            Each pose with its time after the stamp [ns]: one at the stamp, and eight more during a scan that lasts.
         """
         if self._camera is None:
-            return None
-        return self._camera.reported((scan.log_ns - EPOCH_NS) / NS, self._rng("camera_pose", scan.seq))
+            return []
+        rng, scanner = self._rng("camera_pose", scan.seq), self._scenario.params.scanner
+        last = 0.0 if scanner.pattern is Pattern.FLASH else scanner.scan_s
+        after = sorted({round(part * last * NS / 8) for part in range(9)})
+        return [(ns, self._camera.reported((scan.log_ns + ns - EPOCH_NS) / NS, rng)) for ns in after]
 
     def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
         return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
