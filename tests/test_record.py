@@ -284,7 +284,9 @@ def test_messages_that_cannot_be_decoded_are_left_out_and_counted():
         def write_truth(self, *truth):
             assert len(truth) == 4
 
-    tally = recording._fold([(scan, scan) for scan in scans], truth_of, Writer(), true_clock=False, camera_of=lambda _: [])
+    tally = recording._fold(
+        [(scan, scan) for scan in scans], truth_of, Writer(), true_clock=False, camera_of=lambda _: []
+    )
     assert (tally.damaged, tally.scans, 3 in written) == (1, 34, False)
 
 
