@@ -232,7 +232,7 @@ def fixed_point(cloud: Surface, surface: Surface, args: argparse.Namespace) -> N
         for outliers, deg, metres in STARTS:
             passes, far = [], []
             for side in range(2 if args.quick else 8):
-                scan, truth = look(mesh, args.scan, outliers, side)
+                scan, truth = look(mesh, args.scan, outliers, side, partial(_ranges, registrar))
                 fit = registrar.index.icp(scan, off(truth, deg, metres, 100 + side), rule)
                 end = registrar.index.icp(scan, fit.T_ca, replace(exact, gate_m=fit.gate_m))
                 passes.append(fit.iterations)
@@ -257,7 +257,7 @@ def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
     points = sample(mesh, args.model, 1).vertices
     normals = SurfaceIndex.build(sample(mesh, args.model, 1), reach).closest(points).normal
     for outliers, deg, metres in STARTS:
-        scan, truth = look(mesh, args.scan, outliers, 3)
+        scan, truth = look(mesh, args.scan, outliers, 3, partial(_ranges, registrar))
         guess = off(truth, deg, metres, 4)
         cases = {
             "register, 1 thread": Case(registered(registrar, scan, guess)),
