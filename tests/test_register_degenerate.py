@@ -68,6 +68,18 @@ def test_a_rotation_by_any_angle_about_the_axis_is_a_motion_along_the_unobservab
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_refined_pose_has_no_residuals_left_and_does_not_move_along_the_unobservable_directions(seed):
+    J, _ = cylinder_rows(seed)
+    view_of = Directions.of(J.T @ J, len(J), J[:, 3:].mean(axis=0))
+    error = 1e-5 * np.random.default_rng(seed).normal(size=6)
+    T_ca = Pose(Rotation.random(random_state=seed).as_quat(), np.array([0.3, -1.0, 2.0]))
+    step = view_of.refined(T_ca, J.T @ J, J.T @ J @ error) @ T_ca.inverse()
+    d = np.concatenate([2.0 * step.q[:3], step.t])
+    np.testing.assert_allclose(J @ d, J @ error, atol=1e-9)
+    np.testing.assert_allclose(view_of.free.T @ view_of.to_x @ d, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_the_information_is_that_of_the_observable_directions_alone(seed):
     """Oracle: least squares in the observable directions only, with the covariance of independent noise."""
     J, axis = cylinder_rows(seed)

@@ -91,6 +91,18 @@ class Directions:
         q, c = geometry.exp(theta), self.centre
         return Pose(q, c + _screw(theta) @ along[3:] - geometry.matrix(q) @ c) @ T_ca
 
+    def refined(self, T_ca: Pose, info: Array, gradient: Array) -> Pose:
+        """Return ``T_ca`` after one point-to-plane step along the observable directions.
+
+        Args:
+            T_ca: the pose.
+            info: sum of J'J (6, 6) at it, see ``surface_index.NormalEquations``.
+            gradient: sum of J'e (6,) at it.
+        """
+        U = np.linalg.solve(self.to_x, self.observable)
+        d = U @ np.linalg.solve(U.T @ info @ U, U.T @ gradient)
+        return Pose(geometry.exp(d[:3]), d[3:]) @ T_ca
+
 
 def _screw(theta: Array) -> Array:
     """V (3, 3) with exp([theta; u]) = (exp(theta), V u), the left Jacobian of SO(3)."""

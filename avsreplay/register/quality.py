@@ -245,9 +245,9 @@ def grade(
         if guess is not None and fit.converged:
             kept = view.nearest(T_ca, guess)  # passes over a curved surface drift along the unobservable directions
             facing = visibility.camera_c(index, points, kept) is not None
-            there = index.normal_equations(points, kept, limits.gate_m, facing=facing)
-            near = there.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * there.inliers
-            T_ca = kept if there.inliers >= AS_MANY * found.inliers and near else T_ca
+            at = index.normal_equations(points, kept, limits.gate_m, facing=facing)
+            fits = at.inliers >= AS_MANY * found.inliers and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
+            T_ca = view.refined(kept, at.info, at.gradient) if fits else T_ca  # corrects errors of the directions
     settled = P is None or not found.beyond
     size = None
     share = found.inliers / max(1, found.points)
