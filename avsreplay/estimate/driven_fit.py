@@ -137,7 +137,7 @@ def levels_of(
         positions: as in ``estimate_levels``.
     """
     old, kinds = fitted.problem, np.flatnonzero(fitted.u)
-    points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS)
+    points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS, scatter=True)
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
     return (yield from estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions))

@@ -108,7 +108,7 @@ def error_parts(points: Poses) -> tuple[Array, Array]:
     return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
 
 
-def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:
+def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS, scatter: bool = False) -> Poses:
     """At most some hundred poses that carry the information of many: weighted means about a reference motion.
 
     Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's pose at their mean
@@ -122,6 +122,7 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         reference: initial values of a motion close to them.
         factors: (2,) noise factors of attitude and position, for the weights of outliers.
         most: largest number of normal points. A gap in the poses may add one point.
+        scatter: with the scatter of the poses about their normal points (``Poses.within``).
     """
     n, rate = len(poses), float(np.linalg.norm(reference.w_c))
     if n <= min(most, _FEW):
@@ -137,7 +138,7 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     info = weights[:, None, None] * (np.swapaxes(poses.root, 1, 2) @ poses.root)
     C = np.linalg.inv(np.add.reduceat(info, first))
     mean = (C @ np.add.reduceat(info @ d[:, :, None], first))[:, :, 0]
-    within = _within(poses, d, weights, first, sizes)
+    within = _within(poses, d, weights, first, sizes) if scatter else None
     shares = None if poses.shares is None else np.add.reduceat(poses.shares, first) / sizes
     times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
     x = to_state(reference)
