@@ -138,6 +138,20 @@ def test_points_that_are_measured_one_after_the_other_are_noticed(duration_s: fl
     assert "--scan-duration" not in " ".join(timed.notes())
 
 
+def test_points_with_times_give_the_size_at_the_instant_of_their_scan() -> None:
+    model, duration_s = boxes(), 0.4
+    registrar = Registrar(model)
+    timed, skewed = ModelCheck(registrar, model), ModelCheck(registrar, model)
+    for (scan, T_ac), (apart, _) in zip(moving_scans(model, 0.0, 30), moving_scans(model, duration_s, 30), strict=True):
+        found = registrar.register(scan.points, T_ac)
+        times = (duration_s * (apart.places - 0.5)).astype(np.float32)
+        timed.add(replace(apart, places=None, times_s=times), found)
+        skewed.add(replace(apart, places=None), found)
+    assert len(timed._deltas) == len(skewed._deltas) - 1  # the first scan has no motion yet
+    assert np.abs(timed._deltas).max() < 3e-4
+    assert np.abs(skewed._deltas).max() > 1e-3
+
+
 def test_points_of_one_instant_raise_no_note_though_the_target_moves() -> None:
     model = boxes()
     registrar = Registrar(model)

@@ -170,9 +170,8 @@ class ModelCheck:
         self._placed += 1
         if (self._placed - 1) % self._stride:
             return
-        T_ca = T_ac.inverse()
-        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, _PLACE_POINTS)], dtype=np.float64))
-        found = _place_of_size(self._registrar.index, p, self._camera(scan, T_ca))
+        p = self._on_model(scan, T_ac, _PLACE_POINTS)
+        found = None if p is None else _place_of_size(self._registrar.index, p, self._camera(scan, T_ac.inverse()))
         if found is None:
             return
         moved, change, sigma_m = found
@@ -214,11 +213,9 @@ class ModelCheck:
         return T_ca.t if scan.sensor is None else (T_ca @ scan.sensor).t
 
     def _measure(self, scan: Scan, T_ac: Pose) -> None:
-        T_ca = T_ac.inverse()
-        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, POINTS)], dtype=np.float64))
-        camera_c = self._camera(scan, T_ca)
-        measured = fitted_size(self._registrar.index, p, camera_c)
-        if measured is not None and measured.sigma > 0.0:
+        p, camera_c = self._on_model(scan, T_ac, POINTS), self._camera(scan, T_ac.inverse())
+        measured = None if p is None else fitted_size(self._registrar.index, p, camera_c)
+        if p is not None and measured is not None and measured.sigma > 0.0:
             self._deltas.append(measured.delta)
             self._weights.append(1.0 / measured.sigma**2)
             self._points.append((p, camera_c))
@@ -226,16 +223,35 @@ class ModelCheck:
                 mean, spread, _ = self._mean()
                 self._size_open = not abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
 
-    def _measure_duration(self, scan: Scan, places: NDArray[Any], T_ac: Pose) -> None:
+    def _on_model(self, scan: Scan, T_ac: Pose, count: int) -> Array | None:
+        """About ``count`` points (n, 3) in {C} at the instant of the scan; None if their motion is unknown."""
+        kept = _some(scan.points, count)
+        p = T_ac.inverse().apply(np.asarray(scan.points[kept], dtype=np.float64))
+        if scan.times_s is None:
+            return p
+        if (moving := self._motion(scan, T_ac)) is None:
+            return None
+        times = scan.times_s[kept].astype(np.float64)[:, None]
+        back = geometry.matrix(geometry.exp(-times * moving[0]))
+        return np.asarray(np.einsum("nij,nj->ni", back, p - times * moving[1]))
+
+    def _motion(self, scan: Scan, T_ac: Pose) -> tuple[Array, Array, float] | None:
+        """Rate [rad/s] and velocity [m/s] (3,) in {C} since the last aligned scan, and the time since then [s]."""
         if self._last is None or (period := 1e-9 * (scan.t_ns - self._last[0])) <= 0.0:
-            return
-        before, T_ca = self._last[1], T_ac.inverse()
+            return None
+        before = self._last[1]
         turn = geometry.log((T_ac @ before.inverse()).q)
         if np.linalg.norm(turn) > _MOST_TURN_RAD:
+            return None
+        rate, velocity = (geometry.rotate(T_ac.R.T, each / period) for each in (turn, T_ac.t - before.t))
+        return rate, velocity, period
+
+    def _measure_duration(self, scan: Scan, places: NDArray[Any], T_ac: Pose) -> None:
+        if (moving := self._motion(scan, T_ac)) is None:
             return
-        kept = _some(scan.points, _DURATION_POINTS)
+        rate, velocity, period = moving
+        kept, T_ca = _some(scan.points, _DURATION_POINTS), T_ac.inverse()
         p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
-        rate, velocity = (geometry.rotate(T_ca.R, each / period) for each in (turn, T_ac.t - before.t))
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
         measured = fitted_duration(self._registrar.index, p, self._camera(scan, T_ca), motion)
         if measured is not None and measured[1] > 0.0:
