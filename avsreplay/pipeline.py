@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry, monitor
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Estimator, Prediction, Track
+from avsreplay.estimate import Estimator, Prediction, Track, with_change
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.track import deskew, in_doubt, with_scan_duration
 from avsreplay.geometry import Array, Pose
@@ -102,7 +102,8 @@ class Monitors:
         failed = violations(track.belief, *found) if found else ()
         consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
         forecast = estimator.track_forecast(track, self.convergence.times_s)
-        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
+        possible = with_change(forecast, belief, track.change_P)
+        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True, possible)
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,
@@ -308,9 +309,8 @@ def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
     if not stages.reacquire or not len(scan.points):
         return False
     variance = np.diag(predicted.H @ predicted.belief.P @ predicted.H.T)
-    position, half_angle = 3.0 * np.sqrt(variance[:3].sum()), 3.0 * np.sqrt(variance[3:].sum())
-    most = MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m
-    return bool(position > most or 2.0 * half_angle > MAX_ATTITUDE_3S_RAD)
+    position, angle = 3.0 * np.sqrt(variance[:3].sum()), 6.0 * np.sqrt(variance[3:].sum())  # P holds half angles
+    return bool(position > MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m or angle > MAX_ATTITUDE_3S_RAD)
 
 
 def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:

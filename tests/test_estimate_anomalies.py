@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion, hypotheses, noise, scan_window
-from avsreplay.estimate.dynamics import propagate, propagate_state
+from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state, with_change
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
@@ -510,3 +510,17 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s
         assert scan_window.disturbance_levels(fixes[:4], 4.0) is None
     assert len(found) > 20
     assert 0.8 * density < np.sqrt(np.mean(np.square(found))) < 1.3 * density
+
+
+def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
+    """Mean square over motions of which a fifth has a change of the velocities; a linear motion of the mass centre."""
+    world, rng, share = tumbling.draw(3, seconds=1.0), np.random.Generator(np.random.PCG64(4)), 0.2
+    x, times = world.states[0], np.array([5.0, 30.0])
+    F = rng.normal(size=(20, 6)) * 1e-4
+    belief, P = Belief(0, x, 1e-8 * np.eye(20)), F @ F.T
+    plain, changed = (grasp_forecast(Belief(0, x, C), times, 1e-6, 1e-6) for C in (belief.P, belief.P + P))
+    found = with_change(plain, belief, share * P)
+    assert with_change(plain, belief, np.zeros((20, 20))) is plain
+    for name in ("pos_1s_m", "vel_1s_mps", "rot_1s_rad"):
+        before, after, mixed = (getattr(f, name) ** 2 for f in (plain, changed, found))
+        assert mixed == pytest.approx((1.0 - share) * before + share * after, rel=1e-9)

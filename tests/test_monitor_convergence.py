@@ -101,3 +101,11 @@ def test_params() -> None:
         ConvergenceParams(dwell_s=-1.0)
     with pytest.raises(ValueError, match="horizon_steps"):
         ConvergenceParams(horizon_steps=0)
+
+
+def test_a_possible_change_withholds_convergence_and_does_not_interrupt_the_dwell() -> None:
+    convergence, far = Convergence(ConvergenceParams(), 8.0), ahead(pos=1.0)
+    steps = [(belief(float(t)), ahead(), True, far if t in (1, 6) else ahead()) for t in range(9)]
+    assert [fold(convergence, steps[: n + 1]).converged for n in range(9)] == [t >= 2 and t != 6 for t in range(9)]
+    assert fold(convergence, steps[:7]).predictive_converged
+    assert fold(convergence, steps).t1_ns == 0

@@ -11,8 +11,9 @@ except ImportError:
         hint="run 'pip install .' in the source folder (needs a C++17 compiler)",
     ) from None
 
+from avsreplay.estimate.dynamics import with_change
 from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.track import Prediction, Track
 
-__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track"]
+__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track", "with_change"]

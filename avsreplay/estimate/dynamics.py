@@ -280,6 +280,21 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     return forecast_of(times, _motion.forecast(x.flat, P, density, force**2, times))
 
 
+def with_change(forecast: Forecast, belief: Belief, P: Array) -> Forecast:
+    """The forecast with a possible change of the motion, by the law of total covariance at each instant.
+
+    Args:
+        forecast: of the motion without a change.
+        belief: at its beginning.
+        P: (20, 20) second moments of the error that the change has caused by then, times its probability.
+    """
+    if not P.any():
+        return forecast
+    more = grasp_forecast(Belief(belief.t_ns, belief.x, P), forecast.times_s, 0.0, 0.0)
+    position, velocity = np.hypot(forecast.pos_1s_m, more.pos_1s_m), np.hypot(forecast.vel_1s_mps, more.vel_1s_mps)
+    return Forecast(forecast.times_s, position, velocity, np.hypot(forecast.rot_1s_rad, more.rot_1s_rad))
+
+
 def ascending(times_s: Array) -> Array:
     """Return times (n,) [s] as numbers. Raises ValueError where they do not ascend from 0."""
     times = np.asarray(times_s, dtype=np.float64)

@@ -319,7 +319,12 @@ class Convergence:
         return ConvergenceTrack()
 
     def judge(
-        self, track: ConvergenceTrack, belief: Belief, forecast: Forecast | None = None, consistent: bool = True
+        self,
+        track: ConvergenceTrack,
+        belief: Belief,
+        forecast: Forecast | None = None,
+        consistent: bool = True,
+        possible: Forecast | None = None,
     ) -> ConvergenceTrack:
         """Return the state after one more scan. An inconsistent estimate is not converged.
 
@@ -328,6 +333,9 @@ class Convergence:
             belief: the estimate after the scan.
             forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
             consistent: of the consistency tests.
+            possible: the forecast with a change of the motion that the last scans make possible; None without one.
+                While it exceeds a limit, convergence is not claimed. Once later scans exclude the change, the test has
+                held without interruption, so that the dwell goes on.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
@@ -336,7 +344,8 @@ class Convergence:
         if not (holds and consistent):
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
         since = belief.t_ns if track.since_ns is None else track.since_ns
-        converged = (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
+        excluded = possible is None or self.params.criterion is Criterion.COVARIANCE or self._predicted(possible)
+        converged = excluded and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)
 

@@ -28,6 +28,7 @@ import tumbling
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.chart import ARM, ETA, INERTIA, RATE, to_chart, to_errors
+from avsreplay.estimate.dynamics import with_change
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.track import in_doubt
@@ -224,7 +225,8 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         result.failed_at += [t] * len(failed)
         honest = honest and not in_doubt(track) and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)
-        word = test.judge(word, track.belief, forecast, honest)
+        possible = with_change(forecast, track.belief, track.change_P)
+        word = test.judge(word, track.belief, forecast, honest, possible)
         published = estimator.published(track)
         score(result, t, x, published, verdict.gamma, verdict.reason.value, word.converged)
         if any(abs(t - mark) < 0.5 / case.hz for mark in NEES_S):
