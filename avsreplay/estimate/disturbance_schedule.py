@@ -144,7 +144,7 @@ class DisturbanceSchedule:
         factors = np.array([track.window.factors[3], track.window.factors[0]])
         try:
             found = yield from find_drift(
-                track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun, _alike(track)
+                track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun
             )
             if found is None:
                 return None
@@ -194,11 +194,6 @@ class DisturbanceSchedule:
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
-
-
-def _alike(track: Track) -> float:
-    """The larger factor on R, of attitude and position, by which the errors of the poses are correlated."""
-    return 1.0 if track.inflation is None else float(track.inflation.max())
 
 
 def _all_poses(track: Track, since_ns: int = 0) -> Track:

@@ -29,7 +29,13 @@ from avsreplay.estimate.driven_motion import fit_jointly, is_bounded
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
-from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
+from avsreplay.estimate.noise_levels import (
+    MOST_POINTS,
+    NO_LEVELS,
+    NoiseLevels,
+    disturbed_likelihood,
+    pose_error_covariance,
+)
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import BUDGET, Parts
@@ -57,7 +63,6 @@ def find_drift(
     scale: tuple[float, float],
     levels: NoiseLevels = NO_LEVELS,
     known: tuple[float, Array] | None = None,
-    correlated: float = 1.0,
 ) -> Parts[DriftFound | None]:
     """The drift that the poses show with the initial values of the motion, in parts.
 
@@ -71,27 +76,27 @@ def find_drift(
         scale: prior 1 sigma of the angular acceleration [rad/s2] and of the acceleration [m/s2].
         levels: noise levels; random disturbances explain the poses as well, and better unless they are constant.
         known: onset [s] and size u (6,) of a drift that was found in fewer poses and is to be refined.
-        correlated: how many times larger than of white noise the variance of the mean of many poses is.
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
-    alike = max(1.0, min(correlated, len(poses) / len(free.points)))  # of the poses that a normal point joins
-    anew = known is None and _poor(free, factors, alike)
+    anew = known is None and _poor(free, factors, levels)
     begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
     frame, found, onsets = yield from _improved(poses, prior, factors, widths, begin)
-    if _poor(frame, factors, alike):  # a local minimum, or no constant acceleration at all
+    if _poor(frame, factors, levels):  # a local minimum, or no constant acceleration at all
         begin = free if anew else (yield from _from_sphere(fixes, poses, prior, factors, widths))
         other = yield from _improved(poses, prior, factors, widths, begin)
         frame, found, onsets = min((frame, found, onsets), other, key=lambda each: each[0].cost)
     best = max(found, key=lambda f: f.log_odds)
-    if best.log_odds < _FOUND or not frame.u.any():
+    if not frame.u.any() or (known is not None and best.log_odds < _FOUND):
         return None
     if known is None:
         free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION), key=lambda f: f.cost)
         yield _size(free)
-        if _poor(frame, factors) or free.cost - frame.cost < _FOUND:
+        # Laplace's approximation about each minimum: a linear problem about one of them does not reach the other
+        odds = best.log_odds - best.gain + (free.cost - frame.cost) / best.noise
+        if _poor(frame, factors, levels) or min(odds, free.cost - frame.cost) < _FOUND:
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
         if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
@@ -136,7 +141,8 @@ class DriftFound:
 class _Found:
     """Log odds of a drift since ``onset_s``, its most likely size u (6,), the fit's step y, and its most likely prior.
 
-    ``width`` is the 1 sigma of that prior over the given one.
+    ``width`` is the 1 sigma of that prior over the given one, ``noise`` the factor on the variance of the poses, and
+    ``gain`` the decrease of the cost in the log odds.
     """
 
     log_odds: float
@@ -144,6 +150,8 @@ class _Found:
     u: Array
     y: Array
     width: float
+    noise: float
+    gain: float
 
 
 def _improved(
@@ -189,15 +197,20 @@ def _from_sphere(
     return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
 
 
-def _poor(frame: DrivenFit, factors: Array, alike: float = 1.0) -> bool:
+def _poor(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
     """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
 
-    The bound is the quantile of chi-square by Wilson and Hilferty. The noise is at least as claimed; ``alike`` is the
-    factor on its variance by the correlation of the errors.
+    The noise is at least as claimed. Errors of near views are correlated, so that the squared residuals are not
+    chi-square. Their sum is approximated by the multiple of a chi-square value that has its mean and variance
+    (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by Wilson and Hilferty.
     """
-    dof = max(6 * len(frame.points) - DIM - 6, 6)
-    bound = dof * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
-    return 2.0 * frame.cost * min(1.0, float(factors.min())) ** 2 > bound * alike
+    white, common = (tuple(max(1.0, level) for level in each) for each in (levels.white, levels.common))
+    V = pose_error_covariance(frame.points, NoiseLevels(white, common), factors)
+    total, squares = 3.0 * float(np.trace(V, axis1=1, axis2=2).sum()), 3.0 * float((V * V).sum())
+    mean = total * max(1.0 - (DIM + 6) / (6 * len(frame.points)), 1.0 / len(frame.points))
+    dof = mean * total / squares
+    bound = mean * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
+    return 2.0 * frame.cost > bound
 
 
 def _size(fitted: DrivenFit) -> int:
@@ -309,13 +322,15 @@ def _explained(linear: DrivenFit, columns: Array, onsets: Array, widths: Array, 
         own = np.linalg.inv(precision[:, kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled)))
         b = rhs[:, kind] * scaled
         v = (own @ b[:, :, None])[:, :, 0]
-        odds = 0.5 * (v * b).sum(axis=1) + 0.5 * np.linalg.slogdet(own)[1] + prior_odds - math.log(len(_WIDTHS))
+        gain = 0.5 * (v * b).sum(axis=1)
+        odds = gain + 0.5 * np.linalg.slogdet(own)[1] + prior_odds - math.log(len(_WIDTHS))
         for k, known in enumerate(best):
             if known is not None and known.log_odds >= odds[k]:
                 continue
             u = np.zeros(6)
             u[kind] = scaled * v[k]
-            best[k] = _Found(float(odds[k]), float(onsets[k]), u, -solve @ (g + cross[k] @ u), width)
+            y = -solve @ (g + cross[k] @ u)
+            best[k] = _Found(float(odds[k]), float(onsets[k]), u, y, width, inflation, float(gain[k]))
     return [found for found in best if found is not None]
 
 

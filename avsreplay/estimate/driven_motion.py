@@ -35,7 +35,7 @@ _JOINT_STEPS, _LEAST_GAIN = 60, 0.05  # most steps of a joint fit; decrease of i
 _COARSE = 0.1  # the same, as a part of the cost, with normal points about a motion that is far from the one found
 _DAMPING, _MOST_DAMPING = 1e-3, 1e8  # of Levenberg-Marquardt: first, last
 _PIN, _PIN_STEPS, _LEAST_RISE = 0.1, 20, 1.0  # of a profile: 1 sigma, most steps, least increase, 2 for a Gaussian one
-_JOINT_WORK = 10  # work of a step for each pose, in linearised poses
+_JOINT_WORK = 4  # work of a step for each pose, in linearised poses
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
 
