@@ -81,10 +81,10 @@ def find_drift(
     onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
-    anew = known is None and _poor(free, factors, levels)
+    anew = known is None and poor_fit(free, factors, levels)
     begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
     frame, found, onsets = yield from _improved(poses, prior, factors, widths, begin)
-    if _poor(frame, factors, levels):  # a local minimum, or no constant acceleration at all
+    if poor_fit(frame, factors, levels):  # a local minimum, or no constant acceleration at all
         begin = free if anew else (yield from _from_sphere(fixes, poses, prior, factors, widths))
         other = yield from _improved(poses, prior, factors, widths, begin)
         frame, found, onsets = min((frame, found, onsets), other, key=lambda each: each[0].cost)
@@ -96,7 +96,7 @@ def find_drift(
         yield _size(free)
         # Laplace's approximation about each minimum: a linear problem about one of them does not reach the other
         odds = best.log_odds - best.gain + (free.cost - frame.cost) / best.noise
-        if _poor(frame, factors, levels) or min(odds, free.cost - frame.cost) < _FOUND:
+        if poor_fit(frame, factors, levels) or min(odds, free.cost - frame.cost) < _FOUND:
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
         if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
@@ -197,7 +197,7 @@ def _from_sphere(
     return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
 
 
-def _poor(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
+def poor_fit(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
     """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
 
     The noise is at least as claimed. Errors of near views are correlated, so that the squared residuals are not
