@@ -204,7 +204,7 @@ def poor_fit(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
     chi-square. Their sum is approximated by the multiple of a chi-square value that has its mean and variance
     (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by Wilson and Hilferty.
     """
-    white, common = (tuple(max(1.0, level) for level in each) for each in (levels.white, levels.common))
+    white, common = ((max(1.0, a), max(1.0, b)) for a, b in (levels.white, levels.common))
     V = pose_error_covariance(frame.points, NoiseLevels(white, common), factors)
     total, squares = 3.0 * float(np.trace(V, axis1=1, axis2=2).sum()), 3.0 * float((V * V).sum())
     mean = total * max(1.0 - (DIM + 6) / (6 * len(frame.points)), 1.0 / len(frame.points))
