@@ -3,8 +3,7 @@
 Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every correct estimate. They
 need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit.
 ``predictive`` tests position, velocity and attitude of the grasp point over the planner's horizon, which the capture
-needs; a body with unobservable parameters may pass it. Either must hold for the dwell time, and only while the estimate
-is consistent.
+needs; a body with unobservable parameters may pass it. Either must hold for the dwell time, with a consistent estimate.
 """
 
 from __future__ import annotations
@@ -149,8 +148,7 @@ def _gamma_quantile(a: float, p: float) -> float:
     """
     x, step = a - 1.0, math.inf
     while abs(step) > 1e-9 * x:  # the error of the next x is of second order
-        term = total = 1.0 / a
-        k = a
+        k, term, total = a, 1.0 / a, 1.0 / a
         while term > 1e-17 * total:
             k += 1.0
             term *= x / k
@@ -196,10 +194,9 @@ def violations(
     if not all(abs(ratio) < 1.0 for ratio in belief.x.sigma.tolist()):
         found.append("sigma")
     claimed, measured = pose_covariance.diagonal().tolist(), R.diagonal().tolist()
-    for block, factor in ((slice(0, 3), inflation[1]), (slice(3, 6), inflation[0])):
-        if not sum(claimed[block]) <= max(float(factor), 1.0) * _NOT_WORSE**2 * sum(measured[block]):
-            found.append("worse_than_measured")
-            break
+    blocks = (slice(0, 3), float(inflation[1])), (slice(3, 6), float(inflation[0]))
+    if not all(sum(claimed[b]) <= max(factor, 1.0) * _NOT_WORSE**2 * sum(measured[b]) for b, factor in blocks):
+        found.append("worse_than_measured")
     if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= gate:
         found.append("outside_gate")
     return tuple(found)
@@ -333,9 +330,8 @@ class Convergence:
             belief: the estimate after the scan.
             forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
             consistent: of the consistency tests.
-            possible: the forecast with a change of the motion that the last scans make possible; None without one.
-                While it exceeds a limit, convergence is not claimed. Once later scans exclude the change, the test has
-                held without interruption, so that the dwell goes on.
+            possible: the forecast with a change that the last scans make possible. While it exceeds a limit, convergence
+                is not claimed. The dwell goes on: once later scans exclude the change, the test has held.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
