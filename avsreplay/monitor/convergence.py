@@ -330,8 +330,8 @@ class Convergence:
             belief: the estimate after the scan.
             forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
             consistent: of the consistency tests.
-            possible: the forecast with a change that the last scans make possible. While it exceeds a limit, convergence
-                is not claimed. The dwell goes on: once later scans exclude the change, the test has held.
+            possible: the forecast with a change that the last scans make possible. While it exceeds a limit,
+                convergence is not claimed. The dwell goes on: once later scans exclude the change, the test has held.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
