@@ -372,6 +372,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first body")
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="angular rate [rad/s]")
+    parser.add_argument("--seconds", type=float, default=None, help="duration of each case in place of its own [s]")
     parser.add_argument("--without", action="store_true", help="without the test of hypotheses")
     parser.add_argument("--free", action="store_true", help="the estimator is told that there are no disturbances")
     given = parser.parse_args()
@@ -381,6 +382,7 @@ def main() -> None:
     for case in CASES:
         if not wanted or any(w in case.name for w in wanted):
             case = replace(case, hz=given.hz, speed=given.rate if case.speed == 0.1 else case.speed)
+            case = replace(case, seconds=given.seconds or case.seconds)
             seeds = range(given.first, given.first + given.bodies)
             print(line(case, [run(case, seed, not given.without, given.free) for seed in seeds]), flush=True)
 
