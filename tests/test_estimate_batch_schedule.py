@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
+from avsreplay.estimate.batch_schedule import _bent
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import (
@@ -320,3 +321,19 @@ def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: i
     assert np.all(np.isfinite(P))
     scale = np.sqrt(np.diagonal(P))
     assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9
+
+
+def test_one_component_of_a_curved_likelihood_is_fitted_again_once_the_inertia_has_left_it() -> None:
+    world = tumbling.draw(3, seconds=12.0)
+    track = last(world.times, world.states, replace(WHITE, start=Start.COLD), 3)
+    fitted = track.batch
+    curved = replace(fitted, gaussian=False, components=fitted.components[:1])
+    one_sigma = np.linalg.cholesky(fitted.belief.P[12:14, 12:14])
+    x = fitted.belief.x
+    for sigmas, due in ((0.0, False), (0.9, False), (1.1, True)):
+        for angle in (0.0, 1.0, 2.5):
+            moved = sigmas * one_sigma @ [np.cos(angle), np.sin(angle)]
+            belief = replace(fitted.belief, x=replace(x, sigma=x.sigma + moved))
+            assert _bent(curved, belief) is due
+            assert not _bent(replace(curved, gaussian=True), belief)
+            assert not _bent(replace(curved, components=curved.components * 3), belief)

@@ -21,6 +21,7 @@ from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_char
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.driven import DrivenBelief, propagated
 from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.error_state import SIGMA
 from avsreplay.estimate.initialise import (
     BatchResult,
     PoseFix,
@@ -91,7 +92,8 @@ class BatchSchedule:
         if len(track.fixes) < FEWEST_TO_FIT:
             return track.changed(belief=self._first(track, prediction, innovation))
         last = track.batch
-        if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
+        few = last is not None and track.since < max(1.0, self._growth(last) * last.count)
+        if last is None or not few or worn(last.components) or _bent(last, track.belief):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
                 return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
@@ -294,6 +296,17 @@ def _better_than_measured(belief: Belief, R: Array) -> bool:
     H = measurement_jacobian(belief.x)
     S = H @ belief.P @ H.T
     return all(float(np.trace(S[b, b])) <= float(np.trace(R[b, b])) for b in (slice(0, 3), slice(3, 6)))
+
+
+def _bent(last: BatchResult, belief: Belief) -> bool:
+    """Return whether the poses since a fit have moved the inertia by more than its 1 sigma along a curved likelihood.
+
+    One component stands for such a likelihood where no profile fit was found. It holds near the fit only.
+    """
+    if last.gaussian or len(last.components) > 1:
+        return False
+    moved = belief.x.sigma - last.belief.x.sigma
+    return float(moved @ np.linalg.solve(last.belief.P[SIGMA, SIGMA], moved)) > 1.0
 
 
 def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]) -> BatchResult:
