@@ -5,7 +5,8 @@
 
 Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a cylinder stage (a
 cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, and mesh files by their path.
-Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray. The scenes
+Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray; "close" is
+at 0.65 extents, with a quarter of the noise. The scenes
 add walls, outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the
 same extent alone, at the predicted place if there is a guess. "Correct": within 2 deg and 0.02 of the extent of the
 true pose, or of a pose that differs by a symmetry of the mesh. With an error of scale up to 10 % the pose counts; with
@@ -51,7 +52,7 @@ BOXES = {  # sizes and middles of the boxes of a body
     "panel": [((1.5, 1.2, 1.0), (0, 0, 0)), ((3.0, 0.8, 0.05), (2.4, 0, 0.1)), ((0.3, 0.3, 0.5), (0.4, -0.4, 0.7))],
 }
 NOISE = 0.002  # of the extent
-DISTANCE = 3.0  # extents from the camera to the middle of the target
+DISTANCE, CLOSE = 3.0, 0.65  # extents from the camera to the middle of the target
 CLAIM = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a larger squared error contradicts the claim
 RIGHT_DEG, RIGHT_OF_EXTENT = 2.0, 0.02
 
@@ -123,19 +124,26 @@ def cone(points: Array, rng: np.random.Generator, count: int) -> Array:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def pose(surface: Surface, rng: np.random.Generator) -> Pose:
-    """A random attitude, the middle of the target DISTANCE extents in front of the camera."""
+def pose(surface: Surface, rng: np.random.Generator, distance: float = DISTANCE) -> Pose:
+    """A random attitude, the middle of the target so many extents in front of the camera."""
     q = rng.standard_normal(4)
     turn = Pose(q / np.linalg.norm(q), np.zeros(3))
     middle = (surface.vertices.max(0) + surface.vertices.min(0)) / 2
-    place = surface.extent * (np.array([0.0, 0.0, DISTANCE]) + 0.2 * rng.uniform(-1, 1, 3))
+    place = surface.extent * (np.array([0.0, 0.0, distance]) + 0.2 * distance / DISTANCE * rng.uniform(-1, 1, 3))
     return Pose(turn.q, place - turn.R @ middle)
 
 
-def view(surface: Surface, count: int, seed: int, others: Callable[[Pose], list] = lambda _: [], noise: float = NOISE):
+def view(
+    surface: Surface,
+    count: int,
+    seed: int,
+    others: Callable[[Pose], list] = lambda _: [],
+    noise: float = NOISE,
+    distance: float = DISTANCE,
+):
     """A view of about ``count`` points on the target and what ``others`` (surfaces and poses) adds to it."""
     rng = np.random.Generator(np.random.PCG64(seed))
-    T_ac = pose(surface, rng)
+    T_ac = pose(surface, rng, distance)
     scene = [(surface, T_ac), *others(T_ac)]
     probe = cone(T_ac.apply(surface.vertices), rng, 2000)
     share = max(0.05, float(np.isfinite(cast(scene[:1], probe)[0]).mean()))
@@ -223,6 +231,12 @@ def _noisy(noise: float) -> Maker:
     return make
 
 
+def _close(surface: Surface, count: int, seed: int) -> Case:
+    """A camera next to the target, with a prediction as in tracking and a quarter of the noise."""
+    v = view(surface, count, seed, noise=NOISE / 4, distance=CLOSE)
+    return Case(v.points, off(v, 1.0, 0.003), v.T_ac)
+
+
 def _beside(degrees: float | None) -> Maker:
     def make(surface: Surface, count: int, seed: int) -> Case:
         v = view(surface, count, seed, second_object(surface))
@@ -255,6 +269,7 @@ SCENES: dict[str, Maker] = {
     "clean, 45 deg": _plain(45.0, 0.0),
     "clean, 60 deg": _plain(60.0, 0.0),
     "clean, search": _plain(None, 0.0),
+    "close, 1 deg": _close,
     "outliers 5 %, 3 deg": _plain(3.0, 0.01, lambda v: with_outliers(v, 0.05)),
     "outliers 60 %, 0.1 deg": _plain(0.1, 0.0002, lambda v: with_outliers(v, 0.6)),
     "outliers 60 %, 3 deg": _plain(3.0, 0.01, lambda v: with_outliers(v, 0.6)),
