@@ -252,9 +252,10 @@ def angle(q: ArrayLike) -> Array:
 
 
 def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array) -> Array:
-    """Return points (n, 3) moved by R p + t, each at its own one of ``times`` (n,).
+    """Return points (n, 3) transformed by R p + t, each with the R and t of its own time ``times`` (n,).
 
-    R (k, 3, 3) and t (k, 3) hold at evenly spaced ``knots`` (k,); in between, the moved points are interpolated.
+    R (k, 3, 3) and t (k, 3) are given at evenly spaced ``knots`` (k,). Between two knots the point is transformed at
+    both, and the result is interpolated.
     """
     at = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, len(knots) - 1.0)
     low = np.minimum(at.astype(int), len(knots) - 2)

@@ -92,8 +92,7 @@ class BatchSchedule:
         if len(track.fixes) < FEWEST_TO_FIT:
             return track.changed(belief=self._first(track, prediction, innovation))
         last = track.batch
-        few = last is not None and track.since < max(1.0, self._growth(last) * last.count)
-        if last is None or not few or worn(last.components) or _bent(last, track.belief):
+        if last is None or self._due(track, last):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
                 return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
@@ -135,6 +134,11 @@ class BatchSchedule:
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
         return CHECK_GROWTH if last.gaussian else self.params.refit_growth
+
+    def _due(self, track: Track, last: BatchResult) -> bool:
+        """Return whether the last fit no longer represents the likelihood: by the poses since then, or by its drift."""
+        enough = track.since >= max(1.0, self._growth(last) * last.count)
+        return enough or worn(last.components) or _bent(last, track.belief)
 
     def filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
         """The filter's posterior after a healthy pose, its noise window and its memory of poses."""

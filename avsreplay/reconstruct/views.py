@@ -12,6 +12,7 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Scan
+from avsreplay.register.sampling import at_instant
 from avsreplay.register.surface_index import kernel_module
 
 SAMPLE = 24  # most scans from which extent and position of the camera are determined
@@ -145,10 +146,8 @@ def spacings(tree: Any, points: Array) -> Array:
 
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
     """Points (n, 3) in {A} moved to the stamp: p(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity."""
-    times = np.asarray(times_s, dtype=np.float64)[:, None]
-    R = geometry.matrix(geometry.exp(times * twist.w_c))  # T_ac(t) has the rotation R_ac exp(w t)
-    p_c = (points - twist.T_ac.t - times * twist.v_a) @ twist.T_ac.R
-    return np.asarray(twist.T_ac.apply(np.einsum("nji,nj->ni", R, p_c)))
+    p_c = (points - twist.T_ac.t) @ twist.T_ac.R
+    return np.asarray(twist.T_ac.apply(at_instant(p_c, times_s, twist.w_c, twist.v_a @ twist.T_ac.R)))
 
 
 def _connected(points: Array) -> Array:

@@ -33,7 +33,7 @@ from avsreplay.register.backend import POSES, Availability, Backend, Target, ava
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import allowed_scans
-from avsreplay.register.sampling import without_scattered_points
+from avsreplay.register.sampling import at_instant, without_scattered_points
 from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.size import (
     MOST_OF_MODEL,
@@ -231,9 +231,7 @@ class ModelCheck:
             return p
         if (moving := self._motion(scan, T_ac)) is None:
             return None
-        times = scan.times_s[kept].astype(np.float64)[:, None]
-        back = geometry.matrix(geometry.exp(-times * moving[0]))
-        return np.asarray(np.einsum("nij,nj->ni", back, p - times * moving[1]))
+        return at_instant(p, scan.times_s[kept], moving[0], moving[1])
 
     def _motion(self, scan: Scan, T_ac: Pose) -> tuple[Array, Array, float] | None:
         """Rate [rad/s] and velocity [m/s] (3,) in {C} since the last aligned scan, and the time since then [s]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +123,20 @@ def _voxels(points: Array, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np
         np.subtract(points, points.min(axis=0), dtype=np.float64), max(voxel_m, np.finfo(float).tiny)
     )
     return found
+
+
+def at_instant(points: Array, times_s: NDArray[Any], rate: Array, velocity: Array) -> Array:
+    """Return the points of a body that moves during its scan, moved to the instant of the scan.
+
+    Args:
+        points: (n, 3) in the body's frame at that instant [m].
+        times_s: (n,) time of each point after the instant [s].
+        rate: (3,) of the body in its own frame [rad/s].
+        velocity: (3,) of the body's origin in its own frame [m/s].
+    """
+    times = np.asarray(times_s, dtype=np.float64)[:, None]
+    back = geometry.matrix(geometry.exp(-times * rate))
+    return np.asarray(np.einsum("nij,nj->ni", back, points - times * velocity))
 
 
 def without_scattered_points(points: Array) -> Array:

@@ -1,11 +1,38 @@
-// Elimination with the largest pivot of each column, in fixed size.
+// Systems of linear equations of fixed size.
 #pragma once
 #include <algorithm>
 #include <cmath>
 
 namespace avs {
 
-// The factors L U of `size` rows and columns of A from `first` on, with the rows in the order of their pivots.
+// B := A^-1 B for a symmetric positive definite A, by A = L D L'.
+template <int N, int W>
+void solve(const double A[N][N], double B[N][W]) {
+  double L[N][N], D[N];
+  for (int r = 0; r < N; ++r) {
+    for (int c = 0; c <= r; ++c) {
+      double s = A[r][c];
+      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
+      if (c < r) L[r][c] = s / D[c];
+      else D[r] = s;
+    }
+    for (int i = 0; i < r; ++i)
+      for (int c = 0; c < W; ++c) B[r][c] -= L[r][i] * B[i][c];
+  }
+  for (int r = N - 1; r >= 0; --r) {
+    for (int c = 0; c < W; ++c) B[r][c] /= D[r];
+    for (int i = r + 1; i < N; ++i)
+      for (int c = 0; c < W; ++c) B[r][c] -= L[i][r] * B[i][c];
+  }
+}
+
+// The same for one column.
+template <int N>
+void solve(const double A[N][N], double x[N]) {
+  solve<N, 1>(A, reinterpret_cast<double(*)[1]>(x));
+}
+
+// By A = L U with the largest pivot of each column: the factors L U of `size` rows and columns of A from `first` on, with the rows in the order of their pivots.
 template <int N>
 struct Factored {
   int n, pivot[N];

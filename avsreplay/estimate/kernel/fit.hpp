@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "chart.hpp"
+#include "elimination.hpp"
 #include "motion.hpp"
 
 namespace avs {
@@ -107,25 +108,6 @@ class Driven : public Problem {
   void normal();
   double cost_there(const double step[JOINT], double part, double* residuals);
 };
-
-// x := A^-1 x for a symmetric positive definite A, by A = L D L'.
-template <int N>
-void solve(const double A[N][N], double x[N]) {
-  double L[N][N], D[N];
-  for (int r = 0; r < N; ++r) {
-    for (int c = 0; c <= r; ++c) {
-      double s = A[r][c];
-      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
-      if (c < r) L[r][c] = s / D[c];
-      else D[r] = s;
-    }
-    for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
-  }
-  for (int r = N - 1; r >= 0; --r) {
-    x[r] /= D[r];
-    for (int i = r + 1; i < N; ++i) x[r] -= L[i][r] * x[i];
-  }
-}
 
 // S^-1 of a flow: errors (dq_v, w) at its start with the same effect as a unit error at its end.
 void backward(const Flow& flow, double out[6][6]);

@@ -2,31 +2,11 @@
 #include <cmath>
 #include <cstring>
 
+#include "elimination.hpp"
 #include "update.hpp"
 
 namespace avs {
 namespace {
-
-// B := S^-1 B, by S = L D L'.
-template <int W>
-void solve(const double S[SEEN][SEEN], double B[SEEN][W]) {
-  double L[SEEN][SEEN], D[SEEN];
-  for (int r = 0; r < SEEN; ++r) {
-    for (int c = 0; c <= r; ++c) {
-      double s = S[r][c];
-      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
-      if (c < r) L[r][c] = s / D[c];
-      else D[r] = s;
-    }
-    for (int i = 0; i < r; ++i)
-      for (int c = 0; c < W; ++c) B[r][c] -= L[r][i] * B[i][c];
-  }
-  for (int r = SEEN - 1; r >= 0; --r) {
-    for (int c = 0; c < W; ++c) B[r][c] /= D[r];
-    for (int i = r + 1; i < SEEN; ++i)
-      for (int c = 0; c < W; ++c) B[r][c] -= L[i][r] * B[i][c];
-  }
-}
 
 // out := A B' for A (N, W), B (SEEN, W). The sums run side by side, so that none waits for the one before.
 template <int N, int W>
@@ -46,7 +26,7 @@ void by_rows(const double A[N][W], const double B[SEEN][W], double out[N][SEEN])
 template <int W>
 void gain(const double HP[SEEN][W], const double S[SEEN][SEEN], double Kt[SEEN][W]) {
   std::memcpy(Kt, HP, SEEN * W * sizeof(double));
-  solve<W>(S, Kt);
+  solve<SEEN, W>(S, Kt);
 }
 
 // P := (I - KH) P (I - KH)' + K R K', exactly symmetric: X = (I - KH) P, then X + (K R - X H') K'.
@@ -88,7 +68,7 @@ void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2],
   product<SEEN, DIM>(pose.H, P, HP);
   gain<DIM>(HP, S, out.Kt);
   for (int r = 0; r < SEEN; ++r) one[r][r] = 1;
-  solve<DIM>(pose.S, one);
+  solve<SEEN, DIM>(pose.S, one);
   for (int r = 0; r < SEEN; ++r) std::memcpy(out.info[r], one[r], sizeof out.info[r]);
   std::memcpy(out.H, pose.H, sizeof out.H);
   std::memcpy(out.alpha, pose.alpha, sizeof out.alpha);
