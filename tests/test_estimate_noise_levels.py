@@ -19,8 +19,10 @@ from avsreplay.estimate.noise_levels import (
     MOST_POINTS,
     NO_LEVELS,
     NoiseLevels,
+    _density_odds,
     _expected,
     _position_odds,
+    _Residuals,
     _variances,
     estimate_levels,
 )
@@ -120,6 +122,16 @@ def test_the_expected_density_is_that_of_a_certain_likelihood_and_little_of_an_e
     assert _expected(np.full(len(_DENSITIES), -50.0)) < 1e-12
     bounded = np.where(_DENSITIES < 1.1e-5, 0.0, -1e3)  # anything up to 1e-5 is as likely as none
     assert 5e-7 < _expected(bounded) < 5e-6
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e8])
+def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_are(size: float) -> None:
+    """Impulses in an unstable spin have large effects over minutes, nearly those of other initial values."""
+    rng = np.random.Generator(np.random.PCG64(42))
+    e, J = rng.normal(size=144), rng.normal(size=(144, 20))
+    effects = rng.normal(size=(144, 69)) + size * J @ rng.normal(size=(20, 69))
+    _, odds = _density_odds(np.eye(144), effects, _Residuals(e, J, 1e-12 * np.eye(20), np.zeros(20)))
+    assert odds.max() <= 0.5 * float(e @ e)
 
 
 def test_a_given_density_is_not_changed() -> None:

@@ -160,23 +160,25 @@ def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Ar
 
     They are marginal over the initial values, without their constant. ``effects`` (m, k) are those of the disturbance.
     """
-    none, A, b = _likelihood(V, effects, data)
+    none, A, b, chi2 = _likelihood(V, effects, data)
     values, vectors = np.linalg.eigh(A)
-    along, gain = vectors.T @ b, _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
-    fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
+    most = chi2 * np.maximum(values, 0.0)  # by Cauchy and Schwarz; rounding can exceed it
+    squares, gain = np.minimum((vectors.T @ b) ** 2, most), _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
+    fitted = _DENSITIES[:, None] ** 2 * squares / (1.0 + gain)
     return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
 
 
-def _likelihood(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array, Array]:
-    """Log likelihood of the poses with noise V, and the normal equations (k, k), (k,) of unknowns with ``effects``."""
+def _likelihood(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array, Array, float]:
+    """Log likelihood of the poses with noise V, normal equations (k, k), (k,) by ``effects``, chi2 of the residuals."""
     root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
     white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
     columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
     Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
     e = np.concatenate([white[:, -1], prior @ data.off])
     left = e - Q @ (Q.T @ e)
-    none = -0.5 * float(left @ left) - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
-    return none, columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns), columns.T @ left
+    chi2 = float(left @ left)
+    none = -0.5 * chi2 - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
+    return none, columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns), columns.T @ left, chi2
 
 
 def _slack(e: Array, theta: Array, parts: _Components) -> float:
