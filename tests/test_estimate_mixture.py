@@ -190,6 +190,30 @@ def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_
     assert not_worse(precise, T_NS, pose, 1.1 * C, 1.0, (0.0, 0.0)) is precise
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fit_is_compared_with_a_pose_at_the_instant_of_that_pose(seed: int) -> None:
+    """A fit whose pose is precise at its scan and not half a second later, where the mean instant of the points is."""
+    x, _ = body(seed)
+    T = to_errors(to_chart(x))
+    Phi = dynamics.propagate_state(x, 0.5)[1]
+    variances = np.full(20, 1e-12)
+    variances[3:6], variances[9:12] = 1e-2**2, 2e-2**2  # rate [rad/s] and velocity [m/s]
+    P = np.linalg.inv(T) @ np.diag(variances) @ np.linalg.inv(T).T
+    fitted = (Component(1.0, 1.0, T_NS, to_chart(x), P),)
+    there = dynamics.propagate_state(x, 0.5)[0]
+    H = to_fixture(there.T_ac.q, there.q_bc) @ measurement_jacobian(there)
+    S = H @ Phi @ np.diag(variances) @ Phi.T @ H.T
+    white = np.linalg.inv(np.linalg.cholesky(C))
+    assert np.linalg.eigvalsh(white @ S @ white.T)[-1] > 10.0
+    late = T_NS + 500_000_000
+    after = moments(not_worse(fitted, late, seen(x, 0.5), C, 1.0, (0.0, 0.0)))
+    assert after.t_ns == late
+    H = to_fixture(after.x.T_ac.q, after.x.q_bc) @ measurement_jacobian(after.x)
+    assert np.linalg.eigvalsh(white @ H @ after.P @ H.T @ white.T)[-1] == pytest.approx(1.0, rel=0.01)
+    exact = moments(not_worse(fitted, T_NS, x.T_ac, C, 1.0, (0.0, 0.0)))
+    np.testing.assert_allclose(exact.P, np.diag(variances), atol=1e-15)  # at its own instant it is precise enough
+
+
 def after_scans(times: Array, states: list[State], seed: int) -> tuple[Estimator, Track]:
     """A cold estimate after poses of 2 mm and 0.1 deg."""
     rng, estimator = np.random.default_rng(seed), Estimator(EstimatorParams(), None, 4.0)

@@ -52,11 +52,14 @@ def test_points_with_times_are_carried_to_one_instant(cli, fixtures_folder):
     assert [row["seq"] for row in with_it if row["gamma"] == 0] == [22]  # the scan with the injected clock fault
 
 
-def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path):
+@pytest.mark.parametrize(
+    ("hz", "scan_s", "pattern"), [(2.0, 0.3, "raster"), (1.0, 0.9, "raster"), (5.0, 0.15, "lissajous")]
+)
+def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path, hz, scan_s, pattern):
     """The points are moved to the stamp by a motion that is hardly known; the pose has this error too."""
     scenario, log = tmp_path / "raster.toml", tmp_path / "raster.mcap"
-    text = "duration_s = 8.0\nrate_hz = 2.0\n[scanner]\npattern = 'raster'\nscan_s = 0.3\nrays = [60, 60]\n"
-    scenario.write_text(text, encoding="utf-8")
+    text = f"duration_s = {16.0 / hz}\nrate_hz = {hz}\n[scanner]\npattern = '{pattern}'\nscan_s = {scan_s}\n"
+    scenario.write_text(text + "rays = [60, 60]\n", encoding="utf-8")
     assert cli("record", scenario, "-o", log).code == 0
     found = rows(cli, log, "--start", "cold")
     assert {"fit"} <= {row["estimator"] for row in found}

@@ -19,7 +19,7 @@ from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
-from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast
+from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast, propagated
 from avsreplay.estimate.error_state import RHO, semidefinite
 from avsreplay.estimate.frame import ZERO, EstimatorFrame
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
@@ -33,7 +33,7 @@ from avsreplay.estimate.measurement import (
     residual,
 )
 from avsreplay.estimate.mixture import mixture_forecast
-from avsreplay.estimate.noise import NO_INFLATION, Noise
+from avsreplay.estimate.noise import NO_INFLATION, Noise, NoiseWindow
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -238,11 +238,14 @@ class Estimator:
         """
         if track.mode not in ("fit", "filter"):
             return None
-        left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
-        R, x = self.noise.rescaled(innovation.R, prediction.window, track.window), prediction.belief.x
-        if prediction.blur is not None:  # the points were moved to one instant with the error of the prior's motion
-            R = R + in_camera(prediction.blur, x.T_ac.q, x.q_bc)
-        covariance, inflation = self.pose_covariance(track.belief), track.inflation
+        belief, x = track.belief, prediction.belief.x
+        left, R, scaled = residual(belief.x, x, innovation.alpha), innovation.R, prediction.window
+        if prediction.lag_s or prediction.blur is not None:  # the pose belongs to the mean instant of its points
+            fix, scaled = self.batch.fix(prediction, innovation), NoiseWindow.empty()
+            belief, _ = propagated(belief, fix.t_ns, 0.0, 0.0, self.batch.orbit)
+            left, R = innovation_vector(belief.x, fix.T_ac), in_camera(fix.C, fix.T_ac.q, belief.x.q_bc)
+        R = self.noise.rescaled(R, scaled, track.window)
+        covariance, inflation = self.pose_covariance(belief), track.inflation
         gate = gate_of(innovation.dof, R, R + covariance)
         return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
 
@@ -337,13 +340,10 @@ class Estimator:
         return driven_forecast(belief, times_s, *(given or 0.0 for given in self.params.disturbances))
 
     def pose_covariance(self, belief: Belief) -> Array:
-        """The covariance of the pose of {C}, H P H' (H of eq:innovation).
+        """Covariance (6, 6) of the pose of {C}, H P H' (eq:innovation): position in {A} [m], half angles in {B} [rad].
 
         Args:
             belief: mean and covariance.
-
-        Returns:
-            (6, 6) covariance: position in {A} [m], half-angle vector in {B} [rad].
         """
         H = measurement_jacobian(belief.x)
         return np.asarray(H @ belief.P @ H.T)

@@ -173,7 +173,7 @@ def not_worse(
 
     Args:
         components: the result of the fit.
-        t_ns: instant of its last pose [ns].
+        t_ns: instant of its last pose [ns]: the mean instant of the points, where each has its own time.
         pose: that pose T_ac, as measured.
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
         weight: Cauchy weight of the pose.
@@ -181,6 +181,8 @@ def not_worse(
         orbit: the relative orbit that the target is on; None for free motion.
     """
     whiten = _motion.roots(C[None])[0][0]
+    if components[0].t_ns != t_ns:
+        components = carried(components, t_ns, pose, np.zeros((6, 6)), np.ones(2), 1.0, noise, orbit)
     values, axes = _excess(components, whiten)
     if values[-1] <= 1.0:
         return components
