@@ -18,6 +18,7 @@ from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.backend import healthy_work
+from avsreplay.register.budget import HEALTHY_SCANS
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import (
     Candidate,
@@ -26,7 +27,6 @@ from avsreplay.register.global_search import (
     VisibleCentroids,
 )
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.restarts import HEALTHY_SCANS
 from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 

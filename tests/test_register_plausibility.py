@@ -11,10 +11,10 @@ from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar, allowed_scans
 from avsreplay.register.backend import healthy_work
+from avsreplay.register.budget import HEALTHY_SCANS, Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.quality import Visibility
-from avsreplay.register.restarts import HEALTHY_SCANS, Budget
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
@@ -107,6 +107,21 @@ def test_a_surface_that_continues_beyond_an_edge_is_another_object() -> None:
         scan = points + rng.normal(0.0, 0.003, points.shape)
         assert test.continued(scan, T_ac.inverse()) is continued
         assert (test.check(scan, T_ac.inverse()).reason != "") is continued
+
+
+@pytest.mark.parametrize("count", [700, 5000])
+def test_points_well_off_the_model_are_counted_as_their_distances_say(registrar: Registrar, count: int) -> None:
+    """Among 1,000 points of the scan: two gates off or more, but within the reach of the index."""
+    T_ac, rng = example_pose(), np.random.default_rng(SEED)
+    scan = hidden_view(registrar._target.surface, T_ac, count, rng)
+    stray = rng.random(len(scan)) < 0.07
+    scan[stray] += rng.uniform(-1.0, 1.0, (stray.sum(), 3)) * registrar.limits.reach_m
+    found = registrar.register(scan, T_ac)
+    few = scan[np.linspace(0, len(scan) - 1, 1000).astype(int)] if len(scan) > 1000 else scan
+    distance = registrar._test.measure(few, found.T_ac.inverse())
+    off = (distance > 2.0 * registrar.limits.gate_m) & (distance < registrar.index.reach_m)
+    assert found.inlier_ratio > 0.9
+    assert found.well_off == np.count_nonzero(off) > 10
 
 
 def test_points_on_faces_that_face_away_from_the_camera_are_not_of_this_model() -> None:

@@ -13,10 +13,11 @@ from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
+from avsreplay.register.budget import Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.neighbourhood import Neighbourhood
-from avsreplay.register.restarts import Budget, Restarter
+from avsreplay.register.restarts import Restarter
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 SCENARIO = """

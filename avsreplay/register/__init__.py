@@ -30,9 +30,9 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
+from avsreplay.register.budget import allowed_scans
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.restarts import allowed_scans
 from avsreplay.register.sampling import at_instant, without_scattered_points
 from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.size import (

@@ -24,17 +24,11 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import HornBackend, Target
+from avsreplay.register.budget import FAR_WORK, MEASURED_WORK, Budget
 from avsreplay.register.covariance import noise_along
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
-from avsreplay.register.restarts import (
-    FAR_WORK,
-    MEASURED_WORK,
-    STOP_OF_EXTENT,
-    Budget,
-    Restart,
-    Restarter,
-)
+from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN
 from avsreplay.register.surface_index import SurfaceIndex
 

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.quality import Visibility, not_measured
+from avsreplay.register.quality import WELL_OFF, Visibility, not_measured
 from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
@@ -64,7 +64,7 @@ LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of 
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
 POINTS_PER_CELL = 8.0
 GRID = 4096
-BEYOND, MIRRORED = (2.0, 5.0), 2.0  # a point beyond an edge is so many widths away, and its image so many sigmas
+BEYOND, MIRRORED = (WELL_OFF, 5.0), 2.0  # a point beyond an edge is so many widths away, and its image so many sigmas
 LEAST_BEYOND, MOST_CONTINUED = 10, 0.5  # a surface continues beyond an edge with so many points, and this share of them
 LEAST_IMAGE = 0.1  # least distance of an image from the face that counts as on it, in gates
 CONTINUED = "the surface in the scan continues beyond the edges of the model, as that of another or a larger object"

@@ -34,7 +34,7 @@ CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 LEAST_SEEN, NEAR_FACE_OF_EXTENT = 0.85, 0.01  # share of points so near to a face towards a camera close to the model
 FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
-TESTED_POINTS = 200
+TESTED_POINTS, WELL_OFF, PART = 200, 2.0, 1000  # points; gates; points among which those so far off are counted
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
@@ -122,7 +122,7 @@ class PoseQuality:
         bounded: the standard deviations are below the extent and 1 rad.
         beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
         covariance, dof: (6, 6) and its degrees of freedom.  split_nis: the test of halves, NaN where it was not made.
-        size, size_1s: as of ``covariance.patch_size``.
+        size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates off.
         patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
     """
 
@@ -143,6 +143,7 @@ class PoseQuality:
     split_nis: float
     size: float
     size_1s: float
+    well_off: int
     patches: tuple[Any, ...]
 
 
@@ -157,8 +158,7 @@ def evidence(
 ) -> Evidence:
     """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from the residuals.
 
-    A patch is the points that project onto their faces in one cube; each point is its own patch if there are not more
-    than ``LEAST_PATCHES`` cubes.
+    A patch is the points that project onto their faces in one cube, or one point with at most ``LEAST_PATCHES`` cubes.
     """
     facing = visibility.camera_c(index, points, T_ca) is not None
     size = PATCH_OF_EXTENT * index.extent_m
@@ -229,8 +229,7 @@ def grade(
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(failed, message="returned its guess unchanged, although the residuals require a step")
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
-    weakest: tuple[str, ...] = ()
-    free: Array | None = None
+    weakest, free = tuple[str, ...](), None
     if found.observable:
         P = found.covariance
         if not found.bounded:
@@ -269,13 +268,14 @@ def grade(
         message=_message(settled, size, found.size_1s if P is not None and systematic else 0.0),
         dof=np.inf if P is None else found.dof,
         free=free if weakest else None,
+        well_off=found.well_off,
     )
 
 
 def _other_size(found: PoseQuality) -> bool:
     """Whether size is fitted: the sums of patches suggest another size, or many points are not on the model."""
-    suggested = max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
-    return found.inliers < MANY_INLIERS * found.points or abs(found.size) > suggested
+    suggested = abs(found.size) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
+    return found.inliers < MANY_INLIERS * found.points or suggested
 
 
 def _message(settled: bool, size: SizeError | None, size_1s: float) -> str:
@@ -302,7 +302,8 @@ def _grade(
     overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
     step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
     rule = (min(gate_m, index.reach_m), PATCH_OF_EXTENT * extent, LEAST_PATCHES, *camera, *noise, *overlap, *step)
-    return PoseQuality(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
+    counted = (np.ascontiguousarray(across), WELL_OFF * gate_m, MANY_INLIERS, PART)
+    return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, 1, fit.matches))
 
 
 def _observable_information(view: Directions, found: Evidence, extent_m: float, systematic: bool) -> Array:
@@ -327,8 +328,7 @@ def left_undetermined(found: Alignment, motions: Array) -> Alignment:
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
     """Return an alignment without a measurement: the guess is kept, no inliers, no information."""
-    pose = T_ac if T_ac is not None else Pose.identity()
-    return Alignment(pose, 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
+    return Alignment(T_ac or Pose.identity(), 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
 
 
 def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:

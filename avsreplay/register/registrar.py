@@ -16,12 +16,12 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
+from avsreplay.register.budget import HEALTHY_SCANS, LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.neighbourhood import NOT_COMPARED, Neighbourhood, of_many
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.restarts import Budget, Restart, Restarter
 from avsreplay.register.rivals import LEAST_RAYS, NOT_TURNED, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
@@ -66,7 +66,7 @@ class Registrar:
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self.index, self._visibility, self.limits.gate_m)
-        self._restarter = Restarter(self._target, self._test)
+        self._restarter = restarts.Restarter(self._target, self._test)
         self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter)
 
     def register(
@@ -75,7 +75,7 @@ class Registrar:
         guess: Pose,
         seq: int = 0,
         carried: bool = False,
-        effort: int = restarts.HEALTHY_SCANS,
+        effort: int = HEALTHY_SCANS,
         unknown: Array | None = None,
     ) -> Alignment:
         """Register a scan from a guess (eq:ICP).
@@ -111,7 +111,7 @@ class Registrar:
             found = found if effort <= 1 else self._settled(scan, found, budget, halves, carried, unknown)
         return self._neighbourhood.with_bias(scan, found, budget)
 
-    def acquire(self, points: NDArray[Any], effort: int = restarts.HEALTHY_SCANS) -> Alignment:
+    def acquire(self, points: NDArray[Any], effort: int = HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
 
         Args:
@@ -136,7 +136,7 @@ class Registrar:
     ) -> Alignment:
         """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
-        budget.spend(restarts.SCATTER_WORK * len(scan))
+        budget.spend(SCATTER_WORK * len(scan))
         few, results = self._restarter.part(target), list[Alignment]()
         none = quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse())
         whole: SearchResult | None = None
@@ -146,7 +146,7 @@ class Registrar:
             before = whole if part is target else None
             left = budget.left - self._symmetry.after_search(len(scan))
             search = self._symmetry.search.search(part, number, before, known, left)
-            budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
+            budget.spend(search.work + TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
             results.append(found)
@@ -311,12 +311,12 @@ class Registrar:
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
     def _regraded(
-        self, scan: NDArray[Any], few: NDArray[Any], kept: Restart, budget: Budget, halves: bool, carried: bool
+        self, scan: NDArray[Any], few: NDArray[Any], kept: restarts.Restart, budget: Budget, halves: bool, carried: bool
     ) -> Alignment:
         """Register with a rejection distance that follows the noise; among other objects also along the valley."""
         width = self._restarter.width(kept)
         found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= restarts.LEAST_RATIO or budget.brief:
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO or budget.brief:
             return found
         moved = self._neighbourhood.along_valley(few, found.T_ac.inverse(), budget)
         if moved is None:

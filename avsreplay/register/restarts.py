@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus, Fit
-from avsreplay.register.backend import FIXED_WORK, Target, healthy_work
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.records import Alignment, AlignStatus
+from avsreplay.register.backend import Target
+from avsreplay.register.budget import FAR_WORK, LEAST_RATIO, MEASURED_WORK, PASS_WORK, TEST_WORK, Budget
+from avsreplay.register.plausibility import LEAST_BEYOND, NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.quality import PART
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
-LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
-POINTS = 1000  # points of the scan used by restarts
+POOR_OF_GATE = 0.3  # with at least LEAST_RATIO of inliers and a smaller rms (in units of the gate) a fit is close
+POINTS = PART  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
@@ -35,60 +37,8 @@ SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less 
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
-FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
-SCATTER_WORK = 10  # cost per point of leaving out scattered points
-TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
-PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
 COMPARED_WORK = 4 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about four times
 HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise at the result of a search it is not registered to the whole scan
-HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
-
-
-def allowed_scans(failed: int) -> int:
-    """Return the work allowed for a scan, in units of an ordinary registration, before the first accepted pose.
-
-    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far.
-    Their total work therefore stays small with a wrong model, of which no pose explains any scan.
-
-    Args:
-        failed: scans before this one on which no pose was accepted.
-    """
-    due = 0
-    while due < failed:
-        due += max(1, due // 2)
-    return HEALTHY_SCANS if due == failed else 1
-
-
-class Budget:
-    """Point searches left for one scan: counted work, so that results do not depend on the machine.
-
-    Args:
-        points: points of the scan.
-        scans: most work in units of an ordinary registration; 1 leaves nothing for restarts and searches.
-    """
-
-    def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
-        self.brief = scans <= 1
-        self.left = scans * healthy_work(points)
-        self.exhausted = False
-
-    def spend(self, searches: int) -> None:
-        """Subtract work that was done."""
-        self.left -= searches
-
-    def registered(self, fit: Fit, found: Alignment, sized: bool) -> None:
-        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated.
-
-        ``sized``: the size is fitted where many points are off the model.
-        """
-        share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        size = SIZE_WORK if sized and found.inlier_ratio < LEAST_RATIO else 0
-        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK + size)
-
-    def allows(self, searches: int, kept: int = 0) -> bool:
-        """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
-        self.exhausted = self.exhausted or searches > self.left
-        return not self.exhausted and searches + kept <= self.left
 
 
 @value_class
@@ -240,8 +190,9 @@ class Restarter:
 
     def sound(self, points: NDArray[Any], found: Alignment, budget: Budget) -> bool:
         """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues beyond the model."""
-        if not self.healthy(found.inlier_ratio, found.rms_m) or found.inlier_ratio >= COMPLETE:
-            return self.healthy(found.inlier_ratio, found.rms_m)
+        close = self.healthy(found.inlier_ratio, found.rms_m)
+        if not close or found.inlier_ratio >= COMPLETE or found.well_off < LEAST_BEYOND:
+            return close
         few = self.part(points)
         budget.spend(MEASURED_WORK * len(few))
         return not self._test.continued(few, found.T_ac.inverse())

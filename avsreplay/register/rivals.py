@@ -24,13 +24,13 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache
 from avsreplay.register.backend import Target, healthy_work
+from avsreplay.register.budget import TEST_WORK
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
 from avsreplay.register.neighbourhood import VALLEY_WORK
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
-from avsreplay.register.restarts import TEST_WORK
 from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module

@@ -27,11 +27,11 @@ class Matcher {
 
   int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
 
-  // The inliers of a chunk, in the order of the scan; returns how many.
-  int inliers(int64_t chunk, Match* out) const {
+  // The inliers of a chunk, in the order of the scan; returns how many. `off`: the numbers of the others in the chunk.
+  int inliers(int64_t chunk, Match* out, uint16_t* off = nullptr) const {
     const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
     const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
-    return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out);
+    return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out, off);
   }
 
  private:
@@ -47,6 +47,7 @@ class Matcher {
 // What one chunk adds.
 struct Part {
   int inliers = 0;
+  uint16_t off[CHUNK];  // the first are the numbers of its other points
   double sum_d2 = 0, sum[3] = {0, 0, 0};
 };
 
@@ -144,7 +145,7 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
     team.each(many, [&](int64_t k) {
       Match* found = sorted.chunk(k);
       Part& part = parts[(size_t)(first + k)];
-      part.inliers = matcher.inliers(first + k, found);
+      part.inliers = matcher.inliers(first + k, found, part.off);
       for (Match* m = found; m != found + part.inliers; ++m) {
         part.sum_d2 += m->d2;
         for (int a = 0; a < 3; ++a) part.sum[a] += m->p[a];
@@ -155,6 +156,8 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
       const Part& part = parts[(size_t)(first + k)];
       double* to = errors.data() + out.inliers;
       for (int i = 0; i < part.inliers; ++i) to[i] = std::fabs(sorted.chunk(k)[i].e);
+      const int64_t begin = (first + k) * CHUNK, others = std::min<int64_t>(v.n - begin, CHUNK) - part.inliers;
+      for (int64_t i = 0; i < others; ++i) out.off.push_back(begin + part.off[i]);
       out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
       for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
     }
@@ -294,6 +297,28 @@ struct Found {
 };
 
 }  // namespace
+
+int64_t count_beyond(const Store& s, const Code& code, const View& v, const double* T, bool sided, double beyond, int64_t part,
+                     const std::vector<int64_t>& off) {
+  std::vector<double> points;
+  const double step = (double)(v.n - 1) / (double)(part - 1);  // as numpy.linspace
+  const auto add = [&](int64_t k) { points.resize(points.size() + 3), copy_point(v, k, points.data() + points.size() - 3); };
+  if (v.n <= part) {
+    for (const int64_t k : off) add(k);
+  } else {
+    auto next = off.begin();
+    for (int64_t i = 0; i < part && next != off.end(); ++i) {
+      const int64_t k = i + 1 < part ? (int64_t)((double)i * step) : v.n - 1;
+      next = std::lower_bound(next, off.end(), k);
+      if (next != off.end() && *next == k) add(k);
+    }
+  }
+  const View few{reinterpret_cast<const char*>(points.data()), (int64_t)points.size() / 3, 3 * (int64_t)sizeof(double), sizeof(double), false};
+  const Found found(s, code, few, T, sided && s.mesh, s.reach);
+  int64_t count = 0;
+  for (size_t k = 0; k < found.d2.size(); ++k) count += found.id[k] >= 0 && found.d2[k] > beyond * beyond;
+  return count;
+}
 
 int64_t distances(const Store& s, const Code& code, const View& v, const double* T, const Sight& sight, double most, double* out) {
   const int64_t stride = std::max<int64_t>(1, v.n / sight.tested);

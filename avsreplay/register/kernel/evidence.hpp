@@ -8,6 +8,7 @@ struct Evidence {
   int64_t points = 0, inliers = 0;
   double sum_d2 = 0, centre[3] = {0, 0, 0};  // centroid of the inliers
   double median = 0;                         // of |e|
+  std::vector<int64_t> off;                  // numbers of the points that are no inliers, ascending
   std::vector<PatchSums> patches;            // in the order of their first points
 };
 
@@ -37,6 +38,11 @@ struct Sight {
   int64_t tested;
   double least_facing;
 };
+// Points among `part` of a scan, evenly over its order, that are farther than `beyond` from the model at T but within the reach of
+// the index. `off`: the numbers of the points that may be, ascending. `sided`: only faces that face t of T count.
+int64_t count_beyond(const Store& store, const Code& code, const View& points, const double* T, bool sided, double beyond, int64_t part,
+                     const std::vector<int64_t>& off);
+
 // The distances of the points of a scan to the model at T, at most `most`; returns the work in ordinary searches.
 int64_t distances(const Store& store, const Code& code, const View& points, const double* T, const Sight& sight, double most,
                   double* out);

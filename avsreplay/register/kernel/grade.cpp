@@ -132,6 +132,8 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   for (const int64_t count : sums.counts) out.used += count;
   out.total = total(sums.normals.data(), sums.size());
   if (!out.overlap) return out;
+  const bool close = (double)e.inliers >= rule.least_close * (double)e.points;
+  out.well_off = close ? count_beyond(s, code, v, T, patches.facing, rule.beyond, rule.part, e.off) : (int64_t)e.off.size();
   out.observable = is_observable(out.total, out.used, out.centre, rule.least_information);
   if (!out.observable) {
     out.patches = std::move(sums);

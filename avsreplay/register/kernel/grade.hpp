@@ -16,6 +16,8 @@ struct GradeRule {
   bool systematic;               // the covariance includes systematic errors
   double turn, move;             // accuracy of the back end [rad, m]
   std::vector<double> across;    // (k, 3) directions of the test of halves
+  double beyond, least_close;    // [m], see `well_off`; with a smaller share of inliers all others are counted
+  int64_t part;
 };
 
 // The sums of the patches as arrays.
@@ -38,6 +40,7 @@ struct Grade {
   PatchArrays patches;           // those used, where there is overlap but not every motion is observable
   bool measured = false;         // what follows is known: there is overlap, and every motion is observable
   bool bounded = true, beyond = false;  // standard deviations below the extent; the residuals ask for a step
+  int64_t well_off = 0;          // of `part` points, those off the model by `beyond`, see `count_beyond`
   Estimated covariance;
   double split;                  // NaN: not tested
   std::array<double, 2> size{};  // of `size_error`

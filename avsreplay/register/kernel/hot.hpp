@@ -116,8 +116,8 @@ struct Code {
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
   // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
-  // is said there must hold for the eye of `look`, and below its `known`.
-  int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
+  // is said there must hold for the eye of `look`, and below its `known`. `off`: the numbers of the others, or null.
+  int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out, uint16_t* off);
   // Adds the n matches that `order` names, ascending; partial sums of those of a chunk are added in the order of chunks.
   void (*add)(const Match*, const uint32_t* order, int64_t n, PatchSums&);
   void (*field_pass)(const FieldTable&, const FieldLook&, FieldSums&);

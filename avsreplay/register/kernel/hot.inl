@@ -45,9 +45,10 @@ static void pass(const Store& s, const View& v, int64_t first, int64_t last, con
          : pass_kind<Points>(s, v, first, last, look, kept, out);
 }
 
-static int match(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
-  return s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out)
-                : match_kind<Points>(s, v, first, last, look, kept, out);
+static int match(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out,
+                 uint16_t* off) {
+  return s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out, off)
+                : match_kind<Points>(s, v, first, last, look, kept, out, off);
 }
 }  // namespace AVS_ISA
 

@@ -1,0 +1,60 @@
+"""The work that one scan may cost, counted in point searches, so that results do not depend on the machine."""
+
+from __future__ import annotations
+
+from avsreplay.records import Alignment, Fit
+from avsreplay.register.backend import FIXED_WORK, healthy_work
+
+LEAST_RATIO = 0.9  # with fewer inliers the size is fitted
+FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
+SCATTER_WORK = 10  # cost per point of leaving out scattered points
+TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
+PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
+HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
+
+
+def allowed_scans(failed: int) -> int:
+    """Return the work allowed for a scan, in units of an ordinary registration, before the first accepted pose.
+
+    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far.
+    Their total work therefore stays small with a wrong model, of which no pose explains any scan.
+
+    Args:
+        failed: scans before this one on which no pose was accepted.
+    """
+    due = 0
+    while due < failed:
+        due += max(1, due // 2)
+    return HEALTHY_SCANS if due == failed else 1
+
+
+class Budget:
+    """Point searches left for one scan: counted work, so that results do not depend on the machine.
+
+    Args:
+        points: points of the scan.
+        scans: most work in units of an ordinary registration; 1 leaves nothing for restarts and searches.
+    """
+
+    def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
+        self.brief = scans <= 1
+        self.left = scans * healthy_work(points)
+        self.exhausted = False
+
+    def spend(self, searches: int) -> None:
+        """Subtract work that was done."""
+        self.left -= searches
+
+    def registered(self, fit: Fit, found: Alignment, sized: bool) -> None:
+        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated.
+
+        ``sized``: the size is fitted where many points are off the model.
+        """
+        share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
+        size = SIZE_WORK if sized and found.inlier_ratio < LEAST_RATIO else 0
+        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK + size)
+
+    def allows(self, searches: int, kept: int = 0) -> bool:
+        """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
+        self.exhausted = self.exhausted or searches > self.left
+        return not self.exhausted and searches + kept <= self.left
