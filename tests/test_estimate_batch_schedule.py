@@ -138,7 +138,7 @@ def test_process_noise_increases_the_covariance_and_zero_noise_gives_the_fit() -
     found = fixes(4, 100.0)
     poses, params = poses_of(found), WHITE.resolved(2.0)
     prior = weak_prior(poses, params)
-    fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
+    fitted = whole(fit(poses, to_chart(rough_state(found)), prior, FitParams()))
     problem = Problem(poses, prior, fitted.effective, fitted.chart)
     curvature = problem.covariance
     y, calm = process_noise_pass(fitted.chart, None, problem, (0.0, 0.0))

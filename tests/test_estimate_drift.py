@@ -184,7 +184,7 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
     u = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)])
     begin = ((to_chart(truth), u), (to_chart(rough_state(fixes)), np.zeros(6)))
     true, found = (whole(fit_jointly(poses, c, prior, np.ones(2), 0.0, a, widths)) for c, a in begin)
-    free = fit_driven(poses, to_chart(truth), prior, np.ones(2), 0.0, np.zeros(6))
+    free = whole(fit_driven(poses, to_chart(truth), prior, np.ones(2), 0.0, np.zeros(6)))
     assert free.cost > true.cost + 14.0
     assert abs(found.cost - true.cost) < 1.0
     assert whole(is_bounded(found, widths))

@@ -294,7 +294,7 @@ class AnomalyTest:
         inflation = np.ones(2) if track.inflation is None else track.inflation
         window = track.window.factors
         factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
-        fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
+        fitted = whole(fit(poses, prior.mean, prior, FitParams(rescale=False), factors))
         now_ns, noise = fixes[-1].scan_ns, self.batch.noise_levels(track)
         found = BatchCovariance(fitted, ())
         after_s = (now_ns - t_ns) * 1e-9
@@ -314,8 +314,8 @@ class AnomalyTest:
     def _from_poses(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels) -> Track | None:
         """A new track from some poses; None where they contradict one another."""
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
-        poses = poses_of(fixes)
-        fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
+        poses, start = poses_of(fixes), to_chart(rough_state(fixes))
+        fitted = whole(fit(poses, start, weak_prior(poses, self.params), FitParams(rescale=False)))
         agree = 2.0 * fitted.half_chi2 <= EXPLAINED * (6 * len(fixes) - 12)
         return self._started(track, epochs, levels) if agree else None
 

@@ -24,15 +24,18 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.dynamics import SUBSTEP_RAD
 from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.relative_orbit import OrbitArc
+from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
+_MOST_WORK = 2 * BUDGET  # linearised poses of a descent, or pieces of their rotation, from which it is continued later
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +226,7 @@ class Problem:
     def reweigh(self, factors: Array, redescend: bool = True) -> None:
         """Use other noise factors, or Huber's weights in place of Cauchy's, with the same linearisation."""
         self.factors = factors
-        self.core.noise(_pair(factors), redescend, self._slack)
+        self.core.noise((float(factors[0]), float(factors[1])), redescend, self._slack)
 
     def cost(self, chart: Chart) -> float:
         """Half chi-square of initial values, including the prior."""
@@ -233,15 +236,26 @@ class Problem:
         """Half chi-square of the poses alone."""
         return self.core.residuals(chart.flat)[1]
 
-    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> tuple[Chart, Array, int]:
-        """The fit from ``start`` with one direction fixed.
+    def descended(self, most: int, gain_tol: float) -> Parts[tuple[int, bool]]:
+        """Descend to the minimum, in parts, and return the number of steps and whether the stopping rule was met."""
+        turned = float(np.linalg.norm(self.chart.w_c)) * float(np.ptp(self.poses.times_s))
+        part = max(1, int(_MOST_WORK / max(len(self.poses), turned / SUBSTEP_RAD)))
+        steps, done = self.core.descend(min(part, most), gain_tol)
+        while not done and steps < most:
+            yield BUDGET
+            more, done = self.core.descend(min(part, most - steps), gain_tol, go_on=True)
+            steps += more
+        return steps, done
+
+    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> Parts[tuple[Chart, Array, int]]:
+        """The fit from ``start`` with one direction fixed, in parts.
 
         Returns:
             Its chart, its covariance (20, 20) in the chart, and the number of steps, at most ``most``.
         """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
-        steps = self.core.descend(most, max(params.gain_tol, _PIN_TOL))[0]
+        steps, _ = yield from self.descended(most, max(params.gain_tol, _PIN_TOL))
         found = self.chart, self.covariance, steps
         self.core.unpin()
         return found
@@ -264,10 +278,6 @@ def follow_orbit(core: _motion.Problem, poses: Poses) -> None:
         core.paths(np.stack([moved[:, :3, :3], moved[:, :3, 3:]], axis=1))
 
 
-def _pair(factors: Array) -> tuple[float, float]:
-    return float(factors[0]), float(factors[1])
-
-
 def _inverse(A: NDArray[Any]) -> Array:
     return np.asarray(np.linalg.inv(A), dtype=np.float64)
 
@@ -281,10 +291,10 @@ def fit(
     every: Poses | None = None,
     robust_start: bool = False,
     slack: float = 1.0,
-) -> BatchFit:
-    """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` is set.
+) -> Parts[BatchFit]:
+    """Fit from ``start``, in parts. The noise factors begin at ``factors``; they are refined for ``params.rescale``.
 
-    The residuals' correlation in time can be estimated only once there are many; ``params.least_inflation`` bounds it.
+    The residuals' correlation can be estimated only once there are many; ``params.least_inflation`` bounds it.
 
     Args:
         poses: the measurements, or their normal points.
@@ -307,9 +317,9 @@ def fit(
     core, steps = problem.core, 0
     if factors is None or robust_start:
         problem.reweigh(problem.factors, redescend=False)
-        steps = core.descend(params.max_steps, params.gain_tol)[0]
+        steps, _ = yield from problem.descended(params.max_steps, params.gain_tol)
         problem.reweigh(problem.factors)
-    more, done = core.descend(params.max_steps, params.gain_tol)
+    more, done = yield from problem.descended(params.max_steps, params.gain_tol)
     steps += more
     plain, inflation = problem.factors / least, least**2
     if params.rescale and len(every) >= _FEWEST_FOR_FACTORS:
@@ -317,7 +327,7 @@ def fit(
             plain, found = _noise_of(problem, every)
             inflation = np.maximum(found, params.least_inflation)
             problem.reweigh(plain * np.sqrt(inflation))
-            more, done = core.descend(params.max_steps, params.gain_tol)
+            more, done = yield from problem.descended(params.max_steps, params.gain_tol)
             steps += more
     core.linearise(core.chart)  # the last steps kept the Jacobian; the covariance needs that of the minimum
     return BatchFit(problem.chart, problem.covariance, core.cost, core.d, core.weights, plain, inflation, steps, done)

@@ -99,7 +99,7 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Part
     for axis, row in bent:  # row @ axis = 1
         points = []
         for side in (math.sqrt(node2), -math.sqrt(node2)):
-            point, steps = _profile(problem, fitted, params, axis, row, side, left)
+            point, steps = yield from _profile(problem, fitted, params, axis, row, side, left)
             left -= steps
             if point is None:
                 others = True  # its part of the covariance stays that of the fit
@@ -128,7 +128,7 @@ def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: A
 
 def _profile(
     problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float, most: int
-) -> tuple[ProfilePoint | None, int]:
+) -> Parts[tuple[ProfilePoint | None, int]]:
     """The fit with the direction fixed where the cost has risen by side^2 / 2, the best of ``_TRIES`` from ``side`` on.
 
     A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. The
@@ -140,7 +140,7 @@ def _profile(
         if spent >= most:
             break
         pin = Pin(fitted.chart, row, side, _PIN_1S)
-        there, P, steps = problem.pinned(there, params, pin, min(_PIN_STEPS, most - spent))
+        there, P, steps = yield from problem.pinned(there, params, pin, min(_PIN_STEPS, most - spent))
         spent += steps
         rise = problem.cost(there) - fitted.half_chi2
         found.append((abs(float(np.log(max(rise, 1e-9) / wanted))), ProfilePoint(there, P, pin)))

@@ -79,7 +79,7 @@ def find_drift(
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
-    free = fit_driven(poses, start, prior, factors, onset_s, u)
+    free = yield from fit_driven(poses, start, prior, factors, onset_s, u)
     yield _size(free)
     anew = known is None and poor_fit(free, factors, levels)
     begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
@@ -92,7 +92,8 @@ def find_drift(
     if not frame.u.any() or (known is not None and best.log_odds < _FOUND):
         return None
     if known is None:
-        free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION), key=lambda f: f.cost)
+        nearer = yield from fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
+        free = min(free, nearer, key=lambda f: f.cost)
         yield _size(free)
         # Laplace's approximation about each minimum: a linear problem about one of them does not reach the other
         odds = best.log_odds - best.gain + (free.cost - frame.cost) / best.noise

@@ -66,8 +66,8 @@ class DrivenFit:
         return _columns(self.G, self.equivalents(np.append(self.points.times_s, onset_s)), self.points.times_s, onset_s)
 
 
-def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array) -> DrivenFit:
-    """Fit all poses with a given acceleration. The fit need not converge where another one acts.
+def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array) -> Parts[DrivenFit]:
+    """Fit all poses with a given acceleration, in parts. The fit need not converge where another one acts.
 
     Args:
         poses: the measurements.
@@ -79,7 +79,7 @@ def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s
     """
     poses = without_drift(poses, start, onset_s, u) if u.any() else poses
     points = normal_points(poses, start, factors)
-    fitted = fit(points, start, prior, FitParams(rescale=False), factors)
+    fitted = yield from fit(points, start, prior, FitParams(rescale=False), factors)
     problem, chart = Problem(points, prior, factors, fitted.chart), fitted.chart
     e, H = problem.core.rows()
     G = H[:, :, :REACHED]

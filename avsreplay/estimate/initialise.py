@@ -250,9 +250,9 @@ def batch_estimate(
     points = normal_points(poses, start, factors * np.sqrt(levels.slack))
     first, rejected = last is None, last is not None and last.prior_rejected
     noise, slack = (levels.torque, levels.force), levels.slack
-    fitted = fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
+    fitted = yield from fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
     if given is not None and not rejected:
-        joint = fit(points, start, given, rules, factors, robust_start=first, slack=slack)
+        joint = yield from fit(points, start, given, rules, factors, robust_start=first, slack=slack)
         rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
     yield fitted.steps * len(points)
@@ -314,7 +314,7 @@ def improved_levels(
     for _ in range(2):  # about the last motion, then about the one that fits
         points = normal_points(poses, chart, gate, MOST_POINTS, scatter=True)
         problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1
-        problem.core.descend(_LEVEL_STEPS, _LEVEL_TOL)
+        yield from problem.descended(_LEVEL_STEPS, _LEVEL_TOL)
         chart = problem.chart
     problem.core.linearise(chart.flat)
     yield BUDGET

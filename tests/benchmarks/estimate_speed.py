@@ -31,6 +31,7 @@ from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
+from avsreplay.estimate.work import whole
 from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams
 from avsreplay.pipeline import Monitors
@@ -111,7 +112,7 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
     start = to_chart(world.states[0]).moved(np.repeat([5e-3, 2e-4, 5e-3, 1e-4, 0.05, 0.02], [3, 3, 3, 3, 5, 3]))
     once = least(lambda: rotation_history(world.states[0], world.times), 2)
     begun = time.process_time()
-    fitted = fit(poses, start, prior, FitParams())
+    fitted = whole(fit(poses, start, prior, FitParams()))
     off = float(geometry.angle(geometry.multiply(geometry.conjugate(fitted.x.T_ac.q), world.states[0].T_ac.q)))
     if off > 0.05:
         raise SystemExit("the fit did not find the motion")

@@ -341,12 +341,12 @@ nb::tuple residuals(const Problem& self, const Flat& at) {
   return nb::make_tuple(cost, misfit, out);
 }
 
-nb::tuple descend(Problem& self, int most, double gain_tol) {
+nb::tuple descend(Problem& self, int most, double gain_tol, bool go_on) {
   int steps = 0;
   bool done;
   {
     nb::gil_scoped_release release;
-    done = self.descend(most, gain_tol, steps);
+    done = self.descend(most, gain_tol, steps, go_on);
   }
   return nb::make_tuple(steps, done);
 }
@@ -620,7 +620,7 @@ NB_MODULE(_motion, m) {
       .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"), nb::arg("slack"))
       .def("linearise", [](Problem& self, const Flat& at) { self.linearise(chart(at)); }, nb::arg("chart"))
       .def("residuals", &residuals, nb::arg("chart"))
-      .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"))
+      .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"), nb::arg("go_on") = false)
       .def("normal", &normal)
       .def("rows", &rows)
       .def("absorbed", &absorbed, nb::arg("P"))
