@@ -154,9 +154,9 @@ def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[A
 
 def advance(x: State, step: Flow, h: float, arc: OrbitArc | None = None) -> State:
     """The state after a step of h seconds; ``arc``: the orbit from the instant of ``x`` on, None for free motion."""
-    q_ab = np.array(hamilton(x.q_ab.tolist(), step.q.tolist()))
+    q_ab = hamilton(x.q_ab.tolist(), step.q.tolist())
     centre, velocity = translated(x, np.array([h]), arc)
-    return State(q_ab, step.w, centre[0], velocity[0], x.sigma, x.c_b, x.q_bc)
+    return State.of(np.concatenate([q_ab, step.w, centre[0], velocity[0], x.sigma, x.c_b, x.q_bc]))
 
 
 def propagate_state(x: State, h: float, arc: OrbitArc | None = None) -> tuple[State, Array]:

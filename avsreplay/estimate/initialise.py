@@ -13,7 +13,6 @@ direction stays with the fit.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -131,8 +130,13 @@ def mean_rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
     h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
     if h <= 0.0:
         return np.zeros(3), np.zeros(3)
-    turns = [geometry.log(np.array(hamilton(geometry.conjugate(a.T_ac.q), b.T_ac.q))) for a, b in pairwise(fixes)]
-    return np.sum(turns, axis=0) / h, (fixes[-1].T_ac.t - fixes[0].T_ac.t) / h
+    return np.sum(_turns(fixes, 1), axis=0) / h, (fixes[-1].T_ac.t - fixes[0].T_ac.t) / h
+
+
+def _turns(fixes: tuple[PoseFix, ...], apart: int) -> Array:
+    """Rotation vectors (n - apart, 3) from each of n poses to that ``apart`` from it."""
+    q = np.array([fix.T_ac.q for fix in fixes])
+    return geometry.log(np.array(hamilton(geometry.conjugate(q[:-apart]).T, q[apart:].T)).T)
 
 
 def _at_pose(T_ac: Pose, w: Array, v: Array) -> State:
@@ -218,8 +222,13 @@ def rough_state(fixes: tuple[PoseFix, ...]) -> State:
 def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
     """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``, without those almost at one instant."""
     least = 1e-3 * (fixes[-1].t_ns - fixes[0].t_ns) / max(1, len(fixes) - 1)
-    found = [mean_rates((a, b)) for a, b in zip(fixes, fixes[apart:], strict=False) if b.t_ns - a.t_ns >= least]
-    return np.median([w for w, _ in found], axis=0), np.median([v for _, v in found], axis=0)
+    times, t = np.array([fix.t_ns for fix in fixes]), np.array([fix.T_ac.t for fix in fixes])
+    h_ns = times[apart:] - times[:-apart]
+    used = h_ns >= max(least, 1.0)
+    if not used.any():
+        return np.zeros(3), np.zeros(3)
+    h = h_ns[used, None] * 1e-9
+    return np.median(_turns(fixes, apart)[used] / h, axis=0), np.median((t[apart:] - t[:-apart])[used] / h, axis=0)
 
 
 def batch_estimate(

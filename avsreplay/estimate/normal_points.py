@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
@@ -181,8 +182,8 @@ def _parts(turned: Array, most: int) -> NDArray[np.int64]:
     """
     n = len(turned)
     span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // min(most, _FEW))
-    out = [0]
-    while (next_ := min(int(np.searchsorted(turned, turned[out[-1]] + span)), out[-1] + size)) < n:
+    out, angles = [0], turned.tolist()
+    while (next_ := min(bisect_left(angles, angles[out[-1]] + span), out[-1] + size)) < n:
         out.append(next_)
     return np.array(out)
 
