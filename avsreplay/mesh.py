@@ -36,6 +36,14 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
     return kept
 
 
+def numbers_with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the numbers of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    longest2 = np.max([np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)], axis=0, initial=0.0)
+    area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.flatnonzero(area2 > 1e-12 * longest2).astype(np.int32)
+
+
 def distinct_rows(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Identify equal rows, such as the repeated vertices of an STL file.
 

@@ -21,7 +21,8 @@ from avsreplay.log.options import Unit
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.params import Camera
-from avsreplay.register.size import MOST_OF_MODEL, diameter, part_of_size
+from avsreplay.register.sampling import diameter, part_of_size
+from avsreplay.register.size import MOST_OF_MODEL
 
 _LEAST = 0.25  # diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
 _WHOLE = 1.1  # no scan of the target alone is larger than this

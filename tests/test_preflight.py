@@ -25,7 +25,7 @@ from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus
 from avsreplay.register.contract import boxes, view
-from avsreplay.register.size import diameter
+from avsreplay.register.sampling import diameter
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
 

@@ -61,6 +61,22 @@ def test_the_true_pose_is_plausible_and_others_are_not(surface: Surface) -> None
         assert test.check(scan, wrong.inverse()).reason != ""
 
 
+def test_the_surface_that_the_camera_sees_is_not_hidden(surface: Surface) -> None:
+    """Of the sampled points those whose line of sight no triangle crosses, but for points near an outline."""
+    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
+    test, T_ac = PlausibilityTest(surface, index, visibility, 0.065), example_pose()
+    found = test._expected(hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED)), T_ac.inverse())
+    eye = T_ac.inverse().t
+    towards = test._points - eye
+    far = np.linalg.norm(towards, axis=1)
+    first = index.cast(eye, towards / far[:, None])[0]
+    cosine = -np.einsum("ij,ij->i", test._normals, towards) / far
+    free = (first > far - 0.05 * surface.extent) & (cosine > 0.25)
+    assert np.all(cosine[found] > 0.25)
+    assert np.mean(free[found]) > 0.97
+    assert np.mean(np.isin(np.flatnonzero(free), found)) > 0.6  # points near an outline share a cell with nearer ones
+
+
 def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surface) -> None:
     """The camera looks through the model at a wall: the distances of the part on the model alone do not show it."""
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)

@@ -12,6 +12,7 @@ from oracles.residuals import summed
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
+from avsreplay.register import size as size_module
 from avsreplay.register.contract import boxes, view
 from avsreplay.register.covariance import patch_size
 from avsreplay.register.size import SizeError, fitted_size, noise_bias, normal_jacobian
@@ -46,6 +47,22 @@ def fits(model: Surface, noise: float, seeds: range) -> list[tuple[SizeError, fl
         assert found is not None
         out.append((found, noise_bias(index, p, camera_c)))
     return out
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_step_of_the_extension_is_that_of_the_rows(known: bool) -> None:
+    model = boxes()
+    index = SurfaceIndex.build(model, 0.15 * model.extent)
+    points, T_ac = scan_of(model, 4, 0.002)
+    p, camera_c = 1.02 * T_ac.inverse().apply(points[::4]), T_ac.inverse().t if known else None
+    rows, d, centre = size_module._step(index, p, camera_c)
+    delta, moved = size_module._joined(0.0, Pose.identity(), rows.delta, d, centre)
+    other, step = size_module._rounds(index, p, camera_c, 1)
+    assert other == pytest.approx(delta, abs=1e-12)
+    np.testing.assert_allclose(step.matrix, moved.matrix, atol=1e-11)
+    assert abs(delta) > 0.01
+    far = p + 10.0 * model.extent
+    assert size_module._rounds(index, far, camera_c, 1) is size_module._step(index, far, camera_c) is None
 
 
 def test_faces_in_coordinate_planes_do_not_enlarge_the_standard_error() -> None:

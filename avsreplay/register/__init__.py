@@ -33,12 +33,11 @@ from avsreplay.register.backend import POSES, Availability, Backend, Target, ava
 from avsreplay.register.budget import allowed_scans
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.sampling import at_instant, without_scattered_points
+from avsreplay.register.sampling import at_instant, diameter, without_scattered_points
 from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.size import (
     MOST_OF_MODEL,
     SIGMAS,
-    diameter,
     fitted_duration,
     fitted_size,
     matched_points,

@@ -10,6 +10,17 @@ def checksum(payload: NDArray[np.uint8]) -> int: ...
 def keep_patches(normals: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.bool_]: ...
 def pseudo_inverse(N: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def is_narrower(points: NDArray[Any], T_ca: NDArray[np.float64], model: NDArray[np.float64], least: float) -> bool: ...
+def seen(
+    points: NDArray[Any],
+    T_ca: NDArray[np.float64],
+    model: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    in_front: float,
+    least_facing: float,
+    least_cosine: float,
+    hidden_m: float,
+    per_cell: float,
+) -> NDArray[np.int64]: ...
 def sandwich(normals: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def pair_sums(
     points: NDArray[np.float64],
@@ -167,6 +178,9 @@ class Index:
         turn_rad: float,
         move_m: float,
         across: NDArray[np.float64],
+        beyond_m: float,
+        least_close: float,
+        part: int,
         threads: int = 1,
         matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...
@@ -180,6 +194,16 @@ class Index:
         least_facing: float,
     ) -> tuple[NDArray[np.float64], int]: ...
     def cast(self, eye: Sequence[float], directions: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]: ...
+    def size_step(
+        self,
+        points: NDArray[np.float64],
+        camera: Sequence[float] | None,
+        most_m: float,
+        least: int,
+        normal_quantile: float,
+        cauchy: float,
+        least_information: float,
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None: ...
     def faces_camera(self, points: Any, T_ca: Any, tested: int, least_facing: float) -> bool: ...
     @property
     def primitives(self) -> int: ...

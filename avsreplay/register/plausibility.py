@@ -39,7 +39,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.quality import WELL_OFF, Visibility, not_measured
-from avsreplay.register.sampling import EMPTY, Rays, sample
+from avsreplay.register.sampling import EMPTY, SPACED, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
 
@@ -63,11 +63,12 @@ LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
 POINTS_PER_CELL = 8.0
-GRID = 4096
+IN_FRONT, LEAST_FACING = 0.34, 0.02  # least cosines: 70 deg from the middle of the scan, faces seen from the side
 BEYOND, MIRRORED = (WELL_OFF, 5.0), 2.0  # a point beyond an edge is so many widths away, and its image so many sigmas
 LEAST_BEYOND, MOST_CONTINUED = 10, 0.5  # a surface continues beyond an edge with so many points, and this share of them
 LEAST_IMAGE = 0.1  # least distance of an image from the face that counts as on it, in gates
 CONTINUED = "the surface in the scan continues beyond the edges of the model, as that of another or a larger object"
+Numbers = NDArray[np.int64]
 TURNED_AWAY = "most points are on faces that face away from the camera"
 
 
@@ -182,13 +183,15 @@ class PlausibilityTest:
         if compared is not None:
             held, violated, empty = compared
             each = np.count_nonzero(on) / max(1, held)  # points of the scan for a point of the surface
-            hidden = self.predicted(T_ca, guess) and self._alone(rays, on, T_ca)
-            paired = 0.0 if hidden else min(each, np.count_nonzero(~on) / max(1, len(empty)))
+            paired = min(each, np.count_nonzero(~on) / max(1, len(empty)))
             for weight, k in ((each, violated), (paired, empty)):
                 against.append(weight * jacobian.information(self._points[k], self._normals[k]))
             absent = len(violated) + len(empty)
             covered = absent <= MOST_MISSING * (held + absent)
-        score, kind = _contradicted(support, np.array(against), CHANCE * np.count_nonzero(on))
+        chance, seen = CHANCE * np.count_nonzero(on), len(against) > 1
+        score, kind = _contradicted(support, np.array(against), chance)
+        if seen and score > MOST_CONTRADICTED and self.predicted(T_ca, guess) and self._alone(rays, on, T_ca):
+            score, kind = _contradicted(support, np.array(against[:2]), chance)  # what is missing is hidden
         reason = ""
         if noise > NOISE_OF_EXTENT * self._extent:
             reason = f"distances to the model spread by {noise:.3g} m"
@@ -230,22 +233,22 @@ class PlausibilityTest:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the reach."""
         return self._visibility.distances(self._index, points, T_ca, np.inf)[0]
 
-    def _compared(self, rays: Rays, T_ca: Pose, noise: float) -> tuple[int, NDArray[np.intp], NDArray[np.intp]] | None:
+    def _compared(self, rays: Rays, T_ca: Pose, noise: float) -> tuple[int, Numbers, Numbers] | None:
         """How many of the visible surface points the scan has, those in free space, and those where it has no point.
 
         None with too few to compare.
         """
         T_ac, points = T_ca.inverse(), rays.points
-        surface, normals = T_ac.apply(self._points), self._normals @ T_ac.R.T
-        expected = self._expected(_Image(points), surface, normals)
+        expected = self._expected(points, T_ca)
         if not len(expected):
             return None
         tree = kernel_module().PointTree(points)
-        spacing = float(np.median(tree.query(points[:: max(1, len(points) // 500)].copy(), k=2)[0][:, -1]))
+        spacing = float(np.median(tree.query(points[:: max(1, len(points) // SPACED)].copy(), k=2)[0][:, -1]))
         near = max(self._gate, 3.0 * noise, 3.0 * spacing)
-        supported = tree.query(surface[expected])[0][:, 0] < near
+        surface = T_ac.apply(self._points[expected])
+        supported = tree.query(surface)[0][:, 0] < near
         missing = expected[~supported]
-        passed, empty = rays.through(surface[missing], 2.0 * near)
+        passed, empty = rays.through(surface[~supported], 2.0 * near)
         held = int(np.count_nonzero(supported))
         if held + np.count_nonzero(passed) < LEAST_COMPARED:
             return None
@@ -253,9 +256,8 @@ class PlausibilityTest:
 
     def _alone(self, points: Array, on: NDArray[np.bool_], T_ca: Pose) -> bool:
         """Whether nearly all points (n, 3) in {A} are on the model or hide it, well in front of it."""
-        T_ac = T_ca.inverse()
-        surface = T_ac.apply(self._points)
-        seen = Rays(surface[self._expected(_Image(surface), surface, self._normals @ T_ac.R.T)])
+        surface = T_ca.inverse().apply(self._points)
+        seen = Rays(surface[self._expected(surface, T_ca)])
         off = Rays(points[~on])
         if seen.tree is None or not len(off.points):
             return bool(on.all())
@@ -263,16 +265,11 @@ class PlausibilityTest:
         hiding = (angle < EMPTY * seen.spacing) & (off.ranges < seen.ranges[k] - BEFORE_OF_EXTENT * self._extent)
         return int(np.count_nonzero(on)) >= LEAST_ALONE * (len(points) - int(np.count_nonzero(hiding)))
 
-    def _expected(self, image: _Image, surface: Array, normals: Array) -> NDArray[np.intp]:
-        """Which surface points (n, 3) in {A} the camera should see."""
-        ranges = np.linalg.norm(surface, axis=1)
-        cosine = -np.einsum("ij,ij->i", normals, surface) / ranges
-        facing = np.flatnonzero((cosine > 0.02) & image.in_front(surface))
-        _, cell = np.unique(image.cells(surface[facing]), return_inverse=True)
-        nearest = np.full(cell.max(initial=-1) + 1, np.inf)
-        np.minimum.at(nearest, cell.reshape(-1), ranges[facing])
-        visible = ranges[facing] < nearest[cell.reshape(-1)] + HIDDEN_OF_EXTENT * self._extent
-        return np.asarray(facing[visible & (cosine[facing] > LEAST_COSINE)])
+    def _expected(self, scan: Array, T_ca: Pose) -> Numbers:
+        """Which surface points the camera should see that looks at points (n, 3) in {A}."""
+        rule = (IN_FRONT, LEAST_FACING, LEAST_COSINE, HIDDEN_OF_EXTENT * self._extent, POINTS_PER_CELL)
+        found: Numbers = kernel_module().seen(scan, T_ca.matrix, self._points, self._normals, *rule)
+        return found
 
 
 class _Jacobian:
@@ -295,34 +292,6 @@ def _contradicted(support: Array, against: Array, chance: float) -> tuple[float,
     values, vectors = np.linalg.eigh(W @ against.sum(axis=0) @ W.T)
     u = W.T @ vectors[:, -1]
     return float(values[-1]), int(np.argmax(u @ against @ u))
-
-
-class _Image:
-    """The scan as seen from the origin of {A}: tangent plane about the direction of its median."""
-
-    def __init__(self, points: Array) -> None:
-        towards = np.median(points, axis=0)
-        towards /= np.linalg.norm(towards)
-        self._axes = np.vstack([np.linalg.svd(towards[None])[2][1:], towards])
-
-    def in_front(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points are within 70 deg of the viewing direction."""
-        return np.asarray(points @ self._axes[2] > 0.34 * np.linalg.norm(points, axis=1))
-
-    def plane(self, points: Array) -> Array:
-        """Return the coordinates (n, 2) of points (n, 3) in {A} in the tangent plane."""
-        turned = points @ self._axes.T
-        return np.asarray(turned[:, :2] / turned[:, 2:])
-
-    def cells(self, points: Array) -> NDArray[np.int64]:
-        """Return the number of the cell of each point (n, 3); a cell has about ``POINTS_PER_CELL`` of them."""
-        plane = self.plane(points)
-        if not len(plane):
-            return np.zeros(0, dtype=np.int64)
-        area = float(np.prod(np.maximum(np.ptp(plane, axis=0), 1e-9)))
-        size = max(np.sqrt(area * POINTS_PER_CELL / len(plane)), 1e-9)
-        k = np.minimum((plane - plane.min(axis=0)) / size, GRID - 1.0).astype(np.int64)
-        return np.asarray(k[:, 0] * GRID + k[:, 1])
 
 
 def robust_noise(distance: Array) -> float:

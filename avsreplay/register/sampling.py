@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -20,12 +21,13 @@ STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 NEIGHBOUR = 8
-EMPTY, SPACED = 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
+EMPTY, SPACED = 2.5, 125  # for the density of rays; no ray within so many spacings: nothing was measured
 AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
 SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
+GROUPED = 3000  # points of a scan in which connected groups are looked for
 MOST_SEGMENTS = 3
 MOST_ATTEMPTS = MOST_SEGMENTS + 3
 VOXEL_OF_EXTENT = 0.04
@@ -235,29 +237,76 @@ def _without_plane(points: Array, width_m: float) -> Array:
     return off
 
 
+def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
+    """Return the approximate largest distance between two points, found by two sweeps.
+
+    Args:
+        points: (n, 3) coordinates [m].
+        trimmed: leave out the 2 % of the points that are farthest from the median.
+
+    Returns:
+        The distance [m]; 0 without points.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if not len(points):
+        return 0.0
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if trimmed:
+        points = points[away <= np.quantile(away, 0.98)]
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    first = points[np.argmax(away)]
+    second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
+    return float(np.linalg.norm(points - second, axis=1).max())
+
+
+def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float], gap: float = 0.1) -> Array | None:
+    """Return the largest connected group of points with the size of the model.
+
+    Args:
+        points: (n, 3) [m]; about ``GROUPED`` of them are examined.
+        size_m: diameter of the model [m].
+        share: least and largest diameter of the group over ``size_m``.
+        gap: largest distance over ``size_m`` between neighbours of one group.
+
+    Returns:
+        The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the size.
+    """
+    few = np.array(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64, order="C")
+    member = kernel_module().PointTree(few).groups(gap * size_m)
+    groups = [few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))]
+    fitting = [group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]]
+    return max(fitting, key=len, default=None)
+
+
 class Rays:
     """The points (n, 3) of a scan in {A} [m] by their directions.
 
     Attributes:
         points: those that are finite and not at the sensor, whose directions are not known.
         ranges: (n,) [m].
-        tree: of the directions; None with too few.
-        spacing: angle between neighbouring rays [rad].
     """
 
     def __init__(self, points: Array) -> None:
-        """Find the directions and their spacing."""
+        """Leave out the points without a direction."""
         ranges = np.linalg.norm(points, axis=1)
         known = np.isfinite(ranges) & (ranges > 0.0)
-        self.points, self.ranges = points[known], ranges[known]
-        self.tree, self.spacing = None, np.inf
-        if len(self.points) <= NEIGHBOUR:
-            return
+        self.points: Array = points if (every := bool(known.all())) else points[known]
+        self.ranges: Array = ranges if every else ranges[known]
+
+    @cached_property
+    def tree(self) -> Any:
+        """Return the tree of the directions; None with too few."""
         directions = self.points / self.ranges[:, None]
-        self.tree = kernel_module().PointTree(directions)
-        few = directions[:: max(1, len(directions) // SPACED)].copy()
-        apart = self.tree.query(few, k=NEIGHBOUR + 1)[0][:, -1]
-        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
+        return kernel_module().PointTree(directions) if len(directions) > NEIGHBOUR else None
+
+    @cached_property
+    def spacing(self) -> float:
+        """Return the angle between neighbouring rays [rad]; infinite with too few."""
+        if self.tree is None:
+            return np.inf
+        stride = max(1, len(self.points) // SPACED)
+        apart = self.tree.query(self.points[::stride] / self.ranges[::stride, None], k=NEIGHBOUR + 1)[0][:, -1]
+        return float(np.median(apart) * np.sqrt(np.pi / NEIGHBOUR))
 
     def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return through which points (k, 3) in {A} rays passed, and which are in directions without rays.
@@ -267,7 +316,7 @@ class Rays:
             behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind, and all are near.
         """
         far = np.linalg.norm(points, axis=1)
-        if self.tree is None or not len(points):
+        if not len(points) or self.tree is None:
             return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
         angle, k = self.tree.query(points / far[:, None], k=AMONG)
         empty = angle[:, 0] > EMPTY * self.spacing

@@ -30,11 +30,10 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.covariance import noise_along
-from avsreplay.register.surface_index import SurfaceIndex, kernel_module
+from avsreplay.register.surface_index import SurfaceIndex
 
 LEAST_RESIDUALS = 50
 MOST_OF_MODEL = 1.3  # diameter of a scan over that of the model above which more than the target is in view
-GROUPED = 3000  # points of a scan in which connected groups are looked for
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
 SIZE_UNSEEN = "the view does not show an error of the size"  # the message of such a view begins with it
@@ -171,29 +170,49 @@ def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
     rays = rows.normal if camera_c is None else rows.foot - np.asarray(camera_c)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     moved = noise_along(rays, rows.normal, np.sqrt(CAUCHY_VARIANCE) * rows.left, rows.weight)[:, None] * rays
-    found = [_fitted(index, rows.foot + sign * moved, camera_c) for sign in (1.0, -1.0)]
-    return float(np.mean([LARGEST_ERROR if each is None else each.delta for each in found]))
+    found = [_rounds(index, rows.foot + sign * moved, camera_c, ROUNDS) for sign in (1.0, -1.0)]
+    return float(np.mean([LARGEST_ERROR if each is None else each[0] for each in found]))
 
 
 def normal_jacobian(p: Array, n: Array) -> Array:
     """Return J (k, 6) of points p and normals n (k, 3): rows [p x n, n]."""
-    return np.hstack([np.cross(p, n), n])
+    J = np.empty((6, len(p)))  # np.cross takes three times as long
+    J[3:] = n.T
+    (x, y, z), (u, v, w) = p.T, J[3:]
+    J[0], J[1], J[2] = y * w - z * v, z * u - x * w, x * v - y * u
+    return np.ascontiguousarray(J.T)
 
 
 def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | None:
-    delta, moved, rows = 0.0, Pose.identity(), None
-    for _ in range(ROUNDS):
-        found = _step(index, moved.apply(p) / (1.0 + delta), camera_c)
-        if found is None:
+    """The rows of the last round."""
+    if (begun := _rounds(index, p, camera_c, ROUNDS - 1)) is None:
+        return None
+    delta, moved = begun
+    if (found := _step(index, moved.apply(p) / (1.0 + delta), camera_c)) is None:
+        return None
+    rows, d, centre = found
+    delta, moved = _joined(delta, moved, rows.delta, d, centre)
+    return None if abs(delta) > LARGEST_ERROR else replace(rows, delta=delta, moved=moved)
+
+
+def _rounds(index: SurfaceIndex, p: Array, camera_c: Array | None, count: int) -> tuple[float, Pose] | None:
+    """Size and motion after so many rounds, whose rows are not needed."""
+    delta, moved = 0.0, Pose.identity()
+    rule = (WIDTH_OF_EXTENT * index.extent_m, LEAST_RESIDUALS, NORMAL_QUANTILE, CAUCHY, LEAST_INFORMATION)
+    for _ in range(count):
+        if (step := index.size_step(moved.apply(p) / (1.0 + delta), camera_c, *rule)) is None:
             return None
-        rows, d, centre = found
-        back = _undone(d, centre)
-        moved = Pose(back.q, (1.0 + delta) * (back.t + rows.delta * centre)) @ moved
-        delta = (1.0 + delta) * (1.0 + rows.delta) - 1.0
+        delta, moved = _joined(delta, moved, *step)
         if abs(delta) > LARGEST_ERROR:
             return None
-        rows = replace(rows, delta=delta, moved=moved)
-    return rows
+    return delta, moved
+
+
+def _joined(delta: float, moved: Pose, step: float, d: Array, centre: Array) -> tuple[float, Pose]:
+    """Size and motion after one more step."""
+    back = _undone(d, centre)
+    moved = Pose(back.q, (1.0 + delta) * (back.t + step * centre)) @ moved
+    return (1.0 + delta) * (1.0 + step) - 1.0, moved
 
 
 def fitted_duration(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float] | None:
@@ -305,44 +324,3 @@ def _effect(rows: _Rows, B: Array) -> float:
     random = float(rows.left @ rows.left) / len(rows.left) / s[kept] ** 2
     variance = max(0.0, float(np.mean(amplitudes**2 - random)))
     return float(np.sqrt(variance * np.sum((change @ Vt.T[:, kept]) ** 2)))
-
-
-def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
-    """Return the approximate largest distance between two points, found by two sweeps.
-
-    Args:
-        points: (n, 3) coordinates [m].
-        trimmed: leave out the 2 % of the points that are farthest from the median.
-
-    Returns:
-        The distance [m]; 0 without points.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    if not len(points):
-        return 0.0
-    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    if trimmed:
-        points = points[away <= np.quantile(away, 0.98)]
-        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    first = points[np.argmax(away)]
-    second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
-    return float(np.linalg.norm(points - second, axis=1).max())
-
-
-def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float], gap: float = 0.1) -> Array | None:
-    """Return the largest connected group of points with the size of the model.
-
-    Args:
-        points: (n, 3) [m]; about ``GROUPED`` of them are examined.
-        size_m: diameter of the model [m].
-        share: least and largest diameter of the group over ``size_m``.
-        gap: largest distance over ``size_m`` between neighbours of one group.
-
-    Returns:
-        The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the size.
-    """
-    few = np.array(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64, order="C")
-    member = kernel_module().PointTree(few).groups(gap * size_m)
-    groups = [few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))]
-    fitting = [group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]]
-    return max(fitting, key=len, default=None)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from avsreplay import mesh
 from avsreplay.errors import MissingBackend, UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
@@ -194,7 +195,7 @@ class SurfaceIndex:
         index = None if path is None else _restored(kernel, path, len(faces) or len(vertices), len(faces) > 0, portable)
         restored = index is not None
         if index is None:
-            kept = _with_area(vertices, faces)
+            kept = mesh.numbers_with_area(vertices, faces)
             if len(faces) and not len(kept):
                 raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
             index = kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
@@ -283,6 +284,12 @@ class SurfaceIndex:
         ranges, work = self._index.cast(eye_c.tolist(), np.ascontiguousarray(directions))
         return ranges, work
 
+    def size_step(self, points: Array, camera_c: Array | None, *rule: Any) -> tuple[float, Array, Array] | None:
+        """Step of the size, pose d (6,) about a centre (3,), that (n, 3) in {C} ask for; see ``kernel/size.hpp``."""
+        camera = None if camera_c is None else tuple(float(x) for x in camera_c)
+        step: tuple[float, Array, Array] | None = self._index.size_step(np.ascontiguousarray(points), camera, *rule)
+        return step
+
     def faces_camera(self, points: NDArray[Any], T_ca: Pose, tested: int, least: float) -> bool:
         """Return whether at least a share of the faces closest to about ``tested`` points (n, 3) face the camera."""
         return bool(self._index.faces_camera(_points(points), T_ca.matrix, tested, least))
@@ -340,11 +347,3 @@ def _check_size(surface: Surface, vertices: Array, faces: NDArray[np.int32]) -> 
     if max(len(vertices), len(faces)) > MOST_PRIMITIVES:
         what = f"{len(vertices)} vertices and {len(faces)} faces are more than the limit of {MOST_PRIMITIVES}"
         raise UsageError(what, where=surface.name, hint="simplify the model")
-
-
-def _with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Indices of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    longest2 = np.max([np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)], axis=0, initial=0.0)
-    area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.flatnonzero(area2 > 1e-12 * longest2).astype(np.int32)

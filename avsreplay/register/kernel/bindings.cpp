@@ -21,6 +21,7 @@
 #include "point_tree.hpp"
 #include "rays.hpp"
 #include "save.hpp"
+#include "size.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -280,6 +281,23 @@ class Index {
       work = avs::cast(store_, {eye[0], eye[1], eye[2]}, directions.data(), (int64_t)directions.shape(0), out);
     }
     return nb::make_tuple(found, work);
+  }
+
+  nb::object size_step(const Doubles& points, std::optional<std::array<double, 3>> camera, double most, int64_t least, double quantile,
+                       double cauchy, double least_information) const {
+    require(points.ndim() == 2 && points.shape(1) == 3 && most > 0 && least > 0, "points (n, 3), a distance and a number of points");
+    const Vec3 eye = camera ? Vec3{(*camera)[0], (*camera)[1], (*camera)[2]} : Vec3{0, 0, 0};
+    SizeStep step;
+    {
+      nb::gil_scoped_release release;
+      const SizeRule rule{most, least, quantile, cauchy, least_information};
+      step = avs::size_step(store_, code(), points.data(), (int64_t)points.shape(0), camera ? &eye : nullptr, rule);
+    }
+    if (!step.found) return nb::none();
+    double *d, *c;
+    auto pose = array<double>({6}, &d), centre = array<double>({3}, &c);
+    std::copy(step.pose, step.pose + 6, d), std::copy(step.centre, step.centre + 3, c);
+    return nb::make_tuple(step.size, pose, centre);
   }
 
   bool faces_camera(nb::handle points, const Doubles& T_ca, int64_t tested, double least_facing) const {
@@ -572,6 +590,20 @@ bool is_narrower_at(nb::handle points, const Doubles& T_ca, const Doubles& model
   return is_narrower(v, T.v, model.data(), (int64_t)model.shape(0), least);
 }
 
+nb::ndarray<nb::numpy, int64_t> seen_at(nb::handle points, const Doubles& T_ca, const Doubles& model, const Doubles& normals,
+                                        double in_front, double least_facing, double least_cosine, double hidden, double per_cell) {
+  require(are_vectors(model, model.shape(0)) && are_vectors(normals, model.shape(0)), "points of the model and normals must be (n, 3)");
+  const Cloud cloud(points);
+  const View v = cloud.view();
+  const Rows T = rows(T_ca);
+  std::vector<int64_t> found;
+  {
+    nb::gil_scoped_release release;
+    found = seen(v, T.v, model.data(), normals.data(), (int64_t)model.shape(0), {in_front, least_facing, least_cosine, hidden, per_cell});
+  }
+  return copied(found, {found.size()});
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -591,6 +623,8 @@ NB_MODULE(_kernel, m) {
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
   m.def("is_narrower", &is_narrower_at, nb::arg("points"), nb::arg("T_ca"), nb::arg("model"), nb::arg("least"));
+  m.def("seen", &seen_at, nb::arg("points"), nb::arg("T_ca"), nb::arg("model"), nb::arg("normals"), nb::arg("in_front"),
+        nb::arg("least_facing"), nb::arg("least_cosine"), nb::arg("hidden_m"), nb::arg("per_cell"));
   m.def("pair_sums", &pair_sums, nb::arg("points"), nb::arg("normals"), nb::arg("weights"), nb::arg("from_points"),
         nb::arg("to_points"), nb::arg("begin"), nb::arg("gate_m"));
   nb::class_<PointTree>(m, "PointTree")
@@ -640,6 +674,8 @@ NB_MODULE(_kernel, m) {
       .def("distances", &Index::distances, nb::arg("points"), nb::arg("T_ca"), nb::arg("most_m"), nb::arg("camera"),
            nb::arg("tested"), nb::arg("least_facing"))
       .def("cast", &Index::cast, nb::arg("eye"), nb::arg("directions"))
+      .def("size_step", &Index::size_step, nb::arg("points"), nb::arg("camera").none(), nb::arg("most_m"), nb::arg("least"),
+           nb::arg("normal_quantile"), nb::arg("cauchy"), nb::arg("least_information"))
       .def("faces_camera", &Index::faces_camera, nb::arg("points"), nb::arg("T_ca"), nb::arg("tested"), nb::arg("least_facing"))
       .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)

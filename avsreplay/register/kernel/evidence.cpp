@@ -236,9 +236,13 @@ class Image {
 
   // Widens the extents along x, y, x + y and x - y by a point.
   void add(const double* p, double (&low)[4], double (&high)[4]) const {
-    const double depth = dot(towards_, p), x = dot(across_, p) / depth, y = dot(up_, p) / depth, at[4] = {x, y, x + y, x - y};
+    const double at[4] = {x(p), y(p), x(p) + y(p), x(p) - y(p)};
     for (int k = 0; k < 4; ++k) low[k] = std::min(low[k], at[k]), high[k] = std::max(high[k], at[k]);
   }
+
+  double depth(const double* p) const { return dot(towards_, p); }
+  double x(const double* p) const { return dot(across_, p) / depth(p); }
+  double y(const double* p) const { return dot(up_, p) / depth(p); }
 
  private:
   static double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -246,17 +250,69 @@ class Image {
   double towards_[3], across_[3], up_[3];
 };
 
-}  // namespace
-
-bool is_narrower(const View& v, const double* T, const double* model, int64_t n, double least) {
-  std::vector<double> points((size_t)(3 * v.n)), x((size_t)v.n);
-  for (int64_t k = 0; k < v.n; ++k) copy_point(v, k, points.data() + 3 * k);
+// The image about the medians of the coordinates of points (n, 3).
+Image image_of(const std::vector<double>& points) {
+  std::vector<double> x(points.size() / 3);
   double direction[3];
   for (size_t a = 0; a < 3; ++a) {
     for (size_t k = 0; k < x.size(); ++k) x[k] = points[3 * k + a];
     direction[a] = x.empty() ? 0 : value_at(x, x.size() / 2, x.size() % 2);
   }
-  const Image image(direction);
+  return Image(direction);
+}
+
+// A point of the model that faces the camera.
+struct Facet {
+  int64_t number;
+  double x, y, range, cosine;
+};
+
+constexpr double LEAST_CELL = 1e-9, MOST_CELLS = 512;  // side of a cell of the image, and cells along it
+
+// The cell of each facet, and how many cells there are.
+std::pair<std::vector<size_t>, size_t> cells_of(const std::vector<Facet>& facets, double per_cell) {
+  double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL};
+  for (const Facet& f : facets) {
+    low[0] = std::min(low[0], f.x), high[0] = std::max(high[0], f.x);
+    low[1] = std::min(low[1], f.y), high[1] = std::max(high[1], f.y);
+  }
+  const double area = std::max(high[0] - low[0], LEAST_CELL) * std::max(high[1] - low[1], LEAST_CELL);
+  const double side = std::max(std::sqrt(area * per_cell / (double)std::max<size_t>(facets.size(), 1)), LEAST_CELL);
+  const auto cell = [side](double x) { return (size_t)std::min(x / side, MOST_CELLS - 1); };
+  const size_t columns = facets.empty() ? 0 : cell(high[1] - low[1]) + 1, lines = facets.empty() ? 0 : cell(high[0] - low[0]) + 1;
+  std::vector<size_t> of;
+  for (const Facet& f : facets) of.push_back(cell(f.x - low[0]) * columns + cell(f.y - low[1]));
+  return {of, columns * lines};
+}
+
+}  // namespace
+
+std::vector<int64_t> seen(const View& scan, const double* T, const double* model, const double* normals, int64_t n, const SeenRule& rule) {
+  std::vector<double> points((size_t)(3 * scan.n));
+  for (int64_t k = 0; k < scan.n; ++k) copy_point(scan, k, points.data() + 3 * k);
+  const Image image = image_of(points);
+  std::vector<Facet> facets;
+  for (int64_t k = 0; k < n; ++k) {
+    double q[3], p[3], towards = 0;
+    for (int a = 0; a < 3; ++a) q[a] = model[3 * k + a] - T[4 * a + 3], towards -= normals[3 * k + a] * q[a];
+    for (int a = 0; a < 3; ++a) p[a] = T[a] * q[0] + T[4 + a] * q[1] + T[8 + a] * q[2];
+    const double range = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]);
+    if (towards > rule.least_facing * range && image.depth(p) > rule.in_front * range)
+      facets.push_back({k, image.x(p), image.y(p), range, towards / range});
+  }
+  const auto [cell, count] = cells_of(facets, rule.per_cell);
+  std::vector<double> nearest(count, HUGE_VAL);
+  for (size_t k = 0; k < facets.size(); ++k) nearest[cell[k]] = std::min(nearest[cell[k]], facets[k].range);
+  std::vector<int64_t> found;
+  for (size_t k = 0; k < facets.size(); ++k)
+    if (facets[k].range < nearest[cell[k]] + rule.hidden && facets[k].cosine > rule.least_cosine) found.push_back(facets[k].number);
+  return found;
+}
+
+bool is_narrower(const View& v, const double* T, const double* model, int64_t n, double least) {
+  std::vector<double> points((size_t)(3 * v.n));
+  for (int64_t k = 0; k < v.n; ++k) copy_point(v, k, points.data() + 3 * k);
+  const Image image = image_of(points);
   constexpr double FAR = HUGE_VAL;
   double low[2][4] = {{FAR, FAR, FAR, FAR}, {FAR, FAR, FAR, FAR}}, high[2][4] = {{-FAR, -FAR, -FAR, -FAR}, {-FAR, -FAR, -FAR, -FAR}};
   for (int64_t k = 0; k < v.n; ++k) image.add(points.data() + 3 * k, low[0], high[0]);

@@ -31,6 +31,16 @@ bool faces_camera(const Store& store, const Code& code, const View& points, cons
 // one of four directions of the image, 45 deg apart.
 bool is_narrower(const View& points, const double* T, const double* model, int64_t n, double least);
 
+// How the model surface that the camera should see is found.
+struct SeenRule {
+  double in_front, least_facing;          // least cosines of the angles to the direction of the scan, and of incidence
+  double least_cosine, hidden;            // of incidence, of what is seen; [m] behind the nearest of its cell
+  double per_cell;                        // points of the surface in a cell of the image, about
+};
+// The numbers of those of n points of the model (n, 3), with normals, that a camera at the origin of {A} that looks at the scan
+// should see at the pose T, ascending: they face it, and no other point of a cell of the image is clearly nearer.
+std::vector<int64_t> seen(const View& scan, const double* T, const double* model, const double* normals, int64_t n, const SeenRule& rule);
+
 // Whether only faces that face the camera count: where t of T may be it (`known`), and of about `tested` points that have a
 // closest point at least this share has it on a face that faces t.
 struct Sight {
