@@ -41,6 +41,34 @@ def test_the_evidence_is_the_marginal_likelihood() -> None:
     assert pytest.approx(np.diag(scale**2) - gain @ M @ np.diag(scale**2), abs=1e-9) == P
 
 
+def test_the_evidence_of_several_kinds_is_the_mean_of_their_densities() -> None:
+    rng = np.random.Generator(np.random.PCG64(5))
+    M, white, scale = rng.normal(size=(3, 12, 7)), 2.0 * rng.normal(size=12), rng.uniform(0.1, 3.0, size=7)
+    kinds = [slice(6, 7), slice(0, 3), slice(0, 6)]
+    free = multivariate_normal.logpdf(white, np.zeros(12), np.eye(12))
+    for one, found in zip(M, scan_window.mixed(M, white, scale, kinds), strict=True):
+        covariances = [
+            np.eye(12) + one[:, kind] @ np.diag((factor * scale[kind]) ** 2) @ one[:, kind].T
+            for kind, factor in itertools.product(kinds, scan_window.SCALES)
+        ]
+        ratios = [np.exp(multivariate_normal.logpdf(white, np.zeros(12), C) - free) for C in covariances]
+        assert found == pytest.approx(np.log(np.mean(ratios)), rel=1e-9, abs=1e-9)
+        A, b = one.T @ one, one.T @ white
+        want = multivariate_normal.logpdf(white, np.zeros(12), np.eye(12) + one @ one.T) - free
+        assert _motion.log_ratio(A[None], b[None])[0] == pytest.approx(want, rel=1e-9, abs=1e-9)
+
+
+def test_the_effect_of_a_change_acts_on_the_scans_after_it() -> None:
+    rng = np.random.Generator(np.random.PCG64(6))
+    late, impulses, instants = rng.normal(size=(4, 18, 12)), rng.normal(size=(2, 6, 3)), np.array([0.3, 1.7])
+    found = _motion.after_changes(late, np.array([0, 2]), impulses, instants)
+    for k, scan in enumerate((0, 2)):
+        assert found[k, :, :3] == pytest.approx(late[scan, :, :6] @ impulses[k], rel=1e-12, abs=1e-12)
+        assert found[k, :, 3:] == pytest.approx(late[scan, :, 9:] - instants[k] * late[scan, :, 6:9], abs=1e-12)
+    with pytest.raises(ValueError, match="not so many scans"):
+        _motion.after_changes(late, np.array([0, 4]), impulses, instants)
+
+
 def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None:
     """Likelihood ratio and moments of the error against the joint densities of two innovations, evaluated directly."""
     rng = np.random.Generator(np.random.PCG64(4))

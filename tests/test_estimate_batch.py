@@ -165,7 +165,7 @@ def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
         if k:
             step = flow(x.w_b, x.sigma, 0.5, noise[0])
             Phi.append(transition(step, x.sigma, 0.5))
-            lag.append(process_noise(step, 0.5, noise[1]))
+            lag.append(process_noise(step.Q[None], np.array([0.5]), noise[1])[0])
             x = advance(x, step, 0.5)
         off = Pose(poses.q[k], poses.t[k]).inverse() @ x.T_ac
         d[k] = np.concatenate([geometry.log(off.q), off.t])

@@ -21,7 +21,6 @@ from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
     MOST_RAD,
     NO_DRIVE,
-    Flow,
     Triple,
     advance,
     ascending,
@@ -36,10 +35,11 @@ from avsreplay.estimate.dynamics import (
     ratios,
     rotation_history,
     seconds_to,
+    sigma_join,
     transition,
     translated,
 )
-from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VEL, W
+from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VEL, W, hamilton
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
@@ -106,7 +106,7 @@ def propagated(
     Phi, by_u = (M[0] for M in _derivatives(x, u, np.array([h]), [transition(step, x.sigma, h, arc)]))
     P = _covariance(belief, Phi, by_u)
     if h > 0.0:
-        P += process_noise(step, h, force)
+        P += process_noise(step.Q[None], np.array([h]), force)[0]
     cross = Phi @ belief.cross + by_u @ belief.P_u
     there = _pushed(advance(x, step, h, arc), u, h)
     return replace(belief, t_ns=t_ns, x=there, P=0.5 * (P + P.T), cross=cross), Phi
@@ -114,34 +114,43 @@ def propagated(
 
 def driven_steps(
     belief: Belief, times_s: Array, torque: float, arc: OrbitArc | None
-) -> tuple[list[State], Array, Array, list[Flow]]:
+) -> tuple[list[State], Array, Array, Array]:
     """The motion of a belief to ``times_s`` (n,) [s], with the disturbance torque of this root density.
 
     Returns:
         The states, Phi (n, 20, 20), the derivative (n, 20, 6) by a constant acceleration, 0 where the belief has none,
-        and the rotations.
+        and the covariance (n, 6, 6) that the torque adds to (dq_v, w).
     """
     x, u = belief.x, belief.u if isinstance(belief, DrivenBelief) else None
-    steps = flows(x.w_b, x.sigma, times_s, torque, drive_in(belief))
-    states = [advance(x, step, t, arc) for step, t in zip(steps, times_s.tolist(), strict=True)]
-    Phi = [transition(step, x.sigma, t, arc) for step, t in zip(steps, times_s.tolist(), strict=True)]
+    q, w, S, Q = flows(x.w_b, x.sigma, times_s, torque, drive_in(belief))
+    q_ab, (centre, velocity) = np.array(hamilton(x.q_ab, q.T)).T, translated(x, times_s, arc)
+    fixed = np.tile(x.flat[13:], (len(times_s), 1))
+    if u is not None:
+        centre, velocity = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
+    states = [State.of(flat) for flat in np.hstack([q_ab, w, centre, velocity, fixed])]
+    Phi = _transitions(np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2), times_s, arc)
     if u is None:
-        return states, np.array(Phi), np.zeros((len(times_s), DIM, 6)), steps
-    moved = [_pushed(then, u, t) for then, t in zip(states, times_s.tolist(), strict=True)]
-    return moved, *_derivatives(x, u, times_s, Phi), steps
+        return states, Phi, np.zeros((len(times_s), DIM, 6)), Q
+    return states, *_derivatives(x, u, times_s, Phi), Q
+
+
+def _transitions(S: Array, times_s: Array, arc: OrbitArc | None) -> Array:
+    """Phi (n, 20, 20) from the derivatives S (n, 6, 8) of (dq_v, w) by (dq_v, w, sigma)."""
+    Phi = np.zeros((len(times_s), DIM, DIM))
+    Phi[:] = np.eye(DIM)
+    Phi[:, :6, :6], Phi[:, :6, SIGMA] = S[:, :, :6], S[:, :, 6:]
+    if arc is None:
+        Phi[:, RHO, VEL] = times_s[:, None, None] * np.eye(3)
+    else:
+        Phi[:, RHO.start : VEL.stop, RHO.start : VEL.stop] = arc.transitions(times_s)
+    return Phi
 
 
 def driven_history(x: State, u: Array | None, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
     """The motion from ``x`` with a constant acceleration u (6,), or free motion, to ``times_s`` (n,) [s], ascending."""
     path = rotation_history(x, times_s, NO_DRIVE if u is None else drive_of(x, u))
     centre, velocity = translated(x, times_s, arc)
-    Phi = np.zeros((len(times_s), DIM, DIM))
-    Phi[:] = np.eye(DIM)
-    Phi[:, :6, :6], Phi[:, :6, SIGMA] = path.S[:, :, :6], path.S[:, :, 6:]
-    if arc is None:
-        Phi[:, RHO, VEL] = times_s[:, None, None] * np.eye(3)
-    else:
-        Phi[:, RHO.start : VEL.stop, RHO.start : VEL.stop] = arc.transitions(times_s)
+    Phi = _transitions(path.S, times_s, arc)
     if u is None:
         return DrivenHistory(path.q, path.w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6)))
     pushed = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
@@ -227,13 +236,12 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     most = max(map(abs, belief.x.w_b.tolist())) * float(times_s.max(initial=0.0))
     if most > MOST_RAD or not len(times_s):
         return grasp_forecast(belief, times_s, torque, force)
-    states, Phi, by_u, steps = driven_steps(belief, times_s, torque, None)
+    states, Phi, by_u, Q = driven_steps(belief, times_s, torque, None)
     rotations = geometry.matrix(np.array([x.q_ab for x in states]))
     J = grasp_jacobian(rotations, np.array([x.w_b for x in states]), belief.x.c_b)
-    variances = np.empty((len(times_s), 9))
-    for k, t in enumerate(times_s.tolist()):
-        P = _covariance(belief, Phi[k], by_u[k]) + process_noise(steps[k], t, force)
-        variances[k] = np.diagonal(J[k] @ P @ J[k].T)
+    variances, noise = np.empty((len(times_s), 9)), process_noise(Q, times_s, force)
+    for k in range(len(times_s)):
+        variances[k] = np.diagonal(J[k] @ (_covariance(belief, Phi[k], by_u[k]) + noise[k]) @ J[k].T)
     return forecast_of(times_s, variances.reshape(-1, 3, 3).sum(axis=2))
 
 

@@ -85,17 +85,19 @@ def flow(w: Array, sigma: Array, h: float, torque: float = 0.0, drive: Triple = 
     Raises:
         ValueError: an inertia ratio beyond -1 to 1, a rate or time that is not finite, or more than a million radians.
     """
-    return flows(w, sigma, np.array((h,)), torque, drive)[0]
+    q, w, S, Q = flows(w, sigma, np.array((h,)), torque, drive)
+    return Flow(w[0], q[0], S[0], Q[0])
 
 
-def flows(w: Array, sigma: Array, times_s: Array, torque: float = 0.0, drive: Triple = NO_DRIVE) -> list[Flow]:
-    """``flow`` to each of ``times_s`` (n,) [s], each reached from the one before.
+def flows(
+    w: Array, sigma: Array, times_s: Array, torque: float = 0.0, drive: Triple = NO_DRIVE
+) -> tuple[Array, Array, Array, Array]:
+    """Return q (n, 4), w (n, 3), S (n, 6, 9) and Q (n, 6, 6) of ``flow`` to each of ``times_s`` (n,) [s] in turn.
 
     Raises:
         ValueError: as ``flow``.
     """
-    found = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s, drive)
-    return [Flow(w, q, S, Q) for q, w, S, Q in zip(*found, strict=True)]
+    return _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s, drive)
 
 
 def ratios(sigma: Array) -> Triple:
@@ -123,16 +125,18 @@ def transition(step: Flow, sigma: Array, h: float, arc: OrbitArc | None = None) 
     return Phi
 
 
-def process_noise(step: Flow, h: float, force: float) -> Array:
-    """Process noise Q_d (20, 20) of a step; ``force`` is the root density of eps_f [m/s^1.5]."""
-    Q = np.zeros((DIM, DIM))
-    Q[:6, :6] = step.Q
-    density, h = force * force, abs(h)
-    entries = Q.reshape(-1)
-    entries[_POSITION] = density * h**3 / 3.0
-    entries[_MIXED] = entries[_MIXED_MIRROR] = density * h**2 / 2.0
-    entries[_VELOCITY] = density * h
-    return Q
+def process_noise(Q: Array, times_s: Array, force: float) -> Array:
+    """Process noise Q_d (n, 20, 20) over ``times_s`` (n,), from that of the rotations (n, 6, 6).
+
+    ``force`` is the root density of eps_f [m/s^1.5].
+    """
+    out, density, h = np.zeros((len(Q), DIM, DIM)), force * force, np.abs(times_s[:, None])
+    out[:, :6, :6] = Q
+    entries = out.reshape(-1, DIM * DIM)
+    entries[:, _POSITION] = density * h**3 / 3.0
+    entries[:, _MIXED] = entries[:, _MIXED_MIRROR] = density * h**2 / 2.0
+    entries[:, _VELOCITY] = density * h
+    return out
 
 
 def translation(h: float, arc: OrbitArc | None = None) -> Array:

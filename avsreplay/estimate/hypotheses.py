@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import impulses
-from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
     PRIOR_ODDS,
@@ -27,7 +27,6 @@ from avsreplay.estimate.scan_window import (
     log_density,
     log_evidence,
     log_mean,
-    log_ratio,
     mixed,
     pose_difference,
     since_each,
@@ -238,8 +237,8 @@ def _located(
 
 def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
     """Derivatives (k, 6n, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
-    late, tau = window.late[np.searchsorted(window.times_s, instants, side="right")], instants[:, None, None]
-    return np.concatenate([late[..., :6] @ impulses(start.x, instants), late[..., VEL] - tau * late[..., RHO]], axis=2)
+    which = np.searchsorted(window.times_s, instants, side="right")
+    return _motion.after_changes(window.late, which, impulses(start.x, instants), instants)
 
 
 def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]) -> Array:
@@ -251,7 +250,7 @@ def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]
     G, g = (M.T @ M).reshape(count, 6, count, 6), (M.T @ white).reshape(count, 6)
     at = chosen - first
     A = G[at[:, :, None], :, at[:, None, :]].transpose(0, 1, 3, 2, 4).reshape(-1, size, size)
-    return log_ratio(A, g[at].reshape(-1, size))
+    return _motion.log_ratio(A, g[at].reshape(-1, size))
 
 
 def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> tuple[Explanation, bool]:

@@ -169,8 +169,8 @@ def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
         R: (6, 6) noise of each scan.
         shares: common share of the variance of each scan, 0 to 1.
     """
-    roots = [math.sqrt(share) * np.linalg.cholesky(one) for one, share in zip(R, shares, strict=True)]
-    common = np.concatenate(roots)
+    roots = np.sqrt(np.array(shares))[:, None, None] * np.linalg.cholesky(np.array(R))
+    common = roots.reshape(-1, 6)
     out: Array = common @ common.T
     for k, one in enumerate(R):
         out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = one

@@ -120,11 +120,11 @@ def window_of(
     """The scans about the trajectory from ``start``, with disturbances of these root densities."""
     n = len(epochs)
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
-    states, transitions, by_u, steps = driven_steps(start, times, torque, arc)
+    states, transitions, by_u, Q = driven_steps(start, times, torque, arc)
     poses = tuple(measured_pose(e.prediction.belief.x, e.innovation.alpha) for e in epochs)
     y = np.array([innovation_vector(x, pose) for x, pose in zip(states, poses, strict=True)])
     H, inverse = np.array([measurement_jacobian(x) for x in states]), np.linalg.inv(transitions)
-    noise = np.array([process_noise(step, t, force) for step, t in zip(steps, times, strict=True)])
+    noise = process_noise(Q, times, force)
     rows, back = H @ transitions, start.P + inverse @ noise @ np.swapaxes(inverse, 1, 2)  # errors of the start
     C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
     earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common
@@ -203,22 +203,8 @@ def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
 
 def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[Array, Array, Array]:
     """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1), for each M."""
-    Mt, outer = np.swapaxes(M, -1, -2), np.outer(scale, scale)
-    A, b = Mt @ M * outer + np.eye(len(scale)), scale * (Mt @ white)
-    inverse = np.linalg.inv(A)
-    v = (inverse @ b[..., None])[..., 0]
-    value = free + 0.5 * (b * v).sum(axis=-1) - 0.5 * np.linalg.slogdet(A)[1]
-    return np.asarray(value), scale * v, outer * (0.5 * (inverse + np.swapaxes(inverse, -1, -2)))
-
-
-def log_ratio(A: Array, b: Array) -> Array:
-    """Log evidence over none of unknowns u ~ N(0, 1), with A (..., n, n) = M' M and b (..., n) = M' white."""
-    n, bordered = b.shape[-1], np.zeros((*b.shape[:-1], b.shape[-1] + 1, b.shape[-1] + 1))
-    bordered[..., :n, :n], bordered[..., n, :n] = A + np.eye(n), b
-    bordered[..., n, n] = 1.0 + 2.0 * (b * b).sum(axis=-1)
-    root = cholesky_root(bordered)  # its last row is L^-1 b
-    logs = np.log(np.diagonal(root, axis1=-2, axis2=-1)[..., :n])
-    return np.asarray(0.5 * (root[..., n, :n] ** 2).sum(axis=-1) - logs.sum(axis=-1))
+    value, mean, P = _motion.evidence(M if M.ndim == 3 else M[None], white, scale)
+    return (free + value, mean, P) if M.ndim == 3 else (free + value[0], mean[0], P[0])
 
 
 def pose_difference(a: Pose, b: Pose, R_ba: Array) -> Array:
@@ -241,10 +227,7 @@ def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array
 
     A single prior that is wide in all directions would hide a small change of the velocity alone from few scans.
     """
-    Mt, factors = np.swapaxes(M, 1, 2), np.array(SCALES)[:, None, None]
-    G, g = Mt @ M * np.outer(scale, scale), Mt @ white * scale
-    found = [log_ratio(factors[..., None] ** 2 * G[:, kind, kind], factors * g[:, kind]) for kind in kinds]
-    return np.asarray(np.logaddexp.reduce(np.concatenate(found)) - math.log(len(SCALES) * len(kinds)))
+    return _motion.mixed(M, white, scale, np.array(SCALES), [(kind.start, kind.stop) for kind in kinds])
 
 
 def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:

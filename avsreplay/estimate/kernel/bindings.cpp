@@ -2,12 +2,14 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/vector.h>
 
 #include <cmath>
 #include <cstring>
 #include <stdexcept>
 
 #include "covariance.hpp"
+#include "evidence.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -199,6 +201,58 @@ nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>&
   Square moments;
   const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), scale, share, moments);
   return nb::make_tuple(ratio, made(moments));
+}
+
+// Log evidence (k), mean (k, n) and covariance (k, n, n) of the unknowns of each M (m, n).
+nb::tuple evidence_of(const Matrix<-1, -1, -1>& M, const Vector<-1>& white, const Vector<-1>& size) {
+  const size_t k = M.shape(0), m = M.shape(1), n = M.shape(2);
+  if (white.shape(0) != m || size.shape(0) != n) throw std::invalid_argument("sizes of M, data and unknowns differ");
+  double *values, *means, *covariances;
+  Numpy value = array({k}, &values), mean = array({k, n}, &means), P = array({k, n, n}, &covariances);
+  for (size_t i = 0; i < k; ++i)
+    values[i] = evidence(M.data() + m * n * i, white.data(), size.data(), m, n, means + n * i, covariances + n * n * i);
+  return nb::make_tuple(value, mean, P);
+}
+
+// Per instant, the derivatives (m, 6) of white data by a change then, of those in `late` (n, m, 12) that `which` names.
+Numpy after_changes(const Matrix<-1, -1, MOTION>& late, const nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig>& which,
+                    const Matrix<-1, 6, 3>& impulses, const Times& instants) {
+  const size_t k = instants.shape(0), m = late.shape(1);
+  if (which.shape(0) != k || impulses.shape(0) != k) throw std::invalid_argument("instants and impulses must be equally many");
+  double* values;
+  Numpy out = array({k, m, SEEN}, &values);
+  for (size_t i = 0; i < k; ++i) {
+    const int64_t at = which(i);
+    if (at < 0 || (size_t)at >= late.shape(0)) throw std::invalid_argument("there are not so many scans");
+    after_change(late.data() + MOTION * m * (size_t)at, as<double[6][3]>(impulses.data() + 18 * i), instants(i), m,
+                 values + SEEN * m * i);
+  }
+  return out;
+}
+
+Numpy log_ratio_of(const Matrix<-1, -1, -1>& A, const Matrix<-1, -1>& b) {
+  const size_t k = A.shape(0), n = A.shape(1);
+  if (A.shape(2) != n || b.shape(0) != k || b.shape(1) != n) throw std::invalid_argument("sizes of A and b differ");
+  double* values;
+  Numpy value = array({k}, &values);
+  for (size_t i = 0; i < k; ++i) values[i] = log_ratio(A.data() + n * n * i, b.data() + n * i, n);
+  return value;
+}
+
+// Per M (m, n), the log of the mean evidence over kinds, ranges of columns, and factors on the size.
+Numpy mixed_of(const Matrix<-1, -1, -1>& M, const Vector<-1>& white, const Vector<-1>& size, const Vector<-1>& factors,
+               const std::vector<std::array<size_t, 2>>& kinds) {
+  const size_t k = M.shape(0), m = M.shape(1), n = M.shape(2);
+  if (white.shape(0) != m || size.shape(0) != n || !factors.shape(0) || kinds.empty())
+    throw std::invalid_argument("sizes of M, data and unknowns differ");
+  for (const auto& kind : kinds)
+    if (kind[0] >= kind[1] || kind[1] > n) throw std::invalid_argument("a kind is not a range of columns");
+  double* values;
+  Numpy value = array({k}, &values);
+  for (size_t i = 0; i < k; ++i)
+    values[i] = mixed_evidence(M.data() + m * n * i, white.data(), size.data(), m, n, factors.data(), factors.shape(0),
+                               reinterpret_cast<const size_t(*)[2]>(kinds.data()), kinds.size());
+  return value;
 }
 
 using Flat = Vector<CHART>;
@@ -588,6 +642,10 @@ NB_MODULE(_motion, m) {
         nb::arg("origin_c"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
+  m.def("after_changes", &after_changes, nb::arg("late"), nb::arg("which"), nb::arg("impulses"), nb::arg("instants"));
+  m.def("evidence", &evidence_of, nb::arg("M"), nb::arg("white"), nb::arg("size"));
+  m.def("log_ratio", &log_ratio_of, nb::arg("A"), nb::arg("b"));
+  m.def("mixed", &mixed_of, nb::arg("M"), nb::arg("white"), nb::arg("size"), nb::arg("factors"), nb::arg("kinds"));
   m.def("chart", &chart_from, nb::arg("x"));
   m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
