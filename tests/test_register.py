@@ -19,9 +19,10 @@ from avsreplay.register.covariance import systematic_errors, without_dominant_pa
 from avsreplay.register.degenerate import Directions
 from avsreplay.register.params import Camera
 from avsreplay.register.peers import best_motion, horn_matrix
-from avsreplay.register.quality import Visibility, evidence, grade
+from avsreplay.register.quality import evidence, grade
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Visibility
 from avsreplay.simulate.target import box
 
 RNG_SEED = 11
@@ -400,68 +401,6 @@ def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg:
         assert abs(np.degrees(geometry.log(step.q)[2])) < 0.05  # the rotation about it stays that of the guess
     # The position along it stays that of the guess, where the surface was seen: one radius beside the axis.
     assert abs(step.t[2]) < 1.8 * np.radians(guess_deg) + 0.002
-
-
-# --- what the camera can see
-
-
-def test_only_meshes_with_closed_parts_are_sided(surface: Surface) -> None:
-    assert Visibility(surface).sided
-    assert not Visibility(replace(surface, faces=surface.faces[:, ::-1])).sided
-    assert not Visibility(replace(surface, faces=surface.faces[::2])).sided
-    assert not Visibility(replace(surface, faces=np.empty((0, 3), dtype=np.int32))).sided
-
-
-def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.ndarray) -> None:
-    model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
-    np.testing.assert_array_equal(Visibility(surface).camera_c(model, scan, T_ca), T_ca.t)
-    np.testing.assert_array_equal(Visibility(surface, Camera.ORIGIN).camera_c(model, scan, T_ca), T_ca.t)
-    assert Visibility(surface, Camera.NONE).camera_c(model, scan, T_ca) is None
-    inward = replace(surface, faces=surface.faces[:, ::-1])
-    assert Visibility(inward).camera_c(model, scan, T_ca) is None
-
-
-def test_an_origin_inside_the_model_or_behind_the_measured_sides_is_no_camera(surface: Surface) -> None:
-    model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
-    near = view(surface, 3000, T_ca.t)
-    assert Visibility(surface).camera_c(model, near, Pose.identity()) is None
-    behind = view(surface, 3000, -T_ca.t)  # the sides that a camera on the other side would see
-    assert Visibility(surface).camera_c(model, example_pose().apply(behind), T_ca) is None
-
-
-@pytest.mark.parametrize("distance", [0.3, 0.8])
-def test_a_camera_beside_the_target_sees_one_side_of_a_panel(distance: float) -> None:
-    """With both sides of it, noise as large as the panel is thick would move the pose towards its middle."""
-    parts = [box([-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]), box([1.0, -0.5, 0.1], [4.0, 0.5, 0.12])]
-    vertices = np.concatenate([part.vertices for part in parts])
-    surface = Surface(vertices, np.concatenate([parts[0].faces, parts[1].faces + 8]), "box and panel", "")
-    eye = np.array([2.0, -1.8, 0.6 + distance])
-    ideal, rng, chi2 = view(surface, 9000, eye) - eye, _rng(), []
-    for _ in range(4):
-        scan = ideal * (1.0 + rng.normal(0, 0.02, (len(ideal), 1)) / np.linalg.norm(ideal, axis=1, keepdims=True))
-        found = Registrar(surface).register(scan, Pose(geometry.IDENTITY_QUAT, -eye))
-        error = found.T_ac.inverse() @ Pose(geometry.IDENTITY_QUAT, -eye)
-        d = np.concatenate([geometry.log(error.q), error.t])
-        chi2.append(d @ np.linalg.solve(found.covariance, d))
-    assert sum(chi2) < 58.61  # 99.99 % point of chi-square with 24 degrees of freedom
-
-
-def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.ndarray) -> None:
-    sight = Visibility(surface).direction_to_camera(scan)
-    assert sight @ (-example_pose().t / np.linalg.norm(example_pose().t)) > 0.95
-    assert Visibility(surface).direction_to_camera(example_pose().inverse().apply(scan)) is None
-    assert Visibility(surface, Camera.NONE).direction_to_camera(scan) is None
-
-
-@pytest.mark.parametrize("offset", [0.06, -0.06])
-def test_a_thin_panel_is_not_matched_to_its_reverse_side(offset: float) -> None:
-    """Half a panel's thickness off along the sight, either way: only one side of it can have been measured."""
-    surface = boxes()
-    T_ac = example_pose()
-    scan = T_ac.apply(view(surface, 6000, T_ac.inverse().t)) + _rng().normal(0, 0.004, (1, 3))
-    sight = T_ac.t / np.linalg.norm(T_ac.t)
-    found = Registrar(surface).register(scan, Pose(T_ac.q, T_ac.t + offset * sight))
-    assert np.linalg.norm(found.T_ac.t - T_ac.t) < 0.01
 
 
 # --- sampling

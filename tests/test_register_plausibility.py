@@ -14,9 +14,9 @@ from avsreplay.register.backend import healthy_work
 from avsreplay.register.budget import HEALTHY_SCANS, Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
-from avsreplay.register.quality import Visibility
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
+from avsreplay.register.visibility import Visibility
 
 SEED = 7
 

@@ -25,7 +25,7 @@ from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 if TYPE_CHECKING:
     from avsreplay.register.params import RegistrationLimits
-    from avsreplay.register.quality import Visibility
+    from avsreplay.register.visibility import Visibility
 
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 GROUP = "avsreplay.backends"
@@ -147,19 +147,21 @@ class HornBackend:
         ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
         first: they would end further from the result than it is.
         """
-        facing = self._visibility.camera_c(self._index, points, guess) is not None
-        rule = self._rules[facing]
+        rule = self._rules[False]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        return self._with(points, guess, within, max(1, min(most_work, _most(WITHIN_WORK, len(points)))))
+        rules = {facing: replace(within, facing=facing) for facing in (False, True)}
+        return self._run(points, guess, rules, max(1, min(most_work, _most(WITHIN_WORK, len(points)))))
 
-    def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
-        rule = rules[self._visibility.camera_c(self._index, points, guess) is not None]
-        return self._with(points, guess, rule, _most(ALIGN_WORK, len(points)))
+    def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams], most_work: int = 0) -> Fit:
+        """Align with one of the rules; ``most_work`` point searches at most, 0: those of an alignment."""
+        most = most_work or _most(ALIGN_WORK, len(points))
 
-    def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams, most_work: int) -> Fit:
-        found = self._index.icp(points, guess, rule, most_work)
-        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches, found.work)
+        def align(start: Pose, facing: bool) -> Fit:
+            found = self._index.icp(points, start, rules[facing], most)
+            return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches, found.work)
+
+        return self._visibility.consistent(self._index, points, guess, align)
 
 
 def healthy_work(points: int) -> int:

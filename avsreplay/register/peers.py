@@ -65,8 +65,10 @@ class ReferenceBackend:
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
-        T_ca, gate = guess, self._limits.reach_m
-        facing = self._visibility.camera_c(self._index, scan, guess) is not None
+        return self._visibility.consistent(self._index, scan, guess, lambda *start: self._align(scan, *start))
+
+    def _align(self, scan: Array, T_ca: Pose, facing: bool) -> Fit:
+        gate = self._limits.reach_m
         for passes in range(1, self._limits.n_max + 1):
             moved = T_ca.apply(scan)
             found = self._index.closest(moved, camera_c=T_ca.t if facing else None)

@@ -38,10 +38,11 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.quality import WELL_OFF, Visibility, not_measured
+from avsreplay.register.quality import WELL_OFF, not_measured
 from avsreplay.register.sampling import EMPTY, SPACED, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
+from avsreplay.register.visibility import Visibility
 
 SURFACE_POINTS = 1500
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|

@@ -19,20 +19,16 @@ from avsreplay.register.backend import Target, aligned, create_backend, healthy_
 from avsreplay.register.budget import HEALTHY_SCANS, LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
-from avsreplay.register.neighbourhood import NOT_COMPARED, Neighbourhood, of_many
+from avsreplay.register.neighbourhood import NOT_COMPARED, PART_ONLY, POSTPONED, Neighbourhood, of_many
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.rivals import LEAST_RAYS, NOT_TURNED, NearSymmetry, prepared
-from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
+from avsreplay.register.rivals import FAR_RAD, LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
+from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, finite, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Visibility
 
-FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
-TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
 LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = 2, 0.2, 0.9  # kept for the last registration; least and sure inliers
-PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
-NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
-POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
 
 class Registrar:
@@ -58,7 +54,7 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
-        self._visibility = quality.Visibility(surface, self.params.camera)
+        self._visibility = Visibility(surface, self.params.camera)
         surface, self.sided = self._visibility.surface, self._visibility.sided
         self._cache_dir = cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
         self.index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
@@ -94,7 +90,7 @@ class Registrar:
         Returns:
             The pose T_ac with its quality. A failure is its status, never an exception; T_ac is then the guess.
         """
-        scan = self._scan(points)
+        scan = finite(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points), guess):
             return refused
         halves = seq % self.params.split_every == 0
@@ -123,7 +119,7 @@ class Registrar:
             AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` names the rotation to it. A
             motion of a DEGENERATE view along its unobservable directions is not a different pose.
         """
-        scan = self._scan(points)
+        scan = finite(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points)):
             return refused
         if effort <= 1:
@@ -223,11 +219,6 @@ class Registrar:
     def _symmetry(self) -> NearSymmetry:
         """The near-symmetries of the model and its search, prepared when a scan needs them for the first time."""
         return prepared(self._target, self._test, self.params.acquire, self._cache_dir)
-
-    def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
-        finite = np.isfinite(points)
-        scan = points if finite.all() else points[finite.all(axis=1)]
-        return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
     def _settled(
         self, scan: NDArray[Any], found: Alignment, budget: Budget, halves: bool, carried: bool, unknown: Array | None
@@ -336,15 +327,24 @@ class Registrar:
         carried: bool,
         sized: Callable[[float, float], bool] | None = None,
     ) -> Alignment:
-        """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
-        start = guess.inverse()
-        fit = aligned(self.params.backend, self._backend, scan, start, width_m, budget.left)
-        if isinstance(fit, str):
-            return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
+        """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers.
+
+        A close fit that is not at a minimum before the last pass that is allowed is registered once more from there.
+        """
+        start = T_ca = guess.inverse()
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         options = (self.params, halves, self._accuracy, not carried, start, sized)
-        found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)
-        budget.registered(fit, found, sized is None)
+        for last in (budget.brief, True):
+            fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left)
+            if isinstance(fit, str):
+                return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
+            found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)
+            budget.registered(fit, found, sized is None)
+            ended = last or fit.iterations >= self.limits.n_max or budget.left < healthy_work(len(scan))
+            close = self._restarter.healthy(found.inlier_ratio, found.rms_m)
+            if ended or not close or found.status is not AlignStatus.NOT_CONVERGED:
+                break
+            T_ca = fit.T_ca
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found

@@ -89,6 +89,13 @@ def thin(points: Array, voxel_m: float) -> Array:
     return points[np.sort(first)]
 
 
+def finite(points: NDArray[Any], voxel_m: float) -> NDArray[Any]:
+    """Return the points (n, 3) that are finite, thinned by voxels of this size where it is above 0."""
+    known = np.isfinite(points)
+    scan = points if known.all() else points[known.all(axis=1)]
+    return thin(scan, voxel_m) if voxel_m > 0.0 else scan
+
+
 def thin_to(points: Array, count: int) -> Array:
     """Return about ``count`` of the points: the first of every voxel, whose size is found iteratively."""
     if len(points) <= count:

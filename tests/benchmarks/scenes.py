@@ -6,7 +6,7 @@
 Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a cylinder stage (a
 cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, and mesh files by their path.
 Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray; "close" is
-at 0.65 extents, with a quarter of the noise. The scenes
+at 0.65 extents and "closer" at 0.5, with a quarter of the noise. The scenes
 add walls, outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the
 same extent alone, at the predicted place if there is a guess. "Correct": within 2 deg and 0.02 of the extent of the
 true pose, or of a pose that differs by a symmetry of the mesh. With an error of scale up to 10 % the pose counts; with
@@ -52,7 +52,7 @@ BOXES = {  # sizes and middles of the boxes of a body
     "panel": [((1.5, 1.2, 1.0), (0, 0, 0)), ((3.0, 0.8, 0.05), (2.4, 0, 0.1)), ((0.3, 0.3, 0.5), (0.4, -0.4, 0.7))],
 }
 NOISE = 0.002  # of the extent
-DISTANCE, CLOSE = 3.0, 0.65  # extents from the camera to the middle of the target
+DISTANCE, CLOSE, CLOSER = 3.0, 0.65, 0.5  # extents from the camera to the middle of the target
 CLAIM = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a larger squared error contradicts the claim
 RIGHT_DEG, RIGHT_OF_EXTENT = 2.0, 0.02
 
@@ -231,10 +231,14 @@ def _noisy(noise: float) -> Maker:
     return make
 
 
-def _close(surface: Surface, count: int, seed: int) -> Case:
-    """A camera next to the target, with a prediction as in tracking and a quarter of the noise."""
-    v = view(surface, count, seed, noise=NOISE / 4, distance=CLOSE)
-    return Case(v.points, off(v, 1.0, 0.003), v.T_ac)
+def _close(distance: float, degrees: float) -> Maker:
+    """A camera next to the target, with a quarter of the noise; the smallest error is that of a prediction."""
+
+    def make(surface: Surface, count: int, seed: int) -> Case:
+        v = view(surface, count, seed, noise=NOISE / 4, distance=distance)
+        return Case(v.points, off(v, degrees, 0.003 * degrees), v.T_ac)
+
+    return make
 
 
 def _beside(degrees: float | None) -> Maker:
@@ -269,7 +273,12 @@ SCENES: dict[str, Maker] = {
     "clean, 45 deg": _plain(45.0, 0.0),
     "clean, 60 deg": _plain(60.0, 0.0),
     "clean, search": _plain(None, 0.0),
-    "close, 1 deg": _close,
+    "close, 1 deg": _close(CLOSE, 1.0),
+    "close, 5 deg": _close(CLOSE, 5.0),
+    "close, 10 deg": _close(CLOSE, 10.0),
+    "closer, 1 deg": _close(CLOSER, 1.0),
+    "closer, 5 deg": _close(CLOSER, 5.0),
+    "closer, 10 deg": _close(CLOSER, 10.0),
     "outliers 5 %, 3 deg": _plain(3.0, 0.01, lambda v: with_outliers(v, 0.05)),
     "outliers 60 %, 0.1 deg": _plain(0.1, 0.0002, lambda v: with_outliers(v, 0.6)),
     "outliers 60 %, 3 deg": _plain(3.0, 0.01, lambda v: with_outliers(v, 0.6)),

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.covariance import Evidence
-from avsreplay.register.quality import LEAST_PATCHES, PATCH_OF_EXTENT, Visibility
+from avsreplay.register.quality import LEAST_PATCHES, PATCH_OF_EXTENT
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Visibility
 
 
 @dataclass(frozen=True, eq=False)
