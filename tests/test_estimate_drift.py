@@ -116,7 +116,7 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
     """1e-4 rad/s2 per unit inertia: size and onset within their standard deviations, no claim beyond 4 sigma."""
     monkeypatch.setattr(surprises, "POS_M", 1e-3)
     monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.05))
-    case = surprises.Case("torque", torque=1e-4, seconds=60.0)
+    case = surprises.Case("torque", torque=1e-4, seconds=75.0)
     result = surprises.run(case, 0)
     assert result.track is not None
     drift = result.track.drift

@@ -12,17 +12,14 @@ from avsreplay import geometry
 from avsreplay.estimate.batch import Problem
 from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import to_chart
+from avsreplay.estimate.disturbance_density import density_in_use
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import line_of_sight_1s
 from avsreplay.estimate.noise_levels import (
-    _DENSITIES,
     MOST_POINTS,
     NO_LEVELS,
     NoiseLevels,
-    _density_odds,
-    _expected,
-    _position_odds,
-    _Residuals,
+    _of_positions,
     _variances,
     estimate_levels,
 )
@@ -112,26 +109,8 @@ def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(
         change = Manoeuvre(round(40.2e9), 0.1, np.array([0.0, step, 0.0]), np.zeros(3), np.eye(6), 0)
         arm, one = to_chart(world.states[0]).arm_c, np.ones(len(seen))
         rows = position_rows(poses_of(tuple(seen)), one, arm, 36, 0, [change] if step else [])
-        found.append(_expected(_position_odds(_variances(NO_LEVELS), rows)))
+        found.append(density_in_use(_of_positions(_variances(NO_LEVELS), rows), rows.present))
     assert all(force / 2.0 < q < 2.0 * force + 5e-6 for q in found), found
-
-
-def test_the_expected_density_is_that_of_a_certain_likelihood_and_little_of_an_equal_one() -> None:
-    peak = np.where(np.isclose(_DENSITIES, 1e-4, rtol=0.1), 0.0, -1e3) + 50.0
-    assert _expected(peak) == pytest.approx(1e-4, rel=0.1)
-    assert _expected(np.full(len(_DENSITIES), -50.0)) < 1e-12
-    bounded = np.where(_DENSITIES < 1.1e-5, 0.0, -1e3)  # anything up to 1e-5 is as likely as none
-    assert 5e-7 < _expected(bounded) < 5e-6
-
-
-@pytest.mark.parametrize("size", [1.0, 1e4, 1e8])
-def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_are(size: float) -> None:
-    """Impulses in an unstable spin have large effects over minutes, nearly those of other initial values."""
-    rng = np.random.Generator(np.random.PCG64(42))
-    e, J = rng.normal(size=144), rng.normal(size=(144, 20))
-    effects = rng.normal(size=(144, 69)) + size * J @ rng.normal(size=(20, 69))
-    _, odds = _density_odds(np.eye(144), effects, _Residuals(e, J, 1e-12 * np.eye(20), np.zeros(20)))
-    assert odds.max() <= 0.5 * float(e @ e)
 
 
 def test_a_given_density_is_not_changed() -> None:

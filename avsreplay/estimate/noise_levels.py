@@ -12,7 +12,7 @@ points by the average-information algorithm (Gilmour, Thompson and Cullis, Biome
 of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
 well. The claimed noise is the prior, with the weight of a few poses.
 
-The density of a disturbance is the mean over all candidates, none among them, weighted by their likelihood.
+The density of a disturbance stands for all candidates, none among them (``disturbance_density``).
 """
 
 from __future__ import annotations
@@ -27,9 +27,17 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.disturbance_density import (
+    Marginal,
+    Present,
+    Residuals,
+    density_in_use,
+    marginal,
+    probability_beside,
+)
 from avsreplay.estimate.driven import impulses
-from avsreplay.estimate.dynamics import torque_density
-from avsreplay.estimate.error_state import RHO, VEL
+from avsreplay.estimate.dynamics import propagate_state, torque_density
+from avsreplay.estimate.error_state import RHO, VEL, W
 from avsreplay.estimate.normal_points import PositionRows, error_parts
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -38,8 +46,6 @@ MOST_POINTS = 24  # normal points of an estimate
 FEWEST = 12  # poses from which the levels are estimated
 _CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
 _STEP = 3.0  # largest factor on a variance in one step
-_DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
-_FREE = 0.5  # prior probability that there is none; otherwise all decades of its root density are equally likely
 _SMALL = 0.3  # part of its standard deviation below which a disturbance may become zero
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
 _WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
@@ -123,13 +129,16 @@ def estimate_levels(
         theta = _improved(theta, open_, parts, data, points)
         yield n**3 // 40
     likely = theta.copy()
+    found: dict[int, tuple[Marginal, Present]] = {}
     for k in (k for k in (4, 5) if open_[k]):
         if positions is not None and k == 5:
-            odds = _position_odds(likely, positions)
+            found[k] = _of_positions(likely, positions), positions.present
         else:
-            odds = _density_odds(_covariance(likely, parts, k), parts.effects[k - 4], data)[1]
-        theta[k] = _expected(odds) ** 2
+            found[k] = marginal(_covariance(likely, parts, k), parts.effects[k - 4], data), parts.present[k - 4]
         yield n**3 // 40
+    for k, each in found.items():
+        beside = found[9 - k][0].evidence if 9 - k in found else 0.0
+        theta[k] = density_in_use(*each, probability_beside(beside)) ** 2
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
     return replace(
@@ -137,48 +146,10 @@ def estimate_levels(
     )
 
 
-def _expected(log_odds: Array) -> float:
-    """Root density q of a disturbance from the log odds (n,) of ``_DENSITIES`` over none, 0 where none is certain.
-
-    The variance of a tracked velocity that changes at random is proportional to q^1.5; its mean over all candidates is
-    that of the density returned. The most likely value alone is too small wherever the poses do not determine q.
-    """
-    likelihood = np.exp(log_odds - max(float(log_odds.max()), 0.0)) * (1.0 - _FREE) / len(_DENSITIES)
-    free = _FREE * math.exp(-max(float(log_odds.max()), 0.0))
-    mean = float(likelihood @ _DENSITIES**1.5) / (free + float(likelihood.sum()))
-    return math.pow(mean, 2.0 / 3.0)
-
-
-def _position_odds(theta: Array, rows: PositionRows) -> Array:
-    """The increase (n,) of the log likelihood by a random force, from positions alone."""
+def _of_positions(theta: Array, rows: PositionRows) -> Marginal:
+    """The likelihood of a random force from positions alone."""
     V = np.kron(np.eye(3), theta[1] * rows.white + theta[3] * rows.common)
-    return _density_odds(V, rows.force, _Residuals(rows.e, rows.J, rows.info, np.zeros(len(rows.info))))[1]
-
-
-def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array]:
-    """Log likelihood of the poses with noise V, and its increase (n,) with the squares of ``_DENSITIES``.
-
-    They are marginal over the initial values, without their constant. ``effects`` (m, k) are those of the disturbance.
-    """
-    none, A, b, chi2 = _likelihood(V, effects, data)
-    values, vectors = np.linalg.eigh(A)
-    most = chi2 * np.maximum(values, 0.0)  # by Cauchy and Schwarz; rounding can exceed it
-    squares, gain = np.minimum((vectors.T @ b) ** 2, most), _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
-    fitted = _DENSITIES[:, None] ** 2 * squares / (1.0 + gain)
-    return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
-
-
-def _likelihood(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array, Array, float]:
-    """Log likelihood of the poses with noise V, normal equations (k, k), (k,) by ``effects``, chi2 of the residuals."""
-    root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
-    white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
-    columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
-    Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
-    e = np.concatenate([white[:, -1], prior @ data.off])
-    left = e - Q @ (Q.T @ e)
-    chi2 = float(left @ left)
-    none = -0.5 * chi2 - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
-    return none, columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns), columns.T @ left, chi2
+    return marginal(V, rows.force, Residuals(rows.e, rows.J, rows.info, np.zeros(len(rows.info))))
 
 
 def _slack(e: Array, theta: Array, parts: _Components) -> float:
@@ -189,26 +160,36 @@ def _slack(e: Array, theta: Array, parts: _Components) -> float:
 
 
 def disturbed_likelihood(
-    points: Poses, problem: Problem, levels: NoiseLevels, k: int, others: Sequence[tuple[Array, Array]] = ()
+    points: Poses,
+    problem: Problem,
+    levels: NoiseLevels,
+    kinds: Sequence[int],
+    others: Sequence[tuple[Array, Array]] = (),
 ) -> float:
-    """Log likelihood of the poses with a random disturbance of unknown density, or with other unknowns instead.
+    """Log likelihood of the poses with random disturbances of the likeliest densities, or with other unknowns instead.
+
+    The greatest likelihood and not its mean over all densities: these range over eight decades, and the mean would make
+    random disturbances less likely by the logarithm of the number of candidates.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
         problem: their cost, linearised at the fit.
         levels: variance components; those of the errors of the poses and of the other disturbance are used.
-        k: 0 for a random torque, 1 for a random force.
+        kinds: 0 for a random torque, 1 for a random force, or both.
         others: the other unknowns with each of several priors that are equally likely: (n, 6, m) effect on the whitened
             residuals of each at its prior 1 sigma, and (m,) size in the motion about which the residuals are, in
             1 sigma.
     """
     data, parts = _linearised(points, problem)
-    V = _covariance(_variances(levels), parts, 4 + k)
+    theta, likelihood = _variances(levels), -math.inf
     if others:
-        nothing = np.zeros((len(V), 0))
-        return _log_mean(np.array([_likelihood(V, nothing, _extended(data, *each))[0] for each in others]))
-    none, odds = _density_odds(V, parts.effects[k], data)
-    return none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
+        theta[[4 + k for k in kinds]] = 0.0
+        V, nothing = _covariance(theta, parts), np.zeros((data.e.size, 0))
+        return _log_mean(np.array([marginal(V, nothing, _extended(data, *each)).none for each in others]))
+    for k in (*kinds, *kinds[:-1]):  # each given the other
+        density, likelihood = marginal(_covariance(theta, parts, 4 + k), parts.effects[k], data).likeliest
+        theta[4 + k] = density**2
+    return likelihood
 
 
 def _log_mean(values: Array) -> float:
@@ -220,49 +201,38 @@ def _variances(levels: NoiseLevels) -> Array:
 
 
 @value_class
-class _Residuals:
-    """Whitened residuals e (6n,) and their Jacobian J (6n, 20); information and offset (20,) of the prior.
-
-    The rows are ordered by axis, attitude first, and for each axis by pose.
-    """
-
-    e: Array
-    J: Array
-    info: Array
-    off: Array
-
-
-@value_class
 class _Components:
     """The six components at unit factors.
 
     Attributes:
         C: their covariances; of the errors of attitude and position (3n, 3n), of the disturbances (6n, 6n).
         effects: (6n, 3(n - 1)) of torque and of force, the roots of their covariances.
+        present: the rate in {B} and the velocity at the last point, by initial values and by these impulses.
     """
 
     C: tuple[Array, ...]
     effects: tuple[Array, Array]
+    present: tuple[Present, Present]
 
 
-def _linearised(points: Poses, problem: Problem) -> tuple[_Residuals, _Components]:
-    """Residuals about the chart of ``problem``, and the six components."""
-    e, H = problem.core.rows()
+def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components]:
+    """Residuals about the chart of ``problem``, ordered by axis, attitude first, then pose, and the six components."""
+    (e, H), T = problem.core.rows(), to_errors(problem.chart)
     white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
-    found = *_disturbances(points.times_s, problem.chart, H), H @ to_errors(problem.chart)
-    torque, force, J = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in found)
+    *effects, present = _disturbances(points, problem.chart, H, T)
+    torque, force, J = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in (*effects, H @ T))
     f, off = problem.factors**-2.0, problem.chart.minus(problem.prior.mean)
     C = white * f[0], white * f[1], common * f[0], common * f[1], torque @ torque.T, force @ force.T
-    data = _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, problem.prior.info, off)
-    return data, _Components(C, (torque, force))
+    data = Residuals(np.ascontiguousarray(e.T).reshape(-1), J, problem.prior.info, off)
+    return data, _Components(C, (torque, force), present)
 
 
-def _extended(data: _Residuals, effects: Array, size: Array) -> _Residuals:
+def _extended(data: Residuals, effects: Array, size: Array) -> Residuals:
     """The residuals with other unknowns, as in ``disturbed_likelihood``."""
     m = len(size)
     J = np.hstack([data.J, np.ascontiguousarray(effects.transpose(1, 0, 2)).reshape(-1, m)])
     info = np.block([[data.info, np.zeros((len(data.info), m))], [np.zeros((m, len(data.info))), np.eye(m)]])
-    return _Residuals(data.e, J, info, np.concatenate([data.off, size]))
+    return Residuals(data.e, J, info, np.concatenate([data.off, size]))
 
 
 def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
@@ -280,23 +250,26 @@ def _covariance(theta: Array, parts: _Components, without: int | None = None) ->
     return V
 
 
-def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]:
-    """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit density.
+def _disturbances(points: Poses, chart: Chart, H: Array, T: Array) -> tuple[Array, Array, tuple[Present, Present]]:
+    """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit density; the present.
 
     The disturbance between two neighbouring poses acts as one impulse in the middle. An impulse equals the errors at
-    the epoch from which free motion leads to it.
+    the epoch from which free motion leads to it. ``T`` (20, 20): derivative of the errors by chart steps.
     """
-    x, n = to_state(chart), len(times_s)
-    middle, root = 0.5 * (times_s[1:] + times_s[:-1]), np.sqrt(np.diff(times_s))
-    later = times_s[:, None] > middle
+    x, times, n = to_state(chart), points.times_s, len(points)
+    middle, root = 0.5 * (times[1:] + times[:-1]), np.sqrt(np.diff(times))
+    later = times[:, None] > middle
     back = impulses(x, middle) * np.sqrt(torque_density(x.sigma, 1.0))
     turn = (H[:, :, :6].reshape(-1, 6) @ back.transpose(1, 0, 2).reshape(6, -1)).reshape(n, 6, -1, 3)
     push = H[:, :, None, VEL] - middle[:, None] * H[:, :, None, RHO]
     weight = (later * root)[:, None, :, None]
-    return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1)
+    Phi = propagate_state(x, float(times[-1]), points.arc)[1]
+    rate = (Phi[W, :6] @ (back * root[:, None, None])).transpose(1, 0, 2).reshape(3, -1)
+    present = Present(Phi[W] @ T, rate), Present(Phi[VEL] @ T, np.asarray(np.kron(root, np.eye(3))))
+    return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1), present
 
 
-def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: _Residuals, points: Poses) -> Array:
+def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: Residuals, points: Poses) -> Array:
     """Variance components (6,) after one step of average information from theta (6,)."""
     inverse = np.linalg.inv(_covariance(theta, parts))
     VJ = inverse @ data.J

@@ -12,6 +12,7 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
+from avsreplay.estimate.disturbance_density import Present
 from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
@@ -39,6 +40,7 @@ class PositionRows:
         info: (m, m) information of these unknowns before the positions.
         white, common: (n, n) covariance of the independent and of the common errors, the same for three axes.
         force: (3n, 3(n - 1)) of impulses of the force between the points, of unit density.
+        present: the velocity at the last point, by the unknowns and by these impulses.
     """
 
     e: Array
@@ -47,6 +49,7 @@ class PositionRows:
     white: Array
     common: Array
     force: Array
+    present: Present
 
 
 def position_rows(
@@ -90,7 +93,11 @@ def position_rows(
     force = (late[:, None, :, None] * root[:, :, None, :]).reshape(len(times), 3, -1)
     e = (root @ (seen - seen[0])[:, :, None])[:, :, 0]
     rows = [np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)]
-    return PositionRows(np.ascontiguousarray(e.T).reshape(-1), rows[0], np.diag(sizes**-2.0), white, common, rows[1])
+    speed = np.array([0.0, 0.0, 1.0, *(1.0, 0.0) * len(changes)])
+    present = Present(*(np.asarray(np.kron(a, np.eye(3))) for a in (speed, np.sqrt(np.diff(times)))))
+    return PositionRows(
+        np.ascontiguousarray(e.T).reshape(-1), rows[0], np.diag(sizes**-2.0), white, common, rows[1], present
+    )
 
 
 def view_correlation(poses: Poses) -> Array:

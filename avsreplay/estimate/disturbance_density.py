@@ -1,0 +1,144 @@
+"""The density of a random disturbance: its likelihood, and the one density that stands for all of them.
+
+The whitened residuals of the poses are linear in the initial values y and in impulses u of the disturbance between the
+poses, with u ~ N(0, q^2). The likelihood of every root density q is a closed form in the eigenvectors of the
+information on u; so are the mean and the covariance of the present rate or velocity, given q.
+
+The estimator uses one density. The distribution over all densities has a larger covariance than the likely density
+alone wherever the poses do not determine q: a density of small probability under which the velocity has moved far
+counts as much as its square. The density in use is therefore the one about whose mean and with whose covariance the
+expected NEES of the present velocity is 1 (law of total covariance).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array
+
+DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
+_TOGETHER = (
+    0.9  # prior probability that torque and force are both random where one is, and that none is where one is not
+)
+_SQUARES = np.append(0.0, DENSITIES**2)
+
+
+@value_class
+class Residuals:
+    """Whitened residuals e (n,) and their Jacobian J (n, m); information (m, m) and offset (m,) of the prior."""
+
+    e: Array
+    J: Array
+    info: Array
+    off: Array
+
+
+@value_class
+class Present:
+    """The present rate or velocity: its derivatives by the m initial values (3, m) and by the k impulses (3, k)."""
+
+    by_initial: Array
+    by_impulses: Array
+
+
+@value_class
+class Marginal:
+    """The likelihood of k impulses with the initial values marginal over them.
+
+    Attributes:
+        none: log likelihood of no impulses, without its constant.
+        values: (k,) eigenvalues of the information on the impulses.  vectors: (k, k) its eigenvectors.
+        along: (k,) the gradient of the log likelihood along them.
+        R, cross: (m, m) root of the information on the initial values, and (m, k) its product with their derivatives
+            by the impulses.
+    """
+
+    none: float
+    values: Array
+    vectors: Array
+    along: Array
+    R: Array
+    cross: Array
+
+    @property
+    def log_odds(self) -> Array:
+        """(n,) increase of the log likelihood by the squares of ``DENSITIES``."""
+        gain = _SQUARES[1:, None] * self.values
+        fitted = _SQUARES[1:, None] * self.along**2 / (1.0 + gain)
+        return np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
+
+    @property
+    def evidence(self) -> float:
+        """Log likelihood of a disturbance, all decades of whose root density are equally likely, over none."""
+        return float(np.logaddexp.reduce(self.log_odds)) - math.log(len(DENSITIES))
+
+    @property
+    def likeliest(self) -> tuple[float, float]:
+        """The root density of the greatest likelihood, 0 for none, and its log likelihood."""
+        odds = np.append(0.0, self.log_odds)
+        k = int(np.argmax(odds))
+        return math.sqrt(_SQUARES[k]), self.none + float(odds[k])
+
+
+def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
+    """Marginal likelihood of residuals with noise V (n, n) and impulses with ``effects`` (n, k)."""
+    root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
+    white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
+    columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
+    Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
+    e = np.concatenate([white[:, -1], prior @ data.off])
+    left, cross = e - Q @ (Q.T @ e), Q.T @ columns
+    chi2 = float(left @ left)
+    none = -0.5 * chi2 - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
+    values, vectors = np.linalg.eigh(columns.T @ columns - cross.T @ cross)
+    values = np.maximum(values, 0.0)
+    most = np.sqrt(chi2 * values)  # by Cauchy and Schwarz; rounding can exceed it
+    return Marginal(none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross)
+
+
+def probability_beside(evidence: float) -> float:
+    """Prior probability of a random torque or force given the ``evidence`` of the other one.
+
+    A force whose line of action misses the mass centre turns the body, so that the two come together. Each by itself
+    has the probability 0.5.
+    """
+    other = 1.0 / (1.0 + math.exp(-min(max(evidence, -700.0), 700.0)))
+    return _TOGETHER * other + (1.0 - _TOGETHER) * (1.0 - other)
+
+
+def density_in_use(found: Marginal, present: Present, probability: float = 0.5) -> float:
+    """Root density for which the expected NEES of the present velocity is 1 under the posterior of all densities.
+
+    Zero where no disturbance is certain; between two candidates the density is interpolated.
+
+    Args:
+        found: the likelihood of the impulses.
+        present: the rate or velocity at the last pose.
+        probability: prior probability that there is a disturbance.
+    """
+    log = np.append(math.log1p(-probability), found.log_odds + math.log(probability / len(DENSITIES)))
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    by_initial = np.zeros((3, len(found.R)))  # of unknowns besides the initial values it is not known
+    by_initial[:, : present.by_initial.shape[1]] = present.by_initial
+    own = np.linalg.solve(found.R.T, by_initial.T).T
+    reach = (present.by_impulses - own @ found.cross) @ found.vectors
+    share = _SQUARES[:, None] / (1.0 + _SQUARES[:, None] * found.values)
+    P = own @ own.T + (reach * share[:, None, :]) @ reach.T
+    mean = (share * found.along) @ reach.T
+    total = np.tensordot(weights, P + mean[:, :, None] * mean[:, None, :], 1)
+    cross = mean[:, :, None] * (weights @ mean)
+    about = total - cross - cross.swapaxes(1, 2) + mean[:, :, None] * mean[:, None, :]
+    excess = np.trace(np.linalg.solve(P, about), axis1=1, axis2=2) / 3.0 - 1.0
+    largest = math.sqrt(float(weights @ _SQUARES))  # a variance grows at most with the square of the density
+    enough = np.flatnonzero(excess <= 0.0)
+    if not enough.size:
+        return largest
+    k = int(enough[0])
+    if k == 0:
+        return 0.0
+    part = float(excess[k - 1] / (excess[k - 1] - excess[k]))
+    return min(largest, math.sqrt(_SQUARES[k - 1] + part * (_SQUARES[k] - _SQUARES[k - 1])))

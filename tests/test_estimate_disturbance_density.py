@@ -1,0 +1,122 @@
+"""The density that stands for all densities of a random disturbance, on linear motions drawn from the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avsreplay.estimate.disturbance_density import (
+    DENSITIES,
+    Marginal,
+    Present,
+    Residuals,
+    density_in_use,
+    marginal,
+    probability_beside,
+)
+
+TIMES, SIGMA = np.arange(0.0, 40.0, 1.0), 0.002
+MIDDLE, ROOT = 0.5 * (TIMES[1:] + TIMES[:-1]), np.sqrt(np.diff(TIMES))
+LATE = np.maximum(TIMES[:, None] - MIDDLE, 0.0) * ROOT / SIGMA
+EFFECTS = -np.kron(LATE, np.eye(3))
+INITIAL = -np.kron(np.stack([np.ones_like(TIMES), TIMES], axis=1) / SIGMA, np.eye(3))
+PRESENT = Present(np.kron([[0.0, 1.0]], np.eye(3)), np.kron(ROOT[None], np.eye(3)))
+INFO = np.diag(np.repeat([1.0, 10.0], 3))
+V = np.eye(3 * len(TIMES))
+
+
+def drawn(density: float, rng: np.random.Generator) -> tuple[Marginal, Residuals, np.ndarray]:
+    """The likelihood of measured positions, their residuals about zero motion, and the true present velocity."""
+    y, u = rng.normal(size=6) / np.sqrt(np.diagonal(INFO)), density * rng.normal(size=3 * len(MIDDLE))
+    e = -(INITIAL @ y + EFFECTS @ u) + rng.normal(size=len(V))
+    data = Residuals(e, INITIAL, INFO, np.zeros(6))
+    return marginal(V, EFFECTS, data), data, PRESENT.by_initial @ y + PRESENT.by_impulses @ u
+
+
+def velocity(data: Residuals, density: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the present velocity with this density, by the normal equations of all unknowns."""
+    J = np.hstack([data.J, density * EFFECTS])
+    info = np.zeros((J.shape[1], J.shape[1]))
+    info[:6, :6], info[6:, 6:] = data.info, np.eye(J.shape[1] - 6)
+    C = np.linalg.inv(J.T @ J + info)
+    reach = np.hstack([PRESENT.by_initial, density * PRESENT.by_impulses])
+    return -reach @ C @ J.T @ data.e, reach @ C @ reach.T
+
+
+def nees(data: Residuals, density: float, truth: np.ndarray) -> float:
+    mean, P = velocity(data, density)
+    return float((mean - truth) @ np.linalg.solve(P, mean - truth)) / 3.0
+
+
+def power_mean(found: Marginal) -> float:
+    """The power 2/3 of the mean of q^1.5, to which the variance of a velocity that is long tracked is proportional."""
+    log = np.append(0.0, found.log_odds - np.log(len(DENSITIES)))
+    weights = np.exp(log - log.max())
+    return float(weights[1:] @ DENSITIES**1.5 / weights.sum()) ** (2.0 / 3.0)
+
+
+def test_a_velocity_is_claimed_right_in_the_mean_over_the_prior_of_the_density() -> None:
+    rng, ours, powers = np.random.Generator(np.random.PCG64(3)), [], []
+    for k in range(240):
+        density = 0.0 if k % 2 else float(DENSITIES[rng.integers(len(DENSITIES))])
+        found, data, truth = drawn(density, rng)
+        ours.append(nees(data, density_in_use(found, PRESENT), truth))
+        powers.append(nees(data, power_mean(found), truth))
+    assert 0.75 < np.mean(ours) < 1.2
+    assert np.mean(ours) < 0.9 * np.mean(powers)
+
+
+def test_the_density_in_use_is_zero_or_the_true_one_where_the_poses_determine_it() -> None:
+    rng = np.random.Generator(np.random.PCG64(4))
+    strong = drawn(1e-2, rng)[0]
+    assert density_in_use(strong, PRESENT) == pytest.approx(1e-2, rel=0.5)
+    assert strong.likeliest[0] == pytest.approx(1e-2, rel=0.5)
+    quiet = drawn(0.0, rng)[0]
+    assert density_in_use(quiet, PRESENT) < 1e-4
+    assert (
+        density_in_use(quiet, PRESENT, 0.1) < density_in_use(quiet, PRESENT, 0.5) < density_in_use(quiet, PRESENT, 0.9)
+    )
+    assert density_in_use(quiet, PRESENT, 1e-300) < 1e-9
+
+
+def test_the_density_in_use_never_exceeds_the_root_mean_square_of_all() -> None:
+    """Of few poses the expected NEES of the rate may be 1 for densities that are out of the question only."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    for _ in range(20):
+        found = drawn(1e-4, rng)[0]
+        weights = np.exp(np.append(0.0, found.log_odds - np.log(len(DENSITIES))))  # of a weak disturbance: no overflow
+        largest = float(np.sqrt(weights[1:] @ DENSITIES**2 / weights.sum()))
+        assert density_in_use(found, PRESENT) <= largest * (1.0 + 1e-12)
+        nowhere = Present(PRESENT.by_initial, 1e6 * PRESENT.by_impulses)
+        assert density_in_use(found, nowhere) <= largest * (1.0 + 1e-12)
+
+
+def test_the_likelihood_of_a_density_is_that_of_the_whole_covariance() -> None:
+    rng = np.random.Generator(np.random.PCG64(6))
+    found, data, _ = drawn(1e-3, rng)
+    prior = INITIAL @ np.linalg.inv(INFO) @ INITIAL.T
+    values = []
+    for density in (0.0, float(DENSITIES[40])):
+        S = V + prior + density**2 * EFFECTS @ EFFECTS.T
+        values.append(-0.5 * float(data.e @ np.linalg.solve(S, data.e) + np.linalg.slogdet(S)[1]))
+    assert found.log_odds[40] == pytest.approx(values[1] - values[0], abs=1e-6)
+    best, likelihood = found.likeliest
+    assert likelihood - found.none == pytest.approx(max(0.0, found.log_odds.max()))
+    assert best in (0.0, *DENSITIES.tolist())
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e8])
+def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_are(size: float) -> None:
+    """Impulses in an unstable spin have large effects over minutes, nearly those of other initial values."""
+    rng = np.random.Generator(np.random.PCG64(42))
+    e, J = rng.normal(size=144), rng.normal(size=(144, 20))
+    effects = rng.normal(size=(144, 69)) + size * J @ rng.normal(size=(20, 69))
+    found = marginal(np.eye(144), effects, Residuals(e, J, 1e-12 * np.eye(20), np.zeros(20)))
+    assert found.log_odds.max() <= 0.5 * float(e @ e)
+
+
+def test_torque_and_force_come_together() -> None:
+    assert probability_beside(0.0) == pytest.approx(0.5)
+    assert probability_beside(1e6) == pytest.approx(0.9)
+    assert probability_beside(-1e6) == pytest.approx(0.1)
+    assert np.all(np.diff([probability_beside(x) for x in np.linspace(-9.0, 9.0, 19)]) > 0.0)
