@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from decimal import Decimal, localcontext
 
 import estimate_surprises as surprises
 import numpy as np
@@ -27,6 +28,7 @@ from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
 from avsreplay.estimate.mixture import moments
+from avsreplay.estimate.noise_levels import NoiseLevels, pose_error_covariance
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
@@ -396,6 +398,45 @@ def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(s
     scale = np.sqrt(np.diag(fitted.P_chart))
     sizes = [np.sqrt(np.trace(added / np.outer(scale, scale))) for added in (at_minimum, beside)]
     assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
+
+
+@pytest.mark.parametrize(("count", "seconds"), [(3, 1.0), (40, 400.0)])
+def test_correlated_errors_change_the_covariance_as_in_exact_arithmetic(count: int, seconds: float) -> None:
+    """P (prior + J' V J) P in 60 digits, for three poses, most directions being unknown, and over many turns."""
+    states = tumbling.draw(2, seconds=seconds, hz=(count - 1) / seconds, rate=0.3).states
+    rng = np.random.Generator(np.random.PCG64(2))
+    fixes = tuple(
+        PoseFix(round(k * seconds / (count - 1) * 1e9), x.T_ac, np.diag(rng.uniform(0.5, 2.0, 6) * 1e-6), 0, 0.5)
+        for k, x in enumerate(states)
+    )
+    poses = poses_of(fixes)
+    levels, factors = NoiseLevels(common=(2.0, 3.0)), np.array([1.0, 1.2])
+    problem = Problem(poses, weak_prior(poses, WHITE), factors, to_chart(states[0]))
+    (A, B), _ = batch_covariance.sandwich(problem, poses, levels)
+    J = problem.core.rows()[1] @ to_errors(problem.chart)
+    V = pose_error_covariance(poses, levels, factors)
+    with localcontext() as context:
+        context.prec = 60
+        exact = np.vectorize(Decimal, otypes=[object])
+        info = exact(problem.prior.info)
+        P, total = _inverse(exact(J.reshape(-1, 20)).T.dot(exact(J.reshape(-1, 20))) + info), info
+        for b in range(2):
+            rows = exact(J[:, 3 * b : 3 * b + 3].reshape(count, -1))
+            total = total + rows.reshape(-1, 20).T.dot(exact(V[b]).dot(rows).reshape(-1, 20))
+        want, P = P.dot(total).dot(P).astype(float), P.astype(float)
+    scale = np.sqrt(np.diag(want))
+    assert pytest.approx(want / np.outer(scale, scale), abs=1e-11) == A @ (B @ P @ B.T) @ A.T / np.outer(scale, scale)
+
+
+def _inverse(A: Array) -> Array:
+    """The inverse by elimination, with numbers of any kind."""
+    M = np.hstack([A, np.vectorize(Decimal, otypes=[object])(np.eye(len(A)))])
+    for k in range(len(A)):
+        M[k] = M[k] / M[k, k]
+        for r in range(len(A)):
+            if r != k:
+                M[r] = M[r] - M[k] * M[r, k]
+    return M[:, len(A) :]
 
 
 def test_a_long_arc_settles() -> None:

@@ -153,8 +153,11 @@ def _profile(
     return (min(near, key=lambda f: f[0])[1] if near else None), spent
 
 
-def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Array, Array]:
+def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[tuple[Array, Array], Array]:
     """How correlated errors change the covariance of a fit that takes the poses as independent.
+
+    Over many turns the poses determine some directions 1e7 times better than others. The normal equations have the
+    square of this ratio, so that the factor of P is that of the residuals' derivatives themselves.
 
     Args:
         problem: linearised at the minimum of its cost, with the noise factors of the fit.
@@ -162,27 +165,23 @@ def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Arra
         levels: variance components.
 
     Returns:
-        M (20, 20) in chart steps: M P M' is the covariance of the estimate, P that of the fit. And the inflation (2,)
-        of independent noise of attitude and position with the same effect in the mean over the directions determined.
+        A and B (20, 20) in chart steps: A B P B' A' is the covariance of the estimate, P that of the fit. The inflation
+        (2,) of independent noise of attitude and position with the same effect in the mean over all directions.
     """
-    J = problem.core.rows()[1] @ to_errors(problem.chart)
-    n, scale = len(points), problem.prior.one_sigma
-    told, basis = np.linalg.eigh(problem.core.normal()[0] * np.outer(scale, scale))
-    told = np.sqrt(np.maximum(told, 1e-15 * told[-1]))
-    L, inverse = scale[:, None] * basis / told, told[:, None] * basis.T / scale  # P = L L'
-    P, total = L @ L.T, problem.prior.info
+    J, n = problem.core.rows()[1] @ to_errors(problem.chart), len(points)
+    Q, R = np.linalg.qr(np.vstack([J.reshape(-1, DIM), np.linalg.cholesky(problem.prior.info).T]))  # P = (R' R)^-1
+    white, total = Q[: 6 * n].reshape(n, 6, DIM), Q[6 * n :].T @ Q[6 * n :]
     plain = levels.factors(mean_share(points))
     V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
     for b in range(BLOCKS):
-        rows = J[:, 3 * b : 3 * b + 3].reshape(n, -1)
-        columns = rows.reshape(-1, 20)
-        found = columns.T @ (V[b] @ rows).reshape(-1, 20)
+        rows = np.ascontiguousarray(white[:, 3 * b : 3 * b + 3]).reshape(n, -1)
+        columns = rows.reshape(-1, DIM)
+        found = columns.T @ (V[b] @ rows).reshape(-1, DIM)
         total = total + found
-        alone = float(np.sum(P * (columns.T @ columns)))
-        inflation[b] = float(np.sum(P * found)) / alone * float(problem.factors[b] / plain[b]) ** 2
-    values, axes = np.linalg.eigh(L.T @ total @ L)
-    M = (L @ axes) @ (np.sqrt(np.maximum(values, 0.0))[:, None] * (axes.T @ inverse))
-    return np.asarray(M), np.maximum(inflation, 1.0)
+        alone = float(np.sum(columns * columns))
+        inflation[b] = float(np.trace(found)) / alone * float(problem.factors[b] / plain[b]) ** 2
+    values, axes = np.linalg.eigh(total)
+    return (np.linalg.inv(R), (axes * np.sqrt(np.maximum(values, 0.0))) @ (axes.T @ R)), np.maximum(inflation, 1.0)
 
 
 def unseen_torque(problem: Problem, after_s: float) -> Array:
@@ -228,7 +227,7 @@ def final_mixture(
     noise: tuple[float, float],
     t_ns: int,
     after_s: float,
-    spread: Array | None = None,
+    spread: tuple[Array, Array] | None = None,
     unseen: Array | None = None,
 ) -> Parts[tuple[Component, ...]]:
     """The fit with process noise as a Gaussian mixture at the last pose, in parts; the first has the published mean.
@@ -242,7 +241,7 @@ def final_mixture(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         t_ns: the instant of the last scan [ns].
         after_s: that instant after the epoch [s].
-        spread: (20, 20) M in chart steps: M P M' is the covariance with the correlation of the poses' errors.
+        spread: A and B of ``sandwich``, for the covariance with the correlation of the poses' errors.
         unseen: (20, 20) in chart steps at the epoch, added to the covariance of each component (``unseen_torque``).
     """
     fitted, n, rows, out = found.fitted, len(found.directions), [d.row for d in found.directions], []
@@ -258,7 +257,9 @@ def final_mixture(
         lost = not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE)  # far beyond what is linear
         if pin is None:
             y, P = (np.zeros(DIM), fitted.P_chart) if lost else (y, P)
-            P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
+            if spread is not None:  # for the trajectory of the fit alone
+                P = spread[0] @ (spread[1] @ P @ spread[1].T) @ spread[0].T
+            P = definite(P)
         if pin is None or not lost:
             there, share, step, beyond = _moved_on(chart, y, P, problem, recent, after_s)
             added = step @ added @ step.T if pin is None else added  # it is valid about free motion only
