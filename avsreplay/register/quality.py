@@ -6,6 +6,7 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -152,12 +153,12 @@ def grade(
     view has its unobservable directions as in the guess, if the surface then fits as well. ``sized``: whether the size
     is fitted, from the share of inliers and their rms [m]; a pose that is not the last one of its scan needs no size.
     """
-    if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
+    if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
     found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic)
-    same = guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes()
-    if found.overlap and same and found.statistic > UNCHANGED:
+    step = found.overlap and found.statistic > UNCHANGED
+    if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(failed, message="returned its guess unchanged, although the residuals require a step")
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -41,7 +42,7 @@ class Visibility:
     def __init__(self, surface: Surface, camera: Camera = Camera.AUTO) -> None:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
-        self._box = (low, high, clear)
+        self._sides, self._clear = list(zip(low.tolist(), high.tolist(), strict=True)), clear
         self._extent, self._known = surface.extent, camera is not Camera.NONE
         self.sided, self.surface = False, surface
         if camera is Camera.NONE:
@@ -64,9 +65,8 @@ class Visibility:
 
     def may_be_camera(self, T_ca: Pose) -> bool:
         """Return whether the outer sides are known, and the origin of {A} is clear of the bounding box of the model."""
-        low, high, clear = self._box
-        outside = np.maximum(np.maximum(low - T_ca.t, T_ca.t - high), 0.0)
-        return self.sided and float(np.linalg.norm(outside)) >= clear
+        outside = [max(a - x, x - b, 0.0) for x, (a, b) in zip(T_ca.t.tolist(), self._sides, strict=True)]
+        return self.sided and math.hypot(*outside) >= self._clear
 
     def faced(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether the test can apply to a scan (n, 3): ``may_be_camera``, or nearly all its faces are seen."""

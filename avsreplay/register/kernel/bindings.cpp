@@ -380,7 +380,8 @@ nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& 
   bool* keep;
   auto out = array<bool>({normals.shape(0)}, &keep);
   std::vector<uint8_t> kept(normals.shape(0), 1);
-  drop_dominant(normals.data(), counts.data(), (int64_t)kept.size(), kept.data());
+  const int64_t m = (int64_t)kept.size();
+  drop_dominant(normals.data(), counts.data(), m, inverted(total(normals.data(), m)), kept.data());
   std::copy(kept.begin(), kept.end(), keep);
   return out;
 }
@@ -394,7 +395,8 @@ Numpy pseudo_inverse_of(const Patches& N) {
 
 nb::tuple sandwich_of(const Patches& normals, const Patches& gradients) {
   check_patches(normals, gradients);
-  const Estimated found = sandwich(normals.data(), gradients.data(), (int64_t)normals.shape(0));
+  const int64_t m = (int64_t)normals.shape(0);
+  const Estimated found = sandwich(normals.data(), gradients.data(), m, inverted(total(normals.data(), m)).root);
   return nb::make_tuple(array66(found.P), found.dof);
 }
 
@@ -414,7 +416,7 @@ struct Table {
     require(extent > 0 && side > 0, "extent and patch size must be positive");
     table = {(int64_t)m, normals.data(), gradients.data(), offsets.data(), errors.data(), places.data(), counts.data(),
              {centre[0], centre[1], centre[2]}, extent, side, {}};
-    complete(table);
+    complete(table, inverted(total(table.normals, table.m)));
   }
 };
 
@@ -438,14 +440,16 @@ nb::tuple systematic_of(const Table& t) {
 }
 
 nb::tuple covariance_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
-  const Estimated found = covariance(t.table, errors_of(block, smooth, amplitudes, fit));
+  const Systematic errors = errors_of(block, smooth, amplitudes, fit);
+  const Estimated found = covariance(t.table, errors, unexplained(t.table, errors));
   return nb::make_tuple(array66(found.P), found.dof);
 }
 
 double split_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit,
                 const Patches& across) {
   require(across.ndim() == 2 && across.shape(1) == 3, "directions must be (k, 3)");
-  return split(t.table, errors_of(block, smooth, amplitudes, fit), across.data(), (int64_t)across.shape(0));
+  const Systematic errors = errors_of(block, smooth, amplitudes, fit);
+  return split(t.table, errors, unexplained(t.table, errors), across.data(), (int64_t)across.shape(0));
 }
 
 using Poses = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;

@@ -60,19 +60,6 @@ bool dominates(const double* Np, const Six& W, const Six& inverse) {
   return false;
 }
 
-// Root W of the pseudo-inverse of N: N^+ = W W'.
-Six pseudo_root(Six N) {
-  Six V;
-  eigen(N.v, V.v, 6, 1e-32);
-  double most = 0;
-  for (int k = 0; k < 6; ++k) most = std::max(most, N.v[k][k]);
-  for (int k = 0; k < 6; ++k) {
-    const double f = N.v[k][k] > 1.4e-15 * most ? 1 / std::sqrt(N.v[k][k]) : 0;
-    for (int i = 0; i < 6; ++i) V.v[i][k] *= f;
-  }
-  return V;
-}
-
 // W W'.
 Six squared(const Six& W) {
   Six A;
@@ -168,18 +155,14 @@ struct Part {
   std::vector<std::array<double, 18>> blocks;  // sums of the displacements' columns of the normals
 };
 
-void add(const PatchTable& t, const Systematic& errors, int64_t p, Part& to) {
-  double T[3][6];
-  Coupling A;
-  strains(t, p, T);
-  couple(t, p, T, A);
+// `left`: of `unexplained`.
+void add(const PatchTable& t, const std::vector<double>& left, int64_t p, Part& to) {
+  const Coupling& A = t.coupling[(size_t)p];
   const double *N = t.normals + 36 * p, *g = t.gradients + 6 * p;
   to.normals.insert(to.normals.end(), N, N + 36);
+  to.gradients.insert(to.gradients.end(), left.begin() + 6 * p, left.begin() + 6 * (p + 1));
   for (int i = 0; i < 6; ++i) {
-    double left = g[i];
-    for (int j = 0; j < 6; ++j) left -= N[6 * i + j] * errors.fit[j];
-    for (int k = 0; k < AMPLITUDES; ++k) left -= A[i][k] * errors.amplitudes[k], to.coupling[i][k] += A[i][k];
-    to.gradients.push_back(left);
+    for (int k = 0; k < AMPLITUDES; ++k) to.coupling[i][k] += A[i][k];
     to.sum[i] += g[i];
     for (int a = 0; a < 3; ++a) to.blocks[(size_t)t.block[(size_t)p]][(size_t)(3 * i + a)] += N[6 * i + 3 + a];
   }
@@ -227,13 +210,13 @@ bool determines(Six N) {
 }
 
 // Normalised squared difference of the poses from the patches below the median of `along`, and from the others.
-double difference(const PatchTable& t, const Systematic& errors, const std::vector<double>& along) {
+double difference(const PatchTable& t, const Systematic& errors, const std::vector<double>& left, const std::vector<double>& along) {
   std::vector<double> sorted = along;
   std::sort(sorted.begin(), sorted.end());
   const double middle = 0.5 * (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]);
   Part parts[2];
   for (Part& part : parts) part.blocks.resize((size_t)t.blocks);
-  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, parts[along[(size_t)p] < middle ? 0 : 1]);
+  for (int64_t p = 0; p < t.m; ++p) add(t, left, p, parts[along[(size_t)p] < middle ? 0 : 1]);
   double d[6] = {}, value = 0;
   Six C;
   Effect effect;
@@ -242,7 +225,8 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
     const int64_t m = (int64_t)part.gradients.size() / 6;
     const Six N = total(part.normals.data(), m);
     if (m < LEAST_HALF || !determines(N)) return std::numeric_limits<double>::quiet_NaN();
-    const Six inverse = pseudo_inverse(N), P = sandwich(part.normals.data(), part.gradients.data(), m).P;
+    const Inverted of_half = inverted(N);
+    const Six &inverse = of_half.inverse, P = sandwich(part.normals.data(), part.gradients.data(), m, of_half.root).P;
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) d[i] += (half ? 1 : -1) * inverse.v[i][j] * part.sum[j], C.v[i][j] += P.v[i][j];
     effect.add(part, inverse, half ? 1 : -1);
@@ -256,6 +240,20 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
 
 }  // namespace
 
+Inverted inverted(Six N) {
+  Six V;
+  Inverted out;
+  eigen(N.v, V.v, 6, 1e-32);
+  out.inverse = pseudo_inverse(N, V);
+  double most = 0;
+  for (int k = 0; k < 6; ++k) most = std::max(most, N.v[k][k]);
+  for (int k = 0; k < 6; ++k) {
+    const double f = N.v[k][k] > 1.4e-15 * most ? 1 / std::sqrt(N.v[k][k]) : 0;
+    for (int i = 0; i < 6; ++i) out.root.v[i][k] = V.v[i][k] * f;
+  }
+  return out;
+}
+
 Six total(const double* normals, int64_t m, const uint8_t* keep) {
   Six N;
   for (int64_t k = 0; k < m; ++k)
@@ -265,9 +263,9 @@ Six total(const double* normals, int64_t m, const uint8_t* keep) {
   return N;
 }
 
-void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep) {
-  for (;;) {
-    const Six W = pseudo_root(total(normals, m, keep)), inverse = squared(W);
+void drop_dominant(const double* normals, const int64_t* counts, int64_t m, const Inverted& all, uint8_t* keep) {
+  for (Six W = all.root;; W = inverted(total(normals, m, keep)).root) {
+    const Six inverse = squared(W);
     std::vector<uint8_t> left(keep, keep + m);
     int64_t points = 0, dropped = 0;
     for (int64_t k = 0; k < m; ++k) {
@@ -283,8 +281,7 @@ void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint
   }
 }
 
-Estimated sandwich(const double* normals, const double* gradients, int64_t m) {
-  const Six W = pseudo_root(total(normals, m));
+Estimated sandwich(const double* normals, const double* gradients, int64_t m, const Six& W) {
   Six S;
   Estimated out{{}, LEAST_DOF};
   Six& P = out.P;
@@ -314,15 +311,26 @@ Estimated sandwich(const double* normals, const double* gradients, int64_t m) {
   return out;
 }
 
-Estimated covariance(const PatchTable& t, const Systematic& errors) {
+std::vector<double> unexplained(const PatchTable& t, const Systematic& errors) {
+  std::vector<double> left(t.gradients, t.gradients + 6 * t.m);
+  for (int64_t p = 0; p < t.m; ++p)
+    for (int i = 0; i < 6; ++i) {
+      double& to = left[(size_t)(6 * p + i)];
+      for (int j = 0; j < 6; ++j) to -= t.normals[36 * p + 6 * i + j] * errors.fit[j];
+      for (int k = 0; k < AMPLITUDES; ++k) to -= t.coupling[(size_t)p][(size_t)i][(size_t)k] * errors.amplitudes[k];
+    }
+  return left;
+}
+
+Estimated covariance(const PatchTable& t, const Systematic& errors, const std::vector<double>& left) {
   Part all;
   all.blocks.resize((size_t)t.blocks);
-  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, all);
-  Estimated out = sandwich(t.normals, all.gradients.data(), t.m);
+  for (int64_t p = 0; p < t.m; ++p) add(t, left, p, all);
+  Estimated out = sandwich(t.normals, left.data(), t.m, t.total.root);
   const Six random = out.P;
   Six& P = out.P;
   Effect effect;
-  effect.add(all, t.inverse, 1);
+  effect.add(all, t.total.inverse, 1);
   effect.add_to(errors, P);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
@@ -331,7 +339,7 @@ Estimated covariance(const PatchTable& t, const Systematic& errors) {
 }
 
 std::array<double, 2> size_error(const PatchTable& t) {
-  const Six& inverse = t.inverse;
+  const Six& inverse = t.total.inverse;
   std::vector<std::array<double, 6>> a((size_t)t.m);  // sums of J times the residual per unit of size
   std::vector<double> f((size_t)t.m), e((size_t)t.m);  // sums of its square, and of its product with the residual
   double A[6] = {}, g[6] = {}, pose_of_size[6] = {}, pose[6] = {}, F = 0, free = 0, size = 0, squares = 0;
@@ -373,7 +381,7 @@ std::array<double, 2> size_error(const PatchTable& t) {
   return {size, std::sqrt(squares) / free};
 }
 
-double split(const PatchTable& t, const Systematic& errors, const double* across, int64_t k) {
+double split(const PatchTable& t, const Systematic& errors, const std::vector<double>& left, const double* across, int64_t k) {
   double worst = t.m && k ? 0 : std::numeric_limits<double>::quiet_NaN();
   for (int64_t d = 0; d < k && t.m; ++d) {
     std::vector<double> along((size_t)t.m);
@@ -381,7 +389,7 @@ double split(const PatchTable& t, const Systematic& errors, const double* across
       const double *a = across + 3 * d, *x = t.places + 3 * p;
       along[(size_t)p] = a[0] * x[0] + a[1] * x[1] + a[2] * x[2];
     }
-    const double found = difference(t, errors, along);
+    const double found = difference(t, errors, left, along);
     if (!(found <= worst)) worst = found;
     if (std::isnan(found)) break;
   }

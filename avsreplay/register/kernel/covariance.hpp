@@ -12,6 +12,12 @@ constexpr int AMPLITUDES = 7;  // six of a strain and the offset
 using Six = Square<6>;
 using Coupling = std::array<std::array<double, AMPLITUDES>, 6>;
 
+// The pseudo-inverse N^+ of an information N, and W with W W' = N^+.
+struct Inverted {
+  Six inverse, root;
+};
+Inverted inverted(Six N);
+
 // Sums of m patches as in `PatchSums`, matrices complete and row by row.
 struct PatchTable {
   int64_t m;
@@ -21,21 +27,22 @@ struct PatchTable {
   double extent, side;  // of the model, and of a patch [m]
 
   // What follows from these, see `complete`.
-  Six inverse;                      // pseudo-inverse of the sum of the normals
+  Inverted total;                       // of the sum of the normals
+  std::vector<Coupling> coupling = {};  // of each patch, sums of J times the residual per amplitude
   std::vector<int64_t> block = {};  // the number of the block of each patch, in the order of the blocks' places
   int64_t blocks = 0;
 };
 
-// Fills in what follows from the sums.
-void complete(PatchTable& patches);
+// Fills in what follows from the sums; `total` of the sum of their normals.
+void complete(PatchTable& patches, const Inverted& total);
 
 struct Systematic {
   double block = 0, smooth[AMPLITUDES] = {}, amplitudes[AMPLITUDES] = {}, fit[6] = {};
 };
 
 // Clears in `keep` the patches that give too much of the information on some motion of the patches kept, again until there
-// is none. Stops, with `keep` as it was, where too few points would be left.
-void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep);
+// is none. Stops, with `keep` as it was, where too few points would be left. `all`: of the sum of all normals.
+void drop_dominant(const double* normals, const int64_t* counts, int64_t m, const Inverted& all, uint8_t* keep);
 
 // A covariance and the degrees of freedom of the estimate.
 struct Estimated {
@@ -44,7 +51,7 @@ struct Estimated {
 };
 
 // P = sum over the patches p of m_p m_p', m_p = N^+ ((1 + ALONE) I - N_p N^+)^-1 g_p with N the sum of all N_p.
-Estimated sandwich(const double* normals, const double* gradients, int64_t m);
+Estimated sandwich(const double* normals, const double* gradients, int64_t m, const Six& root);
 
 Systematic systematic_errors(const PatchTable& patches);
 
@@ -52,12 +59,15 @@ Systematic systematic_errors(const PatchTable& patches);
 // infinity where the pose explains any size, as for three faces of a box.
 std::array<double, 2> size_error(const PatchTable& patches);
 
-// The sandwich of what `errors` leave unexplained, and their variances.
-Estimated covariance(const PatchTable& patches, const Systematic& errors);
+// The gradients (m, 6) without what pose and amplitudes explain.
+std::vector<double> unexplained(const PatchTable& patches, const Systematic& errors);
+
+// The sandwich of the gradients `left` that `errors` leave unexplained, and their variances.
+Estimated covariance(const PatchTable& patches, const Systematic& errors, const std::vector<double>& left);
 
 // The largest normalised squared difference of the poses of two halves, over the k directions `across` (k, 3); NaN where
 // a half does not determine a pose.
-double split(const PatchTable& patches, const Systematic& errors, const double* across, int64_t k);
+double split(const PatchTable& patches, const Systematic& errors, const std::vector<double>& left, const double* across, int64_t k);
 
 // Sum of the normals (m, 6, 6); of the patches kept where `keep` is given.
 Six total(const double* normals, int64_t m, const uint8_t* keep = nullptr);

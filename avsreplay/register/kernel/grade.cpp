@@ -59,18 +59,19 @@ bool is_bounded(const Six& P, double extent) {
 }
 
 // Covariance, test of halves and error of size.
-void measure(const PatchArrays& sums, const GradeRule& rule, Grade& out) {
+void measure(const PatchArrays& sums, const Inverted& all, const GradeRule& rule, Grade& out) {
   const int64_t directions = (int64_t)rule.across.size() / 3;
   const double* c = out.centre;
   PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
                    sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side, {}};
-  complete(table);
+  complete(table, all);
   Systematic errors;
-  if (rule.systematic || directions) errors = systematic_errors(table);
-  out.covariance = rule.systematic ? covariance(table, errors) : sandwich(table.normals, table.gradients, table.m);
+  std::vector<double> left;
+  if (rule.systematic || directions) errors = systematic_errors(table), left = unexplained(table, errors);
+  out.covariance = rule.systematic ? covariance(table, errors, left) : sandwich(table.normals, table.gradients, table.m, all.root);
   if (rule.systematic) out.size = size_error(table);
   const bool single = std::all_of(sums.counts.begin(), sums.counts.end(), [](int64_t n) { return n == 1; });
-  if (directions && !single) out.split = split(table, errors, rule.across.data(), directions);
+  if (directions && !single) out.split = split(table, errors, left, rule.across.data(), directions);
 }
 
 // Leaves the entries of the patches that are kept.
@@ -99,12 +100,13 @@ PatchArrays::PatchArrays(const std::vector<PatchSums>& patches) {
   }
 }
 
-void PatchArrays::drop() {
+bool PatchArrays::drop(const Inverted& all) {
   std::vector<uint8_t> keep(counts.size(), 1);
-  drop_dominant(normals.data(), counts.data(), size(), keep.data());
-  if (std::find(keep.begin(), keep.end(), 0) == keep.end()) return;
+  drop_dominant(normals.data(), counts.data(), size(), all, keep.data());
+  if (std::find(keep.begin(), keep.end(), 0) == keep.end()) return false;
   for (std::vector<double>* each : {&normals, &gradients, &offsets, &errors, &places}) only(keep, *each);
   only(keep, counts);
+  return true;
 }
 
 Grade grade(const Store& s, const Code& code, const View& v, const double* T, const GradeRule& rule, Team& team,
@@ -123,14 +125,14 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   double gradient[6] = {}, step[6] = {};
   for (int64_t p = 0; p < sums.size(); ++p)
     for (int i = 0; i < 6; ++i) gradient[i] += sums.gradients[(size_t)(6 * p + i)];
-  const Six inverse = pseudo_inverse(total(sums.normals.data(), sums.size()));
+  out.total = total(sums.normals.data(), sums.size());
+  Inverted all = inverted(out.total);
   for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) step[i] += inverse.v[i][j] * gradient[j];
+    for (int j = 0; j < 6; ++j) step[i] += all.inverse.v[i][j] * gradient[j];
   for (int i = 0; i < 6; ++i) out.statistic += step[i] * gradient[i];
   out.statistic /= out.noise * out.noise;
-  if (out.overlap) sums.drop();
+  if (out.overlap && sums.drop(all)) all = inverted(out.total = total(sums.normals.data(), sums.size()));
   for (const int64_t count : sums.counts) out.used += count;
-  out.total = total(sums.normals.data(), sums.size());
   if (!out.overlap) return out;
   const bool close = (double)e.inliers >= rule.least_close * (double)e.points;
   out.well_off = close ? count_beyond(s, code, v, T, patches.facing, rule.beyond, rule.part, e.off) : (int64_t)e.off.size();
@@ -140,7 +142,7 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
     return out;
   }
   out.measured = true;
-  measure(sums, rule, out);
+  measure(sums, all, rule, out);
   out.bounded = is_bounded(out.covariance.P, rule.extent);
   const bool large = length(step) > rule.turn || length(step + 3) > rule.move;
   out.beyond = large && form(pseudo_inverse(out.covariance.P), step) > BEYOND;

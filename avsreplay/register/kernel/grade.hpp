@@ -27,7 +27,9 @@ struct PatchArrays {
 
   PatchArrays() = default;
   explicit PatchArrays(const std::vector<PatchSums>& patches);
-  void drop();  // leaves out the patches that give too much of the information on some motion
+  // Leaves out the patches that give too much of the information on some motion. `all`: of the sum of the normals.
+  // Returns whether there were any.
+  bool drop(const Inverted& all);
   int64_t size() const { return (int64_t)counts.size(); }
 };
 

@@ -44,11 +44,10 @@ template <int N>
 struct Square {
   double v[N][N] = {};
 };
-// Pseudo-inverse of the symmetric positive semidefinite matrix in the first n rows and columns.
+// Pseudo-inverse of the positive semidefinite matrix of these eigenvalues (the diagonal of A) and eigenvectors.
 template <int N>
-Square<N> pseudo_inverse(Square<N> A, int n = N) {
-  Square<N> V, out;
-  eigen(A.v, V.v, n, 1e-32);
+Square<N> pseudo_inverse(const Square<N>& A, const Square<N>& V, int n = N) {
+  Square<N> out;
   double most = 0;
   for (int k = 0; k < n; ++k) most = std::max(most, A.v[k][k]);
   for (int k = 0; k < n; ++k) {
@@ -57,6 +56,14 @@ Square<N> pseudo_inverse(Square<N> A, int n = N) {
       for (int j = 0; j < n; ++j) out.v[i][j] += V.v[i][k] * V.v[j][k] / A.v[k][k];
   }
   return out;
+}
+
+// Pseudo-inverse of the symmetric positive semidefinite matrix in the first n rows and columns.
+template <int N>
+Square<N> pseudo_inverse(Square<N> A, int n = N) {
+  Square<N> V;
+  eigen(A.v, V.v, n, 1e-32);
+  return pseudo_inverse(A, V, n);
 }
 
 }  // namespace avs

@@ -30,7 +30,7 @@ struct Equations {
 
 // The observable combinations of the amplitudes, from the sum of N over all patches.
 void observable(const PatchTable& t, const Joined& all, Equations& out) {
-  const Six& inverse = t.inverse;
+  const Six& inverse = t.total.inverse;
   double points = 0, free[AMPLITUDES][AMPLITUDES];
   for (int64_t p = 0; p < t.m; ++p) points += (double)t.counts[p];
   for (int r = 0; r < AMPLITUDES; ++r)
@@ -65,9 +65,8 @@ Equations joined(const PatchTable& t, Joined& all) {
   out.N.resize((size_t)t.m), out.g.resize((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
     double T[3][6];
-    Coupling A;
     strains(t, p, T);
-    couple(t, p, T, A);
+    const Coupling& A = t.coupling[(size_t)p];
     Joined& N = out.N[p];
     Row& g = out.g[p];
     for (int i = 0; i < 6; ++i) {
@@ -285,8 +284,14 @@ void couple(const PatchTable& t, int64_t p, const double (&T)[3][6], Coupling& A
   }
 }
 
-void complete(PatchTable& t) {
-  t.inverse = pseudo_inverse(total(t.normals, t.m));
+void complete(PatchTable& t, const Inverted& all) {
+  t.total = all;
+  t.coupling.resize((size_t)t.m);
+  for (int64_t p = 0; p < t.m; ++p) {
+    double T[3][6];
+    strains(t, p, T);
+    couple(t, p, T, t.coupling[(size_t)p]);
+  }
   std::vector<std::array<double, 3>> cube((size_t)t.m);
   std::vector<int64_t> order((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
