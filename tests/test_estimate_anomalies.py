@@ -552,3 +552,16 @@ def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
     for name in ("pos_1s_m", "vel_1s_mps", "rot_1s_rad"):
         before, after, mixed = (getattr(f, name) ** 2 for f in (plain, changed, found))
         assert mixed == pytest.approx((1.0 - share) * before + share * after, rel=1e-9)
+
+
+def test_a_manoeuvre_is_preferred_to_a_random_disturbance_of_equal_likelihood_only_after_quiet_poses() -> None:
+    """A torque that has acted before explains a change of the rate as well as a manoeuvre does."""
+    kind = hypotheses.Hypothesis
+    free, step, random = (
+        hypotheses.Explanation(hypothesis, evidence, 60.0, 78, 13)
+        for hypothesis, evidence in ((kind.FREE_MOTION, 0.0), (kind.MANOEUVRE, 7.5), (kind.DISTURBED, 8.5))
+    )
+    found = [random, step, free]
+    assert hypotheses._ranked(found, True)[0] is step
+    assert hypotheses._ranked(found, False)[0] is random
+    assert hypotheses._ranked([step, random, free], False)[0] is step

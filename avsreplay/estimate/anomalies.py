@@ -40,16 +40,7 @@ from avsreplay.estimate.scan_window import (
     possible_change,
     scans_after,
 )
-from avsreplay.estimate.track import (
-    Epoch,
-    SensorBias,
-    Track,
-    confirmed,
-    nis_scale,
-    ready,
-    with_history,
-    with_nis,
-)
+from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_scale, ready, with_history, with_nis
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
@@ -103,7 +94,8 @@ class AnomalyTest:
         if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
-        window, ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
+        allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
+        window, ranked = explain(window, first, self._priors, *allowed)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)

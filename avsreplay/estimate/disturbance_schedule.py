@@ -43,6 +43,7 @@ _EARLY = 2.0  # age of the poses over that at the report of a drift, until which
 _LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
+_NOT_BY_CHANCE = {3: 21.1, 6: 27.9}  # 99.99 % point of chi-square with so many degrees of freedom
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
@@ -154,6 +155,8 @@ class DisturbanceSchedule:
             first = replace(track.levels, torque=0.0, force=0.0)  # the acceleration may have caused these disturbances
             before = first if begun is None else track.levels
             levels = yield from levels_of(best.fitted, before, widths, claimed, self.params.disturbances, seen)
+            if begun is None and levels.established:  # random disturbances are needed beside it: these may be all
+                return None
             motions = []
             for h in found.hypotheses:
                 motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)
@@ -171,6 +174,9 @@ class DisturbanceSchedule:
             return track
         if not driven.motions:
             return track if known is None else track.changed(levels=replace(driven.levels, count=track.levels.count))
+        fitted = driven_moments([(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions])
+        if known is None and not _significant(fitted):
+            return track
         track = track if known is not None else _all_poses(track, epoch_ns)
         best, count = driven.found.hypotheses[0], pose_count(track.fixes)
         later = tuple(f for f in track.fixes if f.t_ns > until_ns)
@@ -188,12 +194,18 @@ class DisturbanceSchedule:
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
             onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
         detected_ns = now_ns if known is None else known.detected_ns
-        fitted = driven_moments([(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions])
         drift = Drift(onset_ns, spread, fitted.u[3:], fitted.u[:3], fitted.P_u, detected_ns)
         result = BatchResult(epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian)
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
+
+
+def _significant(fitted: DrivenBelief) -> bool:
+    """Return whether the acceleration is none by chance only, with the random disturbances that are found beside it."""
+    open_ = np.flatnonzero(fitted.u)
+    u, P = fitted.u[open_], fitted.P_u[np.ix_(open_, open_)]
+    return bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > _NOT_BY_CHANCE[len(open_)]
 
 
 def _all_poses(track: Track, since_ns: int = 0) -> Track:

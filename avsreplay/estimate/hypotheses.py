@@ -59,6 +59,7 @@ def explain(
     torque: float,
     force: float,
     orbit: RelativeOrbit | None = None,
+    quiet: bool = True,
 ) -> tuple[tuple[Epoch, ...], list[Explanation]]:
     """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely first.
 
@@ -73,6 +74,7 @@ def explain(
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
         orbit: the relative orbit of the target; None for free motion.
+        quiet: the poses before these scans show no random disturbance.
     """
     start = epochs[0].track.belief
     window = window_of(epochs, start, torque, force, None if orbit is None else orbit.at(start.t_ns))
@@ -80,7 +82,7 @@ def explain(
     accepted = white[: 6 * first_doubtful]
     if first_doubtful > 1 and not linear(float(accepted @ accepted), epochs[:first_doubtful]):
         left_out = first_doubtful // 2
-        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit)
+        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit, quiet)
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     n, edges = len(epochs), np.append(0.0, window.times_s)
     between = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
@@ -93,15 +95,16 @@ def explain(
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
     ]
-    return tuple(epochs), _ranked(sorted(found, key=lambda e: -e.log_evidence))
+    return tuple(epochs), _ranked(sorted(found, key=lambda e: -e.log_evidence), quiet)
 
 
-def _ranked(found: list[Explanation]) -> list[Explanation]:
+def _ranked(found: list[Explanation], quiet: bool) -> list[Explanation]:
     """The explanations, most likely first, a manoeuvre before random disturbances that are hardly more likely.
 
-    Disturbances as strong as the change would also have acted on the poses before the window, which were quiet.
+    Disturbances as strong as the change would also have acted on the poses before the window, where these were
+    ``quiet``.
     """
-    if found[0].hypothesis is not Hypothesis.DISTURBED:
+    if not quiet or found[0].hypothesis is not Hypothesis.DISTURBED:
         return found
     least = found[0].log_evidence - OVER_NEXT
     close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and e.explains]

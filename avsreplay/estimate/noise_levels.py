@@ -50,6 +50,7 @@ _SMALL = 0.3  # part of its standard deviation below which a disturbance may bec
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
 _WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
 _MOST_STEPS = 6
+_ESTABLISHED = 3.0  # log evidence of a random disturbance that the poses show
 _LARGEST = 4.0  # largest squared residual with disturbances over the mean one
 BLOCKS = 2  # attitude, position
 
@@ -64,6 +65,7 @@ class NoiseLevels:
         torque, force: root densities of the disturbances [rad/s^1.5, m/s^1.5].
         slack: by which disturbances enlarge the squared residuals of a fit without them, at least 1.
         count: poses of the estimate, 0 for the prior.
+        established: the poses show a random disturbance.
     """
 
     white: tuple[float, float] = (1.0, 1.0)
@@ -72,6 +74,7 @@ class NoiseLevels:
     force: float = 0.0
     slack: float = 1.0
     count: int = 0
+    established: bool = False
 
     def factors(self, share: float) -> Array:
         """(2,) factors on the claimed standard deviations of poses with this claimed share of common errors."""
@@ -142,7 +145,13 @@ def estimate_levels(
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
     return replace(
-        levels, white=white, common=common, torque=math.sqrt(theta[4]), force=math.sqrt(theta[5]), slack=slack
+        levels,
+        white=white,
+        common=common,
+        torque=math.sqrt(theta[4]),
+        force=math.sqrt(theta[5]),
+        slack=slack,
+        established=any(each.evidence > _ESTABLISHED for each, _ in found.values()),
     )
 
 
