@@ -79,7 +79,7 @@ def test_an_output_never_replaces_what_the_command_reads(words: tuple[str, ...],
     assert [path.read_bytes() for path in files] == before
 
 
-OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "animate"}
+OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "poses", "animate"}
 NEEDED = {  # arguments without which a command is refused earlier
     "export": ("--to", "csv"),
     "compare": ("--gate", "FILE"),

@@ -266,6 +266,29 @@ def test_the_command_writes_a_model_that_run_accepts(cli, fixtures_folder, tmp_p
     assert "already exists" in again.err
 
 
+def test_the_command_writes_the_poses_of_its_frame(cli, fixtures_folder, tmp_path):
+    """Relative motions of the poses are those of the truth, whatever the frame {C} of the model is."""
+    log, file = fixtures_folder / "tumble.mcap", tmp_path / "p.tum"
+    done = cli("model", log, "-o", tmp_path / "m.ply", "--poses", file, "--json")
+    assert done.code == 0, done.err
+    table = np.loadtxt(file)
+    assert len(table) == json.loads(done.out)["scans_used"]
+    with open_source(log, SourceOptions()) as source:
+        truth = {scan.t_ns: source.truth_of(scan).pose for scan in source.scans()}
+    stamps = np.array(sorted(truth))
+    true = [truth[stamps[np.argmin(np.abs(stamps * 1e-9 - t))]] for t in table[:, 0]]
+    found = [Pose(row[4:], row[1:4]) for row in table]
+    for k in range(1, len(found)):
+        off = (true[0].inverse() @ true[k]).inverse() @ (X := true[0].inverse() @ found[0])
+        off = off @ (found[0].inverse() @ found[k]) @ X.inverse()
+        assert np.degrees(geometry.angle(off.q)) < 0.2
+        assert np.linalg.norm(off.t) < 0.015
+    again = cli("model", log, "-o", tmp_path / "n.ply", "--poses", file)
+    assert again.code == 2
+    assert "already exists" in again.err
+    assert not (tmp_path / "n.ply").exists()
+
+
 @pytest.mark.slow
 def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
     folder = shared_data / "stanford-dragon"

@@ -38,6 +38,7 @@ Examples:
 @click.option(
     "--mesh", type=PATH, help="Also write a triangle mesh (.ply); needs Open3D: pip install 'avsreplay[open3d]'."
 )
+@click.option("--poses", type=PATH, help="Also write the pose of {C} at each scan that was used (TUM).")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @source_options
@@ -47,6 +48,7 @@ def model_command(
     against: Path | None,
     grasp: tuple[float, ...] | None,
     mesh: Path | None,
+    poses: Path | None,
     overwrite: bool,
     as_json: bool,
     **reading: Any,
@@ -56,6 +58,9 @@ def model_command(
     The result is a point cloud with normals in a frame {C} that is fixed to the target: its origin is a grasp point
     on the surface and its x axis the outward normal there. Ground truth in LOG is not used. 'avsreplay run LOG
     --model auto' builds the model and replays the log against it in one step.
+
+    The poses of --poses are a fit to all scans together; if the target moves freely, they are those of the fitted
+    motion. Their errors are not independent of one another, as a filter assumes of measurements.
     \f
     Raises:
         MissingBackend: a mesh is requested and Open3D is not installed.
@@ -66,11 +71,12 @@ def model_command(
     from avsreplay.log import open_source, read_surface
     from avsreplay.log.header import surface_bytes
     from avsreplay.reconstruct import at_grasp, deviations, meshed, reconstruct, reconstruction_ply
+    from avsreplay.report.export import write_tum
 
     for each in (output, mesh):
         if each is not None:
             check_suffix(each, ".ply")
-    check_outputs("output", "mesh", overwrite=overwrite)
+    check_outputs("output", "mesh", "poses", overwrite=overwrite)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
         raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
@@ -87,6 +93,9 @@ def model_command(
         said["mesh_faces"] = len(surface.faces)
         with output_path(mesh, overwrite=overwrite) as path:
             path.write_bytes(surface_bytes(surface))
+    if poses is not None:
+        with output_path(poses, overwrite=overwrite) as path:
+            write_tum(path, made.poses)
     click.echo(json.dumps(said, indent=2) if as_json else _text(said))
 
 

@@ -39,7 +39,7 @@ from avsreplay.simulate import scenario
 
 LIMIT_S, LIMIT_MIB = 20, 512
 ROOT = Path(__file__).resolve().parents[2]
-OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "animate"}
+OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "poses", "animate"}
 NUMBERS = (b"0", b"-1", b"1e999", b"-1e308", b"1e20", b"1e-320", b"9" * 400, b"9223372036854775807", b"nan", b"inf",
            b"-0.0", b"1e15", b"0.5", b"2", b"1e6")  # fmt: skip
 WORDS = (b"true", b"null", b'"x"', b'"\\ud800"', b'"\\u001b[31m"', b"[]", b"{}", b"", b"1970-01-01", b"[[1]]")

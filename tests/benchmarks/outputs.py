@@ -47,6 +47,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("compare", "junit"): ("result", "result", "--gate", "rules.toml", "--junit", "OUT"),
     ("model", "output"): ("log.mcap", "-o", "OUT", "--overwrite"),
     ("model", "mesh"): ("log.mcap", "-o", "other.ply", "--mesh", "OUT", "--overwrite"),
+    ("model", "poses"): ("log.mcap", "-o", "other.ply", "--poses", "OUT", "--overwrite"),
     ("odometry", "output"): ("log.mcap", "-o", "OUT", "--overwrite", "--n-scans", "3"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
 }
