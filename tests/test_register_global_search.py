@@ -16,7 +16,7 @@ from avsreplay.geometry import Array, Pose, exp, matrix
 from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register import RegisterParams, Registrar, global_search
 from avsreplay.register.backend import healthy_work
 from avsreplay.register.budget import HEALTHY_SCANS
 from avsreplay.register.contract import boxes, example_pose, view
@@ -181,6 +181,20 @@ def test_the_symmetries_of_a_body_are_exact_so_that_a_turned_part_of_it_still_fi
     assert motions
     for T in motions:
         assert registrar.distance(points, Pose.from_matrix(T), 1.0).max() < 1e-4 * registrar.index.extent_m
+
+
+def test_attitudes_near_the_identity_that_return_to_it_are_no_symmetries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box turned by 12 deg still covers most of itself, and is registered back to where it was."""
+    search = Registrar(_box((2.0, 1.6, 1.8)))._symmetry.search
+    half_turn = Pose.from_matrix(search.symmetries[0])
+    near = [Pose(exp(np.radians(12.0) * np.eye(3)[k]), np.zeros(3)) for k in range(3)]
+    monkeypatch.setattr(search, "_selected", lambda *_: [*near, half_turn, half_turn @ near[0]])
+    monkeypatch.setattr(global_search, "SYMMETRIC", 1.0)
+    points, _ = sample(_box((2.0, 1.6, 1.8)), 300)
+    found = [Pose.from_matrix(T) for T in search._near_symmetries(points)]
+    assert any(search.same(each, half_turn) for each in found)
+    poses = [Pose.identity(), *found]
+    assert not any(search.same(one, other) for k, one in enumerate(poses) for other in poses[:k])
 
 
 def test_attitudes_cover_all_rotations() -> None:

@@ -251,16 +251,19 @@ class GlobalSearch:
         return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
     def _near_symmetries(self, points: Array) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, registered to it; not the identity."""
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, registered to it.
+
+        They differ from one another and from the identity, to which some attitudes near it return.
+        """
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
         rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
         poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)
         apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
-        best = poses[apart & (costs < SYMMETRIC)][:SYMMETRIES]
-        ended = [self._ended(self._refine, points, Pose.from_matrix(T), COARSE_OF_EXTENT * self._extent) for T in best]
-        return np.array([T_ca.matrix for T_ca in ended]).reshape(-1, 4, 4)
+        best, width = poses[apart & (costs < SYMMETRIC)], COARSE_OF_EXTENT * self._extent
+        ended = [self._ended(self._refine, points, Pose.from_matrix(T), width).matrix for T in best]
+        return self._different(np.stack([np.eye(4), *ended]), 1 + SYMMETRIES, 1.0)[1:]
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
         distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)

@@ -35,7 +35,7 @@ from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
 
-VERSION = 3  # version of the kept data of a model
+VERSION = 4  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; to recognise the axis
