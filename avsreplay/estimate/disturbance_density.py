@@ -20,9 +20,7 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 
 DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
-_TOGETHER = (
-    0.9  # prior probability that torque and force are both random where one is, and that none is where one is not
-)
+_TOGETHER = 0.9  # prior probability that torque and force are both random where one is, and neither where one is not
 _SQUARES = np.append(0.0, DENSITIES**2)
 
 
