@@ -251,10 +251,7 @@ class GlobalSearch:
         return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
     def _near_symmetries(self, points: Array) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, registered to it.
-
-        They differ from one another and from the identity, to which some attitudes near it return.
-        """
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different ones, not the identity."""
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
