@@ -23,7 +23,7 @@ from avsreplay.register.neighbourhood import NOT_COMPARED, PART_ONLY, POSTPONED,
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.rivals import FAR_RAD, LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
-from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, finite, without_scattered_points
+from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, usable_points, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -90,7 +90,7 @@ class Registrar:
         Returns:
             The pose T_ac with its quality. A failure is its status, never an exception; T_ac is then the guess.
         """
-        scan = finite(points, self.params.subsample_m)
+        scan = usable_points(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points), guess):
             return refused
         halves = seq % self.params.split_every == 0
@@ -119,7 +119,7 @@ class Registrar:
             AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` names the rotation to it. A
             motion of a DEGENERATE view along its unobservable directions is not a different pose.
         """
-        scan = finite(points, self.params.subsample_m)
+        scan = usable_points(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points)):
             return refused
         if effort <= 1:

@@ -89,7 +89,7 @@ def thin(points: Array, voxel_m: float) -> Array:
     return points[np.sort(first)]
 
 
-def finite(points: NDArray[Any], voxel_m: float) -> NDArray[Any]:
+def usable_points(points: NDArray[Any], voxel_m: float) -> NDArray[Any]:
     """Return the points (n, 3) that are finite, thinned by voxels of this size where it is above 0."""
     known = np.isfinite(points)
     scan = points if known.all() else points[known.all(axis=1)]
