@@ -37,7 +37,14 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
 
 
 def numbers_with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the numbers of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared."""
+    """Return the numbers of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared.
+
+    ``with_area`` leaves out what has no normal at all; an index also leaves out faces whose normal is rounding.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     longest2 = np.max([np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)], axis=0, initial=0.0)
     area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)

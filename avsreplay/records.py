@@ -234,7 +234,7 @@ class Alignment:
     """A pose with its quality, measured in the same way for every back end (register.quality).
 
     Attributes:
-        T_ac: measured pose of {C} in {A} (ICP iterates its inverse).  well_off: as of ``quality.PoseQuality``.
+        T_ac: measured; ICP iterates its inverse.  well_off: of 1,000 points, those over two gates from the model.
         info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
         covariance: (6, 6) of d, systematic errors included; None if degenerate.  dof: of this estimate, inf if known.
         message: why it failed or is not accepted.  free_directions: not determined, in words; free: columns d (6, k).

@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from command_server import CommandServer
 
+from avsreplay.records import Surface
+from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.rows import Row
 
 hypothesis.settings.register_profile("without deadline", deadline=None)  # no test asserts a time
@@ -46,6 +48,19 @@ def avsreplay(*args, cwd=None, env=None, timeout=300):
         )
         done = ended.returncode, ended.stdout, ended.stderr
     return Done(*done)
+
+
+@pytest.fixture(scope="session")
+def surface() -> Surface:
+    """The closed mesh without symmetry of the contract tests."""
+    return boxes()
+
+
+@pytest.fixture(scope="session")
+def scan(surface: Surface) -> np.ndarray:
+    """Its points (n, 3) in {A} that the camera sees at ``example_pose``."""
+    T_ac = example_pose()
+    return T_ac.apply(view(surface, 6000, T_ac.inverse().t))
 
 
 @pytest.fixture(scope="session")

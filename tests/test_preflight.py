@@ -24,7 +24,7 @@ from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus
-from avsreplay.register.contract import boxes, view
+from avsreplay.register.contract import view
 from avsreplay.register.sampling import diameter
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
@@ -50,11 +50,6 @@ class Log:
 
     def scan_at(self, seq):
         return Scan(seq, seq * 100_000_000, np.asarray(self.clouds[seq], np.float64), ScanStatus.OK)
-
-
-@pytest.fixture(scope="module")
-def surface():
-    return boxes()
 
 
 def _seen(surface, n=6, wall=False, seed=1):

@@ -14,7 +14,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
-from avsreplay.register.contract import boxes, example_pose, plate_scan, view
+from avsreplay.register.contract import example_pose, plate_scan, view
 from avsreplay.register.covariance import systematic_errors, without_dominant_patches
 from avsreplay.register.degenerate import Directions
 from avsreplay.register.params import Camera
@@ -33,19 +33,8 @@ def _rng() -> np.random.Generator:
 
 
 @pytest.fixture(scope="module")
-def surface() -> Surface:
-    return boxes()
-
-
-@pytest.fixture(scope="module")
 def registrar(surface: Surface) -> Registrar:
     return Registrar(surface)
-
-
-@pytest.fixture(scope="module")
-def scan(surface: Surface) -> np.ndarray:
-    T_ac = example_pose()
-    return T_ac.apply(view(surface, 6000, T_ac.inverse().t))
 
 
 # --- Horn's closed form

@@ -12,18 +12,13 @@ from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar, allowed_scans
 from avsreplay.register.backend import healthy_work
 from avsreplay.register.budget import HEALTHY_SCANS, Budget
-from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 from avsreplay.register.visibility import Visibility
 
 SEED = 7
-
-
-@pytest.fixture(scope="module")
-def surface() -> Surface:
-    return boxes()
 
 
 @pytest.fixture(scope="module")

@@ -25,17 +25,6 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(RNG_SEED)
 
 
-@pytest.fixture(scope="module")
-def surface() -> Surface:
-    return boxes()
-
-
-@pytest.fixture(scope="module")
-def scan(surface: Surface) -> np.ndarray:
-    T_ac = example_pose()
-    return T_ac.apply(view(surface, 6000, T_ac.inverse().t))
-
-
 def _box_and_panel() -> Surface:
     """A box with a panel whose thickness is that of the noise of a scan."""
     parts = [box([-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]), box([1.0, -0.5, 0.1], [4.0, 0.5, 0.12])]

@@ -37,7 +37,7 @@ from avsreplay.estimate.measurement import (
     measured_pose,
     measurement_jacobian,
 )
-from avsreplay.estimate.mixture import carried, contradicted, moments, not_worse, worn
+from avsreplay.estimate.mixture import carried, contradicted, moments, not_worse, without_pose, worn
 from avsreplay.estimate.noise import NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
@@ -57,7 +57,6 @@ _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) 
 _LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _GAP = 2  # intervals between poses after which a mixture is propagated by its components
-_NO_POSE = np.zeros((6, 6))  # root of the information of a scan without a pose
 _instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
 
 
@@ -285,8 +284,7 @@ class BatchSchedule:
         mixed = track.mode == "fit" and last is not None and len(last.components) > 1 and len(times) == 2
         if last is None or not mixed or t_ns - times[1] <= _GAP * (times[1] - times[0]):
             return belief, Phi
-        noise = self.noise_levels(track)
-        mixture = carried(last.components, t_ns, belief.x.T_ac, _NO_POSE, NO_INFLATION, 1.0, noise, self.orbit)
+        mixture = without_pose(last.components, t_ns, belief.x.T_ac, self.noise_levels(track), self.orbit)
         return moments(mixture), Phi
 
     def chart_at(self, belief: Belief, t_ns: int) -> Chart:

@@ -238,12 +238,13 @@ class Estimator:
         """
         if track.mode not in ("fit", "filter"):
             return None
-        belief, x = track.belief, prediction.belief.x
-        left, R, scaled = residual(belief.x, x, innovation.alpha), innovation.R, prediction.window
         if prediction.lag_s or prediction.blur is not None:  # the pose belongs to the mean instant of its points
             fix, scaled = self.batch.fix(prediction, innovation), NoiseWindow.empty()
-            belief, _ = propagated(belief, fix.t_ns, 0.0, 0.0, self.batch.orbit)
+            belief, _ = propagated(track.belief, fix.t_ns, 0.0, 0.0, self.batch.orbit)
             left, R = innovation_vector(belief.x, fix.T_ac), in_camera(fix.C, fix.T_ac.q, belief.x.q_bc)
+        else:
+            belief, R, scaled = track.belief, innovation.R, prediction.window
+            left = residual(belief.x, prediction.belief.x, innovation.alpha)
         R = self.noise.rescaled(R, scaled, track.window)
         covariance, inflation = self.pose_covariance(belief), track.inflation
         gate = gate_of(innovation.dof, R, R + covariance)

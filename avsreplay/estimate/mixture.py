@@ -23,11 +23,12 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import MOST_RAD, forecast_of, torque_density, translation
 from avsreplay.estimate.error_state import DIM, definite, rotation
-from avsreplay.estimate.noise import BOUND, cholesky_root
+from avsreplay.estimate.noise import BOUND, NO_INFLATION, cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
+_NO_POSE = np.zeros((6, 6))  # root of the information of a scan without a pose
 _SMALL_EXCESS = 1.1  # largest ratio of the corrected covariance to that of the last pose
 _POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])  # half angle in {C} and position in {A} of the chart's steps
 _ORIGIN = (0.0, 0.0, 0.0)
@@ -155,6 +156,13 @@ def carried(
     )
 
 
+def without_pose(
+    components: tuple[Component, ...], t_ns: int, near: Pose, noise: tuple[float, float], orbit: RelativeOrbit | None
+) -> tuple[Component, ...]:
+    """The mixture at another instant, as ``carried`` with a pose ``near`` its own that has no information."""
+    return carried(components, t_ns, near, _NO_POSE, NO_INFLATION, 1.0, noise, orbit)
+
+
 def not_worse(
     components: tuple[Component, ...],
     t_ns: int,
@@ -182,7 +190,7 @@ def not_worse(
     """
     whiten = _motion.roots(C[None])[0][0]
     if components[0].t_ns != t_ns:
-        components = carried(components, t_ns, pose, np.zeros((6, 6)), np.ones(2), 1.0, noise, orbit)
+        components = without_pose(components, t_ns, pose, noise, orbit)
     values, axes = _excess(components, whiten)
     if values[-1] <= 1.0:
         return components

@@ -55,7 +55,7 @@ class PoseQuality:
         bounded: the standard deviations are below the extent and 1 rad.
         beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
         covariance, dof: (6, 6) and its degrees of freedom.  split_nis: the test of halves, NaN where it was not made.
-        size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates off.
+        size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates away.
         patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
     """
 
