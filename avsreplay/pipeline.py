@@ -20,6 +20,7 @@ from avsreplay.config import Guess
 from avsreplay.errors import value_class
 from avsreplay.estimate import Estimator, Prediction, Track, with_change
 from avsreplay.estimate.chart import body_parameters
+from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.track import deskew, in_doubt, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import FaultDetector, Gramian
@@ -49,12 +50,13 @@ class Measurement:
 
 @value_class
 class MonitorState:
-    """What the monitors carry from scan to scan."""
+    """What the monitors carry from scan to scan; ``motion``: trajectory of the last fit, which the Gramian follows."""
 
     gramian: Gramian
     consistency: ConsistencyTrack
     convergence: ConvergenceTrack
     violations: int = 0
+    motion: FittedMotion | None = None
 
 
 @value_class
@@ -94,11 +96,9 @@ class Monitors:
             belief: what is published of it.
         """
         healthy = innovation if gamma else None
-        gramian = self._gramian(state.gramian, estimator, prior, healthy, track)
-        rank = monitor.measure(gramian)
-        consistency = self.consistency.observe(state.consistency, innovation, gamma)
-        window = self.consistency.judge(consistency)
-        found = healthy and estimator.residual_after(track, prior, healthy)
+        motion, gramian = self._gramian(state, estimator, prior, healthy, track)
+        rank, consistency = monitor.measure(gramian), self.consistency.observe(state.consistency, innovation, gamma)
+        window, found = self.consistency.judge(consistency), healthy and estimator.residual_after(track, prior, healthy)
         failed = violations(track.belief, *found) if found else ()
         consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
         forecast = estimator.track_forecast(track, self.convergence.times_s)
@@ -118,15 +118,16 @@ class Monitors:
             unconverged=judged.unknown,
             forecast=forecast,
         )
-        return MonitorState(gramian, consistency, judged, state.violations + len(failed)), report
+        return MonitorState(gramian, consistency, judged, state.violations + len(failed), motion), report
 
     def _gramian(
-        self, gramian: Gramian, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
-    ) -> Gramian:
+        self, state: MonitorState, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
+    ) -> tuple[FittedMotion | None, Gramian]:
         """The Gramian with one more scan, along the trajectory of the new fit where there is one."""
-        if (refitted := estimator.refitted_rows(track)) is not None:
-            return monitor.from_trajectory(gramian.scale, *refitted)
-        return monitor.observe(gramian, *estimator.gramian_row(track, prior, healthy))
+        if (seen := estimator.refitted_rows(track)) is not None:
+            return seen[0], monitor.from_trajectory(state.gramian.scale, *seen[1])
+        motion, row = estimator.gramian_row(track, prior, healthy, state.motion)
+        return motion, monitor.observe(state.gramian, *row)
 
 
 @value_class
@@ -326,7 +327,6 @@ Forecaster = Callable[[Array], Forecast]
 
 def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster) -> Scene:
     """Return the predicted target after a belief, as the planner uses it: estimate and forecast, never the truth."""
-    centre_c = -geometry.matrix(belief.x.q_bc).T @ belief.x.c_b
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
         predicted = forecast(times_s)
@@ -336,7 +336,7 @@ def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, f
         goal=estimator.motion(belief),
         attitude=estimator.attitude(belief),
         axis_c=target.axis_c,
-        centre_c=centre_c,
+        centre_c=-geometry.matrix(belief.x.q_bc).T @ belief.x.c_b,
         surface=target.surface,
         sigma=sigma,
         hull_c=target.hull_c,

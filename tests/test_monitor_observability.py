@@ -12,8 +12,13 @@ import tumbling
 from click.testing import CliRunner
 
 from avsreplay.cli.observability import observability_command
+from avsreplay.estimate.chart import to_chart, to_state
+from avsreplay.estimate.initialise import BatchResult
+from avsreplay.estimate.reference import FittedMotion
+from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.log import SourceOptions
 from avsreplay.monitor import from_trajectory, gramian, measure, observe, weakest
+from avsreplay.records import Belief
 from avsreplay.rows import Row
 from avsreplay.run import Job, Run
 
@@ -123,6 +128,23 @@ def test_a_trajectory_in_one_call_equals_the_recursion() -> None:
 
 
 POSES = ("register.backend=poses",)
+
+
+@pytest.mark.parametrize("orbit", [None, RelativeOrbit(0.02, np.eye(3), 5)], ids=["free", "orbit"])
+def test_a_fitted_motion_followed_from_scan_to_scan_is_the_one_from_its_epoch(orbit) -> None:
+    """State and transition over 60 s in 100 steps, within rounding of those in one step."""
+    chart = to_chart(tumbling.draw(5, seconds=1.0, hz=2.0, rate=0.4, sigma_max=0.85).states[0])
+    fitted = BatchResult(0, chart, 1, np.ones(2), np.ones(2), Belief(0, to_state(chart), np.eye(20)), False)
+    there, direct = FittedMotion.of(fitted).at(60 * 10**9, orbit)
+    motion, Phi = FittedMotion.of(fitted), np.eye(20)
+    for k in range(1, 101):
+        motion, step = motion.at(k * 6 * 10**8, orbit)
+        Phi = step @ Phi
+    assert motion.is_of(fitted)
+    assert not motion.is_of(replace(fitted, chart=chart.moved(np.full(20, 1e-12))))
+    assert motion.t_ns == there.t_ns
+    assert np.abs(motion.x.flat - there.x.flat).max() < 1e-11
+    assert np.abs(Phi - direct).max() < 1e-11 * np.abs(direct).max()
 
 
 def _pose_log(path: Path, rate: float, seconds: float) -> Path:

@@ -17,7 +17,7 @@ from avsreplay.estimate import dynamics
 from avsreplay.estimate.acceleration import accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
-from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
+from avsreplay.estimate.chart import ANY_HALF_RAD
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast, propagated
 from avsreplay.estimate.error_state import RHO, semidefinite
@@ -35,7 +35,7 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.mixture import mixture_forecast
 from avsreplay.estimate.noise import NO_INFLATION, Noise, NoiseWindow
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.reference import rows_along
+from avsreplay.estimate.reference import FittedMotion, rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import (
     Epoch,
@@ -138,9 +138,8 @@ class Estimator:
             alignment: a measured pose.
         """
         x, alignment = prediction.belief.x, self.frame.alignment_into(alignment, prediction.belief.t_ns)
-        R = self.noise.of(alignment, x, prediction.window)
+        R, dof = self.noise.of(alignment, x, prediction.window), self.noise.dof(alignment)
         alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
-        dof = self.noise.dof(alignment)
         found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
         return replace(found, rms_m=alignment.rms_m, free=alignment.free)
 
@@ -188,43 +187,45 @@ class Estimator:
             turn, position = np.hypot(turn, turns), np.hypot(position, moves)
         return Forecast(found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD))
 
-    def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
+    def refitted_rows(self, track: Track) -> tuple[FittedMotion, tuple[Array, Array, Array]] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
 
         Args:
             track: after a scan.
 
         Returns:
-            H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20) from there to the scan.
+            The motion at the scan; H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20).
         """
         start, trimmed = track.batch, track.mode == "filter" and len(track.fixes) >= self.params.audit_poses
         if start is None or track.since or trimmed or start.count != pose_count(track.fixes):
             return None
-        return rows_along(start.chart, start.epoch_ns, track.fixes, track.belief.t_ns)
+        motion, Phi = (first := FittedMotion.of(start)).at(track.belief.t_ns, self.batch.orbit)
+        return motion, (*rows_along(first, track.fixes), Phi)
 
     def gramian_row(
-        self, track: Track, prediction: Prediction, innovation: Innovation | None
-    ) -> tuple[Array, Array, Array | None, bool]:
+        self, track: Track, prediction: Prediction, innovation: Innovation | None, last: FittedMotion | None
+    ) -> tuple[FittedMotion | None, tuple[Array, Array, Array | None, bool]]:
         """Phi (20, 20) and H (6, 20) of a scan, and R (6, 6) as the registration claims it.
 
-        Between two fits along the trajectory of the last one: the published mean, that of a mixture where the
-        likelihood is not Gaussian, follows no trajectory of the body.
+        Between two fits along the trajectory of the last one: the mean of a mixture follows no motion of the body.
 
         Args:
             track: after the scan.
             prediction: of the scan.
             innovation: of the scan; None where it was not used.
+            last: trajectory of the last fit at the last scan; None before a fit.
 
         Returns:
-            Phi, H, R or None, and whether Phi begins at the first pose and not at the last scan.
+            That at this scan; Phi, H, R or None, and whether Phi begins at the first pose and not at the last scan.
         """
-        start, used, t_ns = track.batch, innovation is not None, prediction.belief.t_ns
+        start = track.batch
         if track.mode != "fit" or start is None or start.points is None:
             R = None if innovation is None else self.noise.base(innovation.R, prediction.window)
-            return prediction.Phi, prediction.H, R, False
-        x, Phi = dynamics.propagate_state(to_state(start.chart), (t_ns - start.epoch_ns) * 1e-9, start.points.arc)
-        last = track.fixes[-1]
-        return Phi, measurement_jacobian(x), in_camera(last.C, last.T_ac.q, x.q_bc) if used else None, True
+            return None, (prediction.Phi, prediction.H, R, False)
+        known, pose = last if last is not None and last.is_of(start) else None, track.fixes[-1]
+        motion, Phi = (known or FittedMotion.of(start)).at(prediction.belief.t_ns, self.batch.orbit)
+        R = None if innovation is None else in_camera(pose.C, pose.T_ac.q, motion.x.q_bc)
+        return motion, (Phi, measurement_jacobian(motion.x), R, known is None)
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
@@ -245,9 +246,8 @@ class Estimator:
         else:
             belief, R, scaled = track.belief, innovation.R, prediction.window
             left = residual(belief.x, prediction.belief.x, innovation.alpha)
-        R = self.noise.rescaled(R, scaled, track.window)
-        covariance, inflation = self.pose_covariance(belief), track.inflation
-        gate = gate_of(innovation.dof, R, R + covariance)
+        R, covariance = self.noise.rescaled(R, scaled, track.window), self.pose_covariance(belief)
+        gate, inflation = gate_of(innovation.dof, R, R + covariance), track.inflation
         return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
 
     def _common_1s(self, track: Track) -> Array:

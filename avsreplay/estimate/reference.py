@@ -12,7 +12,7 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
 from avsreplay.estimate.chart import Chart, to_chart, to_state
 from avsreplay.estimate.dynamics import pose_rows, propagate_state, rotation_path, translated
-from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
+from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Track
@@ -81,20 +81,48 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
     return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns, arc))
 
 
-def rows_along(chart: Chart, epoch_ns: int, fixes: tuple[PoseFix, ...], t_ns: int) -> tuple[Array, Array, Array]:
+@value_class
+class FittedMotion:
+    """The motion of a fit at one instant.
+
+    Attributes:
+        epoch_ns: instant of its initial values [ns].  chart: these.
+        t_ns: the instant [ns].  x: the state there.
+    """
+
+    epoch_ns: int
+    chart: Chart
+    t_ns: int
+    x: State
+
+    @classmethod
+    def of(cls, fitted: BatchResult) -> FittedMotion:
+        """The motion of a fit at its epoch."""
+        return cls(fitted.epoch_ns, fitted.chart, fitted.epoch_ns, to_state(fitted.chart))
+
+    def is_of(self, fitted: BatchResult) -> bool:
+        """Whether the motion is that of a fit."""
+        return self.epoch_ns == fitted.epoch_ns and bool(np.array_equal(self.chart.flat, fitted.chart.flat))
+
+    def at(self, t_ns: int, orbit: RelativeOrbit | None) -> tuple[FittedMotion, Array]:
+        """The motion at another instant [ns], and the transition (20, 20) to there; ``orbit``: of the target."""
+        arc = None if orbit is None else orbit.at(self.t_ns)
+        x, Phi = propagate_state(self.x, (t_ns - self.t_ns) * 1e-9, arc)
+        return replace(self, t_ns=t_ns, x=x), Phi
+
+
+def rows_along(motion: FittedMotion, fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
     """H Phi of poses along one motion, for the observability Gramian.
 
     Args:
-        chart: values of the motion at its epoch.
-        epoch_ns: the epoch.
+        motion: at its epoch.
         fixes: the poses (n), later than the epoch.
-        t_ns: instant to which the transition leads.
 
     Returns:
-        H Phi (n, 6, 20), R (n, 6, 6) [m, half angle], and the transition (20, 20) from the epoch to ``t_ns``.
+        H Phi (n, 6, 20) and R (n, 6, 6) [m, half angle].
     """
-    x, poses = to_state(chart), poses_of(fixes, epoch_ns)
-    arc = None if fixes[0].orbit is None else fixes[0].orbit.at(epoch_ns)
+    x, poses = motion.x, poses_of(fixes, motion.epoch_ns)
+    arc = None if fixes[0].orbit is None else fixes[0].orbit.at(motion.epoch_ns)
     J = np.zeros((len(poses), 6, 6))  # from d = [theta; v] in {C}, as in ``measurement.to_camera``
     J[:, :3, 3:], J[:, 3:, :3] = geometry.matrix(poses.q), 0.5 * geometry.matrix(x.q_bc)
     R = J @ poses.C @ np.swapaxes(J, 1, 2)
@@ -102,7 +130,7 @@ def rows_along(chart: Chart, epoch_ns: int, fixes: tuple[PoseFix, ...], t_ns: in
     if poses.counts is not None:  # where the oldest poses are joined, one stands for several
         each = np.sqrt(poses.counts)[:, None, None]
         rows, R = each * rows, each**2 * R
-    return rows, R, propagate_state(x, (t_ns - epoch_ns) * 1e-9, arc)[1]
+    return rows, R
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
