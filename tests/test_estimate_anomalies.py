@@ -274,6 +274,39 @@ def test_the_residuals_of_the_registration_tell_which_poses_are_biased(
 
 
 @pytest.mark.slow
+def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoeuvre() -> None:
+    """The first three scans after the step resemble an offset of 13 mm. An offset that grows is a manoeuvre."""
+    case = surprises.Case("step", at_s=45.0, velocity=0.01, seconds=54.0)
+    result = surprises.run(case, 5016)
+    first = result.t.index(45.5)
+    assert "sensor_bias" in result.reason[first : first + 4]
+    assert set(result.reason[first + 4 :]) == {"ok"}
+    assert result.track is not None
+    (found,) = result.track.manoeuvres
+    assert abs(found.t_ns * 1e-9 - 45.2) < 1.0
+    assert found.velocity == pytest.approx(result.true_velocity, abs=4.0 * float(np.sqrt(found.P[3:, 3:].max())))
+    assert not any(c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True))
+
+
+@pytest.mark.slow
+def test_a_push_during_a_bias_ends_the_claim_of_convergence() -> None:
+    """The offset of 3 cm begins at once, so that no manoeuvre explains it; from the push on it grows."""
+    case = surprises.Case("bias", at_s=45.0, bias=0.03, seconds=64.0)
+    times, states, _, _ = surprises.world_of(case, 31005)
+    moved = [
+        x if t < 52.0 else replace(x, r_a=x.r_a + np.array([0.0, 0.01, 0.0]) * (t - 52.0))
+        for t, x in zip(times, states, strict=True)
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surprises, "world_of", lambda *_: (times, moved, np.zeros(3), np.zeros(3)))
+        result = surprises.run(case, 31005)
+    push = result.t.index(52.0)
+    assert any(result.converged[:push])
+    assert not any(result.converged[push + 5 :])
+    assert set(result.reason[push:]) == {"sensor_bias"}
+
+
+@pytest.mark.slow
 def test_a_single_wild_scan_changes_nothing() -> None:
     case = surprises.Case("outlier", at_s=50.0, until_s=50.4, bias=0.1, seconds=60.0)
     result, clean = surprises.run(case, 4), surprises.run(CLEAN, 4)

@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, MOST_FIXES, BatchSc
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import OVER_NEXT, explain, linear
+from avsreplay.estimate.hypotheses import OVER_FREE, OVER_NEXT, Ranked, explain, linear
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
@@ -40,16 +40,14 @@ from avsreplay.estimate.scan_window import (
     possible_change,
     scans_after,
 )
+from avsreplay.estimate.sensor_bias import begun, compared, continued, squared
 from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_scale, ready, with_history, with_nis
 from avsreplay.estimate.work import whole
-from avsreplay.geometry import Array
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
-_OVER_FREE = 3.0  # log odds over free motion of an early decision
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
-_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 _DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)
@@ -81,9 +79,9 @@ class AnomalyTest:
         if not self.enabled or verdict.reason not in _TESTED:
             return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
         if track.bias is not None:
-            bias = _continued(track.bias, epoch)
+            bias = continued(track.bias, epoch)
             if bias is not None:
-                return track.changed(belief=epoch.prediction.belief, bias=bias), Verdict(0, Reason.SENSOR_BIAS)
+                return self._still_biased(track.changed(belief=epoch.prediction.belief), bias)
             track = track.changed(bias=None)
         doubtful = track.changed(belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
         large = verdict.reason is Reason.POSE_JUMP
@@ -94,13 +92,12 @@ class AnomalyTest:
         if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
-        allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
-        window, ranked = explain(window, first, self._priors, *allowed)
+        window, ranked = self._explained(track, window, first)
         best = ranked[0].hypothesis
-        changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
+        changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free, window))
-        disturbed = best in _DISTURBANCES and odds_over_free(ranked) >= _OVER_FREE and ranked[0].explains
+        disturbed = best in _DISTURBANCES and odds_over_free(ranked) >= OVER_FREE and ranked[0].explains
         if (large or track.doubtful) and disturbed:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
@@ -123,6 +120,19 @@ class AnomalyTest:
         after = with_nis(after, track, epoch.innovation.chi2)
         return after.changed(recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
+    def _explained(self, track: Track, window: tuple[Epoch, ...], first: int) -> Ranked:
+        allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
+        return explain(window, first, self._priors, *allowed)
+
+    def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Verdict]:
+        """The track after one more scan of a sensor error, unless a manoeuvre explains its scans better."""
+        bias, found = compared(bias, lambda window, first: self._explained(track, window, first))
+        window, best = found or ((), None)
+        if best is not None and scans_after(window, best) >= FEWEST_TO_FIT:
+            reported = self._reported(track.changed(bias=None), window, best)
+            return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
+        return track.changed(bias=bias), Verdict(0, Reason.SENSOR_BIAS)
+
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones may agree by themselves."""
         if len(track.doubtful) < _FEWEST:
@@ -134,7 +144,7 @@ class AnomalyTest:
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
         best, explained = ranked[0], ranked[0].explains
         certain = explained and best.log_evidence - ranked[1].log_evidence >= OVER_NEXT
-        certain = certain and (odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
+        certain = certain and (odds_over_free(ranked) >= OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
         if doubtful < _MOST and not certain:
             return in_doubt
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
@@ -185,7 +195,7 @@ class AnomalyTest:
     def _biased(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """The estimate of the poses before the sensor error, propagated to the present."""
         first, last = len(window) - len(track.doubtful), window[-1]
-        bias = SensorBias(best.size, best.P, last)
+        bias = begun(window, best)
         if best.onset >= first:
             return with_history(track, track).changed(bias=bias)
         then = window[best.onset].track
@@ -234,7 +244,7 @@ class AnomalyTest:
             S = H @ belief.P @ H.T + seen.R
             alpha = innovation_vector(belief.x, measured_pose(prior.x, seen.alpha))
             limit = gate_of(seen.dof, seen.R, S)
-            if _chi2(alpha, S) > limit or _chi2(seen.alpha, S) < limit:
+            if squared(alpha, S) > limit or squared(seen.alpha, S) < limit:
                 return False
         return True
 
@@ -319,24 +329,3 @@ class AnomalyTest:
         old = track.changed(recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
         out = with_history(out, track).changed(drift=track.drift, previous=old)
         return out.changed(sigma_hits=track.sigma_hits, r_floors=track.r_floors)
-
-
-def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
-    """The sensor error after one more scan, None where it has ended.
-
-    The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
-    scan to the next, where an offset that ends changes the innovation by its own size.
-    """
-    last, prediction = bias.last, epoch.prediction
-    turned = prediction.H @ prediction.Phi - last.prediction.H
-    P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
-    if _chi2(bias.offset, P + bias.P) < _SIGNIFICANT:
-        return None
-    change = epoch.innovation.alpha - last.innovation.alpha
-    still, ended = _chi2(change, P), _chi2(change + bias.offset, P + bias.P)
-    gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
-    return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
-
-
-def _chi2(y: Array, C: Array) -> float:
-    return float(y @ np.linalg.solve(C, y))

@@ -36,7 +36,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array
 from avsreplay.records import Belief
 
-OVER_NEXT = 2.0  # log odds over the next hypothesis of an early decision
+OVER_FREE, OVER_NEXT = 3.0, 2.0  # log odds over free motion and over the next hypothesis of an early decision
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
 _PER_BAD_SCAN = math.log(1e-2)
@@ -51,6 +51,9 @@ _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and 
 _PER_S = 0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
 _OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
 
+Ranked = tuple[tuple[Epoch, ...], list[Explanation]]
+"""Scans and the hypotheses about them, most likely first."""
+
 
 def explain(
     epochs: Sequence[Epoch],
@@ -60,7 +63,7 @@ def explain(
     force: float,
     orbit: RelativeOrbit | None = None,
     quiet: bool = True,
-) -> tuple[tuple[Epoch, ...], list[Explanation]]:
+) -> Ranked:
     """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely first.
 
     The hypotheses are linear about the motion predicted from the first scan. Where the accepted scans contradict this

@@ -30,8 +30,7 @@ from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation,
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
-_NO_NOISE = frozen(np.zeros((6, 6)))
-_NO_MOTION = frozen(np.zeros((6, 0)))
+_NO_NOISE, _NO_MOTION = frozen(np.zeros((6, 6))), frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
 _TURN_WITHIN_RAD = 0.2  # largest change of the other rotations if a rotation that is first determined turns the track
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
@@ -44,11 +43,18 @@ class SensorBias:
     Attributes:
         offset: (6,) of the measured poses in {A} at its onset: position [m] and half angle.
         P: (6, 6) its covariance.  last: the last scan with this error.
+        before, since: scans without and with it that are compared.  doubted: another hypothesis is more likely.
+        spacing, left_out: scans to the next that is compared, of which so many have passed.
     """
 
     offset: Array
     P: Array
     last: Epoch
+    before: tuple[Epoch, ...] = ()
+    since: tuple[Epoch, ...] = ()
+    doubted: bool = False
+    spacing: int = 1
+    left_out: int = 0
 
 
 @value_class
@@ -67,9 +73,8 @@ class Track:
 
     Attributes:
         belief: after the last scan.  mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
-        window: of the noise adaptation.
-        sigma_hits: sigma bounds that cut the gain so far.  r_floors: eigenvalues of R raised so far.
-        R: (6, 6) noise of the last healthy scan [m, half-angle], zero before the first.
+        window: of the noise adaptation.  sigma_hits: sigma bounds that cut the gain so far.
+        r_floors: eigenvalues of R raised so far.  R: (6, 6) noise of the last healthy scan [m, half angle].
         fixes: healthy poses that fits use.  older: those before.
         batch: the last batch fit whose estimate was adopted.  since: healthy poses since the last fit.
         reinitialised: how often a fit replaced the filter's estimate, or the given start was rejected.
@@ -77,8 +82,7 @@ class Track:
         prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
         recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
         rejected: the last poses since the last accepted scan that nothing explained.
-        bias: an error of the sensor in effect, None where there is none.
-        started_ns: instant of the first scan of this estimate.
+        bias: an error of the sensor in effect, or None.  started_ns: instant of the first scan of this estimate.
         previous: the estimate before the last new start, None where there was none.
         manoeuvres: all that were found.  pending: the last of them is reported, and the motion after it not determined.
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
@@ -233,8 +237,8 @@ def confirmed(track: Track) -> tuple[Manoeuvre, ...]:
 
 
 def in_doubt(track: Track) -> bool:
-    """Return whether a scan is not decided on, or a change of the motion is more likely than none."""
-    return bool(track.doubtful) or track.change_probability > 0.5
+    """Return whether a scan is not decided on, or a bias or an unchanged motion is not the most likely cause."""
+    return bool(track.doubtful) or track.change_probability > 0.5 or (track.bias is not None and track.bias.doubted)
 
 
 def with_history(then: Track, now: Track) -> Track:

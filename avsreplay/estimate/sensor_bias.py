@@ -1,0 +1,88 @@
+"""A sensor error in effect: whether it lasts, and whether a manoeuvre explains its scans better after all.
+
+A bias of the sensor is a step of the pose; a manoeuvre is a step of the velocity. A small manoeuvre between two scans
+may resemble a bias in the first scans after it. The hypotheses are therefore compared again while the bias lasts. A
+constant offset that grows with time is a manoeuvre, where the pose is continuous at its beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from avsreplay.estimate.hypotheses import OVER_FREE, OVER_NEXT, Ranked
+from avsreplay.estimate.measurement import GATE
+from avsreplay.estimate.scan_window import Explanation, Hypothesis, odds_over_free
+from avsreplay.estimate.track import Epoch, SensorBias
+from avsreplay.geometry import Array
+
+_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
+_MOST = 12  # scans of a bias that are compared
+
+Compare = Callable[[tuple[Epoch, ...], int], Ranked]
+"""The hypotheses about scans, of which as many as stated are accepted (``hypotheses.explain``)."""
+
+
+def begun(window: Sequence[Epoch], found: Explanation) -> SensorBias:
+    """Return the error that begins within some scans.
+
+    Args:
+        window: measured scans in the order of time, the last of them with the error.
+        found: the hypothesis of a bias about them.
+    """
+    onset = found.onset
+    return SensorBias(found.size, found.P, window[-1], tuple(window[:onset]), tuple(window[onset:]))
+
+
+def continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
+    """Return the error after one more scan, None where it has ended.
+
+    The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
+    scan to the next, where an offset that ends changes the innovation by its own size.
+
+    Args:
+        bias: after the last scan.
+        epoch: the scan.
+    """
+    last, prediction = bias.last, epoch.prediction
+    turned = prediction.H @ prediction.Phi - last.prediction.H
+    P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
+    if squared(bias.offset, P + bias.P) < _SIGNIFICANT:
+        return None
+    change = epoch.innovation.alpha - last.innovation.alpha
+    still, ended = squared(change, P), squared(change + bias.offset, P + bias.P)
+    gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
+    return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
+
+
+def compared(bias: SensorBias, compare: Compare) -> tuple[SensorBias, tuple[tuple[Epoch, ...], Explanation] | None]:
+    """Return the error with its last scan among those that are compared, and a manoeuvre that explains them instead.
+
+    At most ``_MOST`` scans of the error are kept. Then every second one is left out, and the next ones are added half
+    as often, so that a slow growth of the offset is found as well.
+
+    Args:
+        bias: after the last scan.
+        compare: the hypotheses about scans.
+
+    Returns:
+        The error, and the scans with the manoeuvre if that is the most likely cause of them; else None.
+    """
+    if bias.left_out + 1 < bias.spacing or not bias.before:
+        return replace(bias, left_out=bias.left_out + 1), None
+    since, spacing = (*bias.since, bias.last), bias.spacing
+    if len(since) > _MOST:
+        since, spacing = since[::2], 2 * spacing
+    window, ranked = compare((*bias.before, *since), len(bias.before))
+    best, odds = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence
+    doubted = best.hypothesis is not Hypothesis.SENSOR_BIAS
+    bias = replace(bias, since=since, spacing=spacing, left_out=0, doubted=doubted)
+    certain = best.explains and odds >= OVER_NEXT and odds_over_free(ranked) >= OVER_FREE
+    return bias, (window, best) if best.hypothesis is Hypothesis.MANOEUVRE and certain else None
+
+
+def squared(y: Array, C: Array) -> float:
+    """Return the squared norm of y (n,) whitened by the covariance C (n, n)."""
+    return float(y @ np.linalg.solve(C, y))
