@@ -366,16 +366,41 @@ def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> 
 
 
 def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_they_make() -> None:
-    """White innovations N(0, 1 + M diag(scale^2) M') with the columns M of the instants, against N(0, 1)."""
+    """White innovations N(0, 1 + M M') with the columns M of the instants, two in each interval, against N(0, 1)."""
     rng = np.random.default_rng(7)
-    columns, white, scale = rng.normal(size=(8, 30, 6)), 3.0 * rng.normal(size=30), rng.uniform(0.1, 2.0, size=6)
-    chosen = np.array([[1, 3, 4], [2, 5, 7]])
-    found = hypotheses._joint(columns, white, scale, chosen)
-    for instants, value in zip(chosen, found, strict=True):
-        M = np.hstack([columns[k] * scale for k in instants])
-        odds = multivariate_normal.logpdf(white, cov=np.eye(30) + M @ M.T)
-        odds += 0.5 * float(white @ white) + 15.0 * np.log(2.0 * np.pi)
-        assert value == pytest.approx(odds, rel=1e-9)
+    every, white = rng.normal(size=(40, 48)), 3.0 * rng.normal(size=40)
+    for intervals in (1, 3, 4):
+        found = hypotheses._joint(every.T @ every, every.T @ white, 12 * intervals)
+        assert len(found) == 5 - intervals
+        for k, value in enumerate(found):
+            M = every[:, 12 * k : 12 * (k + intervals)]
+            odds = multivariate_normal.logpdf(white, cov=np.eye(40) + M @ M.T)
+            odds += 0.5 * float(white @ white) + 20.0 * np.log(2.0 * np.pi)
+            assert value == pytest.approx(odds, rel=1e-9)
+
+
+@pytest.mark.parametrize(("m", "n"), [(20, 9), (6, 9), (5, 1), (5, 2)])
+def test_the_odds_of_random_impulses_are_those_of_the_gaussian_they_make(m: int, n: int) -> None:
+    rng = np.random.default_rng(n)
+    M, white, variances = rng.normal(size=(m, n)), 2.0 * rng.normal(size=m), np.array([0.0, 1e-6, 0.3, 1e8])
+    odds, fall = _motion.impulse_odds(M.T @ M, M.T @ white, variances)
+    for variance, value, less in zip(variances, odds, fall, strict=True):
+        C = np.eye(m) + variance * M @ M.T
+        free = multivariate_normal.logpdf(white, cov=np.eye(m))
+        assert value == pytest.approx(multivariate_normal.logpdf(white, cov=C) - free, rel=1e-6, abs=1e-9)
+        assert less == pytest.approx(white @ white - white @ np.linalg.solve(C, white), rel=1e-6, abs=1e-9)
+
+
+def test_a_triangular_matrix_is_inverted_and_divided_by() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(31, 31))
+    L, y = np.linalg.cholesky(A @ A.T + np.eye(31)), rng.normal(size=31)
+    inverse = _motion.lower_inverse(L)
+    assert np.abs(inverse @ L - np.eye(31)).max() < 1e-12
+    assert not np.triu(inverse, 1).any()
+    assert _motion.lower_divided(L, y) == pytest.approx(np.linalg.solve(L, y), rel=1e-9, abs=1e-12)
+    with pytest.raises(ValueError, match="sizes"):
+        _motion.lower_divided(L, y[1:])
 
 
 def test_the_window_holds_the_covariance_of_its_innovations() -> None:

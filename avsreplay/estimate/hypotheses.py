@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import impulses
@@ -136,17 +135,17 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     single = free + mixed(columns, white, scale, _CHANGES)
-    k = int(np.argmax(single))
-    found = [replace(_changes(instants[[k]], columns[[k]], white, free, scale)[0], log_evidence=float(single[k]))]
     two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array([count // 8, count - 1 - count // 8])
-    total = [log_mean(single.tolist())]
+    M = (columns[two.reshape(-1)] * scale).transpose(1, 0, 2).reshape(len(white), -1)
+    G, g = M.T @ M, M.T @ white
+    found, total = [], [log_mean(single.tolist())]
     for m in range(1, len(_SPREAD)):
-        chosen = [two[k : k + m].reshape(-1) for k in range(len(two) + 1 - m)]
-        if not chosen:
+        if m > len(two):
             total.append(-math.inf)
             continue
-        values = free + _joint(columns, white, scale, np.array(chosen))
-        c = chosen[int(np.argmax(values))]
+        values = free + _joint(G, g, 12 * m)
+        first = int(np.argmax(values))
+        c = two[first : first + m].reshape(-1)
         most_likely, likely = _changes(instants[c], columns[c], white, free, scale)
         total.append(log_mean(values.tolist()) if likely else -math.inf)
         if likely:
@@ -154,7 +153,7 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     fine, value = _located(window, start, white, free, scale, instants, single)
     total[0] = max(total[0], value - math.log(float(window.times_s[-1])))
     odds = float(np.logaddexp.reduce(np.log(_SPREAD) + total)) + PRIOR_ODDS
-    best = max((fine, *found[1:]), key=lambda f: f.log_evidence)
+    best = max((fine, *found), key=lambda f: f.log_evidence)
     if best is not fine:
         best = replace(best, after_1s_s=math.hypot(best.after_1s_s, float(lengths.max()) / math.sqrt(12.0)))
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
@@ -172,15 +171,13 @@ def _disturbed(edges: Array, between: Array, white: Array, free: float) -> Expla
     columns, found, n = between * np.sqrt(np.diff(edges))[:, None, None], [], len(between)
     for kind in _CHANGES[:2]:
         A = columns[:, :, kind].transpose(1, 0, 2).reshape(6 * n, -1)
-        values, vectors = np.linalg.eigh(A.T @ A)
-        along = vectors.T @ (A.T @ white)
-        gain = _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
-        fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
-        odds, left = 0.5 * (fitted - np.log1p(gain)).sum(axis=1), float(white @ white) - fitted.sum(axis=1)
+        odds, fall = _motion.impulse_odds(A.T @ A, A.T @ white, _DENSITIES**2)
         k, size = int(np.argmax(odds)), np.zeros(6)
         size[kind] = _DENSITIES[k]
         value = free + log_mean(odds.tolist()) + PRIOR_ODDS
-        found.append(Explanation(Hypothesis.DISTURBED, value, float(left[k]), 6 * n, n, size=size))
+        found.append(
+            Explanation(Hypothesis.DISTURBED, value, float(white @ white) - float(fall[k]), 6 * n, n, size=size)
+        )
     return max(found, key=lambda f: f.log_evidence)
 
 
@@ -247,16 +244,19 @@ def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
     return _motion.after_changes(window.late, which, impulses(start.x, instants), instants)
 
 
-def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]) -> Array:
-    """(k,) log evidence over free motion of changes at several instants ``chosen`` (k, m), as in ``_changes``."""
-    first = int(chosen.min())
-    used = columns[first : int(chosen.max()) + 1] * scale
-    count, size = len(used), chosen.shape[1] * used.shape[2]
-    M = used.transpose(1, 0, 2).reshape(len(white), -1)
-    G, g = (M.T @ M).reshape(count, 6, count, 6), (M.T @ white).reshape(count, 6)
-    at = chosen - first
-    A = G[at[:, :, None], :, at[:, None, :]].transpose(0, 1, 3, 2, 4).reshape(-1, size, size)
-    return _motion.log_ratio(A, g[at].reshape(-1, size))
+def _joint(G: Array, g: Array, size: int) -> Array:
+    """Log evidence over free motion of changes in successive intervals, two in each, as in ``_changes``.
+
+    Args:
+        G: (12k, 12k) normal matrix of the changes in k intervals, of unit size.
+        g: (12k,) its right side.
+        size: 12 times the number of intervals of a manoeuvre.
+
+    Returns:
+        The values of the manoeuvres that begin in each interval, as far as they end within the k.
+    """
+    parts = [slice(k, k + size) for k in range(0, len(g) + 1 - size, 12)]
+    return _motion.log_ratio(np.array([G[part, part] for part in parts]), np.array([g[part] for part in parts]))
 
 
 def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> tuple[Explanation, bool]:

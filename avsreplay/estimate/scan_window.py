@@ -123,9 +123,10 @@ def window_of(
     states, transitions, by_u, Q = driven_steps(start, times, torque, arc)
     poses = tuple(measured_pose(e.prediction.belief.x, e.innovation.alpha) for e in epochs)
     y = np.array([innovation_vector(x, pose) for x, pose in zip(states, poses, strict=True)])
-    H, inverse = np.array([measurement_jacobian(x) for x in states]), np.linalg.inv(transitions)
-    noise = process_noise(Q, times, force)
-    rows, back = H @ transitions, start.P + inverse @ noise @ np.swapaxes(inverse, 1, 2)  # errors of the start
+    H, motion = np.array([measurement_jacobian(x) for x in states]), slice(REACHED)  # noise acts on these alone
+    inverse, noise = np.linalg.inv(transitions[:, motion, motion]), process_noise(Q, times, force)[:, motion, motion]
+    rows, back = H @ transitions, np.tile(start.P, (n, 1, 1))  # errors of the start
+    back[:, motion, motion] += inverse @ noise @ np.swapaxes(inverse, 1, 2)
     C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
     earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common
     C = np.where(earlier.T[:, None, :, None], C.transpose(2, 3, 0, 1), C)
@@ -137,7 +138,7 @@ def window_of(
         across = rows.reshape(6 * n, 20) @ start.cross @ seen.T
         flat += across + across.T + seen @ start.P_u @ seen.T
     flat = 0.5 * (flat + flat.T)
-    whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
+    whiten = _motion.lower_inverse(cholesky_root(flat))
     late = np.concatenate([since_each(whiten, rows[:, :, :REACHED]), np.zeros((1, 6 * n, REACHED))])
     return Window(times, y.reshape(-1), flat, whiten, late, poses, R, tuple(rotation(x.q_ab).T for x in states))
 
@@ -217,7 +218,7 @@ def pose_difference(a: Pose, b: Pose, R_ba: Array) -> Array:
 def log_density(y: Array, C: Array) -> tuple[float, float]:
     """Log density of N(0, C) at y without its constant, and the squared whitened norm."""
     root = cholesky_root(C)
-    white = np.linalg.solve(root, y)
+    white = _motion.lower_divided(root, y)
     chi2 = float(white @ white)
     return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
 

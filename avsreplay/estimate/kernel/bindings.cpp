@@ -255,6 +255,36 @@ Numpy mixed_of(const Matrix<-1, -1, -1>& M, const Vector<-1>& white, const Vecto
   return value;
 }
 
+// Per variance of the unknowns, the log evidence over none and the fall of the chi-square, from A = M' M and b = M' white.
+nb::tuple impulse_odds_of(const Matrix<-1, -1>& A, const Vector<-1>& b, const Vector<-1>& variances) {
+  const size_t n = A.shape(0), k = variances.shape(0);
+  if (A.shape(1) != n || b.shape(0) != n) throw std::invalid_argument("sizes of A and b differ");
+  double *odds, *fall;
+  Numpy first = array({k}, &odds), second = array({k}, &fall);
+  std::vector<double> copy(A.data(), A.data() + n * n);
+  impulse_odds(copy.data(), {b.data(), b.data() + n}, variances.data(), k, odds, fall);
+  return nb::make_tuple(first, second);
+}
+
+Numpy lower_inverse_of(const Matrix<-1, -1>& L) {
+  const size_t n = L.shape(0);
+  if (L.shape(1) != n) throw std::invalid_argument("the matrix is not square");
+  double* to;
+  Numpy out = array({n, n}, &to);
+  lower_inverse(L.data(), n, to);
+  return out;
+}
+
+Numpy lower_divided(const Matrix<-1, -1>& L, const Vector<-1>& y) {
+  const size_t n = L.shape(0);
+  if (L.shape(1) != n || y.shape(0) != n) throw std::invalid_argument("sizes of L and y differ");
+  double* to;
+  Numpy out = array({n}, &to);
+  std::copy(y.data(), y.data() + n, to);
+  lower_divide(L.data(), n, to);
+  return out;
+}
+
 using Flat = Vector<CHART>;
 
 Chart chart(const Flat& from) {
@@ -646,6 +676,9 @@ NB_MODULE(_motion, m) {
   m.def("evidence", &evidence_of, nb::arg("M"), nb::arg("white"), nb::arg("size"));
   m.def("log_ratio", &log_ratio_of, nb::arg("A"), nb::arg("b"));
   m.def("mixed", &mixed_of, nb::arg("M"), nb::arg("white"), nb::arg("size"), nb::arg("factors"), nb::arg("kinds"));
+  m.def("impulse_odds", &impulse_odds_of, nb::arg("A"), nb::arg("b"), nb::arg("variances"));
+  m.def("lower_inverse", &lower_inverse_of, nb::arg("L"));
+  m.def("lower_divided", &lower_divided, nb::arg("L"), nb::arg("y"));
   m.def("chart", &chart_from, nb::arg("x"));
   m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));

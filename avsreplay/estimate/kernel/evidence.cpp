@@ -15,6 +15,7 @@ void normal(const double* M, const double* white, const double* size, size_t m, 
   G.assign(n * n, 0.0), g.assign(n, 0.0);
   for (size_t i = 0; i < m; ++i) {
     const double* row = M + n * i;
+    if (std::all_of(row, row + n, [](double one) { return one == 0; })) continue;  // of a scan before the change
     for (size_t r = 0; r < n; ++r) {
       double* to = G.data() + n * r;
       const double factor = row[r];
@@ -49,7 +50,97 @@ double factored(double* A, double* b, size_t n) {
   return 0.5 * gain - log_det;
 }
 
+// A symmetric A := Q' A Q, of which the diagonal d (n) and the elements e (n - 1) beside it are not zero, and b := Q' b, by
+// Householder's reflections (Golub and Van Loan, Matrix Computations, section 8.3.1).
+void tridiagonal(double* A, std::vector<double>& b, std::vector<double>& d, std::vector<double>& e) {
+  const size_t n = b.size();
+  std::vector<double> v(n), p(n);
+  d.resize(n), e.assign(n, 0.0);
+  for (size_t k = 0; k < n; ++k) {
+    const double* column = A + n * k;
+    d[k] = column[k];
+    if (k + 1 == n) break;
+    double beyond = 0, vb = 0, vp = 0;
+    for (size_t i = k + 2; i < n; ++i) beyond += column[i] * column[i];
+    e[k] = column[k + 1];
+    if (beyond == 0) continue;
+    e[k] = -std::copysign(std::sqrt(column[k + 1] * column[k + 1] + beyond), column[k + 1]);
+    for (size_t i = k + 1; i < n; ++i) v[i] = column[i] - (i == k + 1 ? e[k] : 0), p[i] = 0;
+    const double beta = 2 / (v[k + 1] * v[k + 1] + beyond);
+    for (size_t r = k + 1; r < n; ++r) {
+      const double* row = A + n * r;
+      const double f = beta * v[r];
+      for (size_t c = k + 1; c < n; ++c) p[c] += f * row[c];
+      vb += v[r] * b[r];
+    }
+    for (size_t i = k + 1; i < n; ++i) vp += v[i] * p[i];
+    for (size_t i = k + 1; i < n; ++i) {
+      p[i] -= 0.5 * beta * vp * v[i];
+      b[i] -= beta * vb * v[i];
+    }
+    for (size_t r = k + 1; r < n; ++r) {
+      double* row = A + n * r;
+      const double fv = v[r], fp = p[r];
+      for (size_t c = k + 1; c < n; ++c) row[c] -= fv * p[c] + fp * v[c];
+    }
+  }
+}
+
+// Logarithm of a product of positive numbers that may be out of range.
+class LogProduct {
+ public:
+  void times(double factor) {
+    int power;
+    mantissa_ = std::frexp(mantissa_ * factor, &power);
+    powers_ += power;
+  }
+  double log() const { return log_of(2 * mantissa_) + (powers_ - 1) * 0.69314718055994530942; }
+
+ private:
+  double mantissa_ = 0.5;
+  long powers_ = 1;
+};
+
 }  // namespace
+
+void impulse_odds(double* A, std::vector<double> b, const double* variances, size_t k, double* odds, double* fall) {
+  std::vector<double> d, e;
+  tridiagonal(A, b, d, e);
+  for (size_t i = 0; i < k; ++i) {  // by elimination in 1 + variance A
+    const double s = variances[i];
+    LogProduct determinant;
+    double pivot = 1, z = 0, sum = 0;
+    for (size_t r = 0; r < b.size(); ++r) {
+      const double f = r ? s * e[r - 1] / pivot : 0;
+      z = b[r] - f * z;
+      pivot = 1 + s * d[r] - (r ? f * s * e[r - 1] : 0);
+      determinant.times(pivot);
+      sum += z * z / pivot;
+    }
+    fall[i] = s * sum;
+    odds[i] = 0.5 * (fall[i] - determinant.log());
+  }
+}
+
+void lower_inverse(const double* L, size_t n, double* out) {
+  std::fill(out, out + n * n, 0.0);
+  for (size_t r = 0; r < n; ++r) {
+    double* row = out + n * r;
+    for (size_t i = 0; i < r; ++i) {
+      const double f = L[n * r + i];
+      for (size_t c = 0; c <= i; ++c) row[c] -= f * out[n * i + c];
+    }
+    for (size_t c = 0; c < r; ++c) row[c] /= L[n * r + r];
+    row[r] = 1 / L[n * r + r];
+  }
+}
+
+void lower_divide(const double* L, size_t n, double* y) {
+  for (size_t r = 0; r < n; ++r) {
+    for (size_t i = 0; i < r; ++i) y[r] -= L[n * r + i] * y[i];
+    y[r] /= L[n * r + r];
+  }
+}
 
 void after_change(const double* late, const double impulse[6][3], double instant, size_t m, double* out) {
   for (size_t i = 0; i < m; ++i, late += 12, out += 6) {
