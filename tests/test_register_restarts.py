@@ -112,6 +112,15 @@ def test_a_misfit_that_neighbours_share_is_told_from_noise():
     assert restarter.structure(exact, T_ac.inverse() @ shift) > 0.4 * noise
 
 
+def test_noise_as_large_as_a_patch_is_not_a_common_misfit_of_neighbours():
+    """Patches of the measured points would divide each face by the sign of the noise."""
+    surface, T_ac = boxes(), example_pose()
+    restarter, share = Registrar(surface)._restarter, 0.015
+    for seed in range(4):
+        noisy = seen(surface, T_ac, share, np.random.default_rng(seed))
+        assert restarter.structure(noisy, T_ac.inverse(), side=share) < 0.18 * share * surface.extent
+
+
 def test_points_of_a_wrong_pose_share_their_distances_and_those_of_the_true_pose_do_not() -> None:
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
     scan, restarter = seen(surface, T_ac, 0.002, rng), Registrar(surface)._restarter

@@ -33,7 +33,7 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 COMPLETE = 0.985  # with more inliers too few points are left that could continue beyond an edge of the model
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
-SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
+SHARED = 0.4  # of the rms distance; a correct pose of a correct model has less than 0.3 in common to neighbours
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
@@ -160,7 +160,8 @@ class Restarter:
         """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
 
         From the products of the sums of two halves of each patch: noise of single points cancels in the mean, a wrong
-        pose and errors of the model do not.
+        pose and errors of the model do not. A point belongs to the patch in which its projection onto its face lies.
+        With patches of the measured points, noise as large as a patch would divide a face by the sign of the noise.
 
         Args:
             points: (n, 3) in {A} [m].
@@ -176,8 +177,9 @@ class Restarter:
         near = found.d2 < min(most_m, START_OF_EXTENT * self._extent) ** 2
         if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
             return float("inf")
-        e = np.einsum("ij,ij->i", found.normal[near], p[near] - found.foot[near])
-        cells = np.floor((p[near] - self._middle) / (side * self._extent)).astype(np.int64) + CELLS // 2
+        e = np.einsum("ij,ij->i", normal := found.normal[near], p[near] - found.foot[near])
+        on = p[near] - e[:, None] * normal
+        cells = np.floor((on - self._middle) / (side * self._extent)).astype(np.int64) + CELLS // 2
         patch = np.unique(cells @ np.array([CELLS * CELLS, CELLS, 1]), return_inverse=True)[1]
         half = 2 * patch + np.arange(len(patch)) % 2
         sums, counts = (np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None))
