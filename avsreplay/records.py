@@ -196,9 +196,8 @@ class LogHeader:
     """The metadata of a log; with them it can be replayed without options.
 
     Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults ``labels``, initial
-    belief ``start``, ``truth`` at the first scan, ``notes`` by name, and the frame of its transforms in which start,
-    truth and poses are, ``fixed_frame`` ("": that of the clouds). ``sensor_at_stamp``: points with times of their own
-    are in the frame that the sensor has at the stamp of their cloud, not in that at their own time.
+    belief ``start``, ``truth`` at the first scan, ``notes`` by name, ``fixed_frame`` of start, truth, poses ("": that
+    of clouds). ``sensor_at_stamp``: points with times are in the frame of the sensor at the stamp of their cloud.
     """
 
     surface: Surface | None = None
@@ -238,7 +237,7 @@ class Alignment:
         info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
         covariance: (6, 6) of d, systematic errors included; None if degenerate.  dof: of this estimate, inf if known.
         message: why it failed or is not accepted.  free_directions: not determined, in words; free: columns d (6, k).
-        split_nis: normalised squared difference of the poses from two halves of the scan, the larger of two splits.
+        split_nis: of the poses of halves of the scan, see ``quality``.  size_1s: error of the size, until it is fitted.
     """
 
     T_ac: Pose
@@ -256,6 +255,7 @@ class Alignment:
     dof: float = float("inf")
     free: Array | None = None
     well_off: int = 0
+    size_1s: float | None = None
 
     @property
     def measured(self) -> bool:

@@ -12,7 +12,7 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
+from avsreplay.register import Registrar, neighbourhood
 from avsreplay.register.budget import Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
@@ -100,6 +100,21 @@ def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
     assert found.status is AlignStatus.ALIGNED
     assert found.inlier_ratio > 0.93
     assert (len(calls), len(restarts)) == (2, 0)
+
+
+def test_the_size_is_fitted_for_the_pose_that_is_returned(monkeypatch):
+    """Half of the points are far away: two alignments are graded, and the size is fitted to the second only."""
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(5)
+    registrar, graded, sized = Registrar(surface), [], []
+    scan = seen(surface, T_ac, 0.002, rng)
+    scan = np.vstack([scan, scan + np.array([0.0, 0.0, 0.8 * surface.extent])])
+    grade, fitted = registrar._graded, neighbourhood.size_error
+    monkeypatch.setattr(registrar, "_graded", lambda *args, **named: graded.append(1) or grade(*args, **named))
+    monkeypatch.setattr(neighbourhood, "size_error", lambda *args: sized.append(1) or fitted(*args))
+    found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
+    assert found.status is AlignStatus.ALIGNED
+    assert (len(graded) > 1, len(sized)) == (True, 1)
+    assert found.size_1s is None
 
 
 def test_a_misfit_that_neighbours_share_is_told_from_noise():

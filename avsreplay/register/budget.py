@@ -5,10 +5,10 @@ from __future__ import annotations
 from avsreplay.records import Alignment, Fit
 from avsreplay.register.backend import FIXED_WORK, healthy_work
 
-LEAST_RATIO = 0.9  # with fewer inliers the size is fitted
+LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 10  # cost per point of leaving out scattered points
-TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
+TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size
 PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
@@ -45,14 +45,10 @@ class Budget:
         """Subtract work that was done."""
         self.left -= searches
 
-    def registered(self, fit: Fit, found: Alignment, sized: bool) -> None:
-        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated.
-
-        ``sized``: the size is fitted where many points are off the model.
-        """
+    def registered(self, fit: Fit, found: Alignment) -> None:
+        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated."""
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        size = SIZE_WORK if sized and found.inlier_ratio < LEAST_RATIO else 0
-        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK + size)
+        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""

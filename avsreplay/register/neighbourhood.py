@@ -24,12 +24,12 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import HornBackend, Target
-from avsreplay.register.budget import FAR_WORK, MEASURED_WORK, Budget
+from avsreplay.register.budget import FAR_WORK, MEASURED_WORK, SIZE_WORK, Budget
 from avsreplay.register.covariance import noise_along
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
-from avsreplay.register.size import SIZE_UNSEEN
+from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
 from avsreplay.register.surface_index import SurfaceIndex
 
 VALLEY_STEPS, VALLEY_POINTS = 8, 250  # steps of half a gate each way along the two least certain directions; points
@@ -111,20 +111,47 @@ class Neighbourhood:
             budget.spend(MEASURED_WORK * len(points))
         return found
 
-    def with_bias(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
-        """Return the alignment without the bias of the noise as far as it is certain, where the fit is not close.
+    def with_size(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
+        """Return an alignment with what its scan (n, 3) in {A} says about the size, if that is still to be fitted.
 
-        With x the chi-square of the bias b by the covariance P of the pose, the share s = 1 - 4 / x of it, 0 if
-        negative, is certain (James and Stein, Proc. 4th Berkeley Symp. 1, 1961, for 6 unknowns). The pose is corrected
-        by s b if the ranges of the scan then fit better. P is enlarged by b b' times (1 - s)^2 (1 - 1 / x) for what is
-        left, and times (s / 2)^2, because half of a correction counts as its standard error. Where nothing else is
-        stated, the message states a standard deviation of the attitude above ``UNCERTAIN_RAD``.
+        The covariance is enlarged by the change of the pose that a significant error of the size causes.
+        """
+        P = found.covariance
+        if found.size_1s is None or P is None:
+            return found
+        budget.spend(SIZE_WORK)
+        T_ca, target = found.T_ac.inverse(), self._target
+        size = size_error(target.index, scan, T_ca, target.visibility.camera_c(target.index, scan, T_ca))
+        if size is not None and size.significant:
+            P = geometry.frozen(P + np.outer(size.shift, size.shift))
+        return replace(found, covariance=P, message=size_remark(size, found.size_1s), size_1s=None)
+
+    def of_one(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
+        """Return the alignment of a scan (n, 3) in {A}, not accepted if the view shows faces of many bodies.
+
+        They do not determine the pose, or no error of the size.
+        """
+        found = self.with_size(scan, found, budget)
+        if found.status is not AlignStatus.DEGENERATE and not found.message.startswith(SIZE_UNSEEN):
+            return found
+        return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
+
+    def with_bias(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
+        """Return the alignment with its size, and without the bias of the noise, where the fit is not close.
+
+        The bias is left out as far as it is certain. With x the chi-square of the bias b by the covariance P of the
+        pose, the share s = 1 - 4 / x of it, 0 if negative, is certain (James and Stein, Proc. 4th Berkeley Symp. 1,
+        1961, for 6 unknowns). The pose is corrected by s b if the ranges of the scan then fit better. P is enlarged by
+        b b' times (1 - s)^2 (1 - 1 / x) for what is left, and times (s / 2)^2, because half of a correction counts as
+        its standard error. Where nothing else is stated, the message states a standard deviation of the attitude above
+        ``UNCERTAIN_RAD``.
 
         Args:
             scan: (n, 3) in {A} [m].
             found: the alignment.
             budget: work that is left; it need not suffice.
         """
+        found = self.with_size(scan, found, budget)
         P = found.covariance
         if P is None or found.rms_m <= BIAS_OF_GATE * self._target.limits.gate_m:
             return found
@@ -274,11 +301,6 @@ class _Noiseless:
     def cost(self, noise_m: float) -> float:
         """Return the mean squared distance from the points, in units of three sigma, at most 1 for each."""
         return float(np.mean(np.minimum(self.off / (CREDIBLE * noise_m), 1.0) ** 2))
-
-
-def of_many(found: Alignment) -> bool:
-    """Return whether a view shows faces of many bodies: they do not determine the pose, or no error of the size."""
-    return found.status is AlignStatus.DEGENERATE or found.message.startswith(SIZE_UNSEEN)
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:

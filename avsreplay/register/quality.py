@@ -7,7 +7,6 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +26,7 @@ from avsreplay.register.covariance import (
 )
 from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import RegisterParams, RegistrationLimits
-from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error, size_remark
+from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
@@ -142,7 +141,6 @@ def grade(
     accuracy: tuple[float, float] = ACCURACY,
     systematic: bool = True,
     guess: Pose | None = None,
-    sized: Callable[[float, float], bool] | None = None,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
@@ -150,8 +148,8 @@ def grade(
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
     end began. A pose that equals this guess, although the residuals require a step, is FAILED. The pose of a degenerate
-    view has its unobservable directions as in the guess, if the surface then fits as well. ``sized``: whether the size
-    is fitted, from the share of inliers and their rms [m]; a pose that is not the last one of its scan needs no size.
+    view has its unobservable directions as in the guess, if the surface then fits as well. The size is not fitted; if
+    it should be (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it for the pose that is returned in the end.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -181,11 +179,7 @@ def grade(
             fits = at.inliers >= AS_MANY * found.inliers and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
             T_ca = view.refined(kept, at.info, at.gradient) if fits else T_ca  # corrects errors of the directions
     settled = P is None or not found.beyond
-    size = None
-    share = found.inliers / max(1, found.points)
-    if P is not None and settled and systematic and _other_size(found) and (sized is None or sized(share, found.rms_m)):
-        size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
-        P = P + np.outer(size.shift, size.shift) if size is not None and size.significant else P
+    fitted = P is not None and settled and systematic and _other_size(found)
     return Alignment(
         T_ac=T_ca.inverse(),
         iterations=fit.iterations,
@@ -198,10 +192,11 @@ def grade(
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
-        message=_message(settled, size, found.size_1s if P is not None and systematic else 0.0),
+        message=_message(settled, found.size_1s if P is not None and systematic and not fitted else 0.0),
         dof=np.inf if P is None else found.dof,
         free=free if weakest else None,
         well_off=found.well_off,
+        size_1s=found.size_1s if fitted else None,
     )
 
 
@@ -211,10 +206,10 @@ def _other_size(found: PoseQuality) -> bool:
     return found.inliers < MANY_INLIERS * found.points or suggested
 
 
-def _message(settled: bool, size: SizeError | None, size_1s: float) -> str:
+def _message(settled: bool, size_1s: float) -> str:
     if not settled:
         return "the back end reports convergence, but its pose is not at a minimum of the distances"
-    return size_remark(size, size_1s)
+    return size_remark(None, size_1s)
 
 
 def _grade(

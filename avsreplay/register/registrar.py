@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -19,7 +18,7 @@ from avsreplay.register.backend import Target, aligned, create_backend, healthy_
 from avsreplay.register.budget import HEALTHY_SCANS, LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
-from avsreplay.register.neighbourhood import NOT_COMPARED, PART_ONLY, POSTPONED, Neighbourhood, of_many
+from avsreplay.register.neighbourhood import NOT_COMPARED, POSTPONED, Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.rivals import FAR_RAD, LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
@@ -95,7 +94,7 @@ class Registrar:
             return refused
         halves = seq % self.params.split_every == 0
         budget = Budget(len(scan), effort)
-        first = self._graded(scan, guess, budget, None, halves, carried, self._restarter.healthy)
+        first = self._graded(scan, guess, budget, None, halves, carried)
         if first.status is AlignStatus.FAILED:
             return first
         sound = self._restarter.sound(scan, first, budget)
@@ -191,8 +190,8 @@ class Registrar:
         if rivals:
             words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
-        elif of_many(found) and self._visibility.sided and not at.covered:
-            found = replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
+        elif self._visibility.sided and not at.covered:
+            found = self._neighbourhood.of_one(scan, found, budget)
         return found, alone
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
@@ -325,7 +324,6 @@ class Registrar:
         width_m: float | None,
         halves: bool,
         carried: bool,
-        sized: Callable[[float, float], bool] | None = None,
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers.
 
@@ -333,13 +331,13 @@ class Registrar:
         """
         start = T_ca = guess.inverse()
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
-        options = (self.params, halves, self._accuracy, not carried, start, sized)
+        options = (self.params, halves, self._accuracy, not carried, start)
         for last in (budget.brief, True):
             fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left)
             if isinstance(fit, str):
                 return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
             found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)
-            budget.registered(fit, found, sized is None)
+            budget.registered(fit, found)
             ended = last or fit.iterations >= self.limits.n_max or budget.left < healthy_work(len(scan))
             close = self._restarter.healthy(found.inlier_ratio, found.rms_m)
             if ended or not close or found.status is not AlignStatus.NOT_CONVERGED:
