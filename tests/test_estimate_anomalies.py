@@ -289,6 +289,19 @@ def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoe
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [20003, 20007])
+def test_a_small_bias_is_flagged_until_its_end(seed: int) -> None:
+    """Of an offset of 1.5 cm the difference of two scans cannot show every time whether it has ended."""
+    case = surprises.Case("bias", at_s=45.0, until_s=65.0, bias=0.015, seconds=70.0)
+    result = surprises.run(case, seed)
+    first, after = result.t.index(45.0), result.t.index(65.0)
+    assert not any(result.gamma[first:after])
+    assert set(result.reason[first + 3 : after]) == {"sensor_bias"}
+    assert all(result.gamma[after:])
+    assert max(result.ratio[first:]) < 4.0
+
+
+@pytest.mark.slow
 def test_a_push_during_a_bias_ends_the_claim_of_convergence() -> None:
     """The offset of 3 cm begins at once, so that no manoeuvre explains it; from the push on it grows."""
     case = surprises.Case("bias", at_s=45.0, bias=0.03, seconds=64.0)

@@ -33,12 +33,14 @@ from avsreplay.estimate.scan_window import (
     ChangePriors,
     Explanation,
     Hypothesis,
+    Window,
     disturbance_levels,
     last_change_ns,
     long_run,
     odds_over_free,
     possible_change,
     scans_after,
+    window_of,
 )
 from avsreplay.estimate.sensor_bias import begun, compared, continued, squared
 from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_scale, ready, with_history, with_nis
@@ -79,7 +81,7 @@ class AnomalyTest:
         if not self.enabled or verdict.reason not in _TESTED:
             return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
         if track.bias is not None:
-            bias = continued(track.bias, epoch)
+            bias = continued(track.bias, epoch, lambda scans: self._windowed(track, scans), self._priors)
             if bias is not None:
                 return self._still_biased(track.changed(belief=epoch.prediction.belief), bias)
             track = track.changed(bias=None)
@@ -123,6 +125,10 @@ class AnomalyTest:
     def _explained(self, track: Track, window: tuple[Epoch, ...], first: int) -> Ranked:
         allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
         return explain(window, first, self._priors, *allowed)
+
+    def _windowed(self, track: Track, scans: tuple[Epoch, ...]) -> Window:
+        start, orbit = scans[0].track.belief, self.batch.orbit
+        return window_of(scans, start, *self.batch.noise_levels(track), None if orbit is None else orbit.at(start.t_ns))
 
     def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Verdict]:
         """The track after one more scan of a sensor error, unless a manoeuvre explains its scans better."""

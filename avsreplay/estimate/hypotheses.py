@@ -17,6 +17,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
+    OFFSETS,
     PRIOR_ODDS,
     SCALES,
     ChangePriors,
@@ -27,6 +28,7 @@ from avsreplay.estimate.scan_window import (
     log_evidence,
     log_mean,
     mixed,
+    offsets,
     pose_difference,
     since_each,
     window_of,
@@ -48,7 +50,6 @@ _A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
 _PER_S = 0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
-_OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
 
 Ranked = tuple[tuple[Epoch, ...], list[Explanation]]
 """Scans and the hypotheses about them, most likely first."""
@@ -308,14 +309,9 @@ def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
 
 def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
     """A constant offset of the pose in {A} from one of the scans on: of its range, its position, or all of it."""
-    half = priors.half_angle
-    scale = np.concatenate([np.repeat([priors.position_m, half], 3), [priors.position_m]])
-    M = np.zeros((n, 6, 7))
-    for k, (pose, R_ba) in enumerate(zip(window.poses, window.R_ba, strict=True)):
-        M[k, :3, :3], M[k, 3:, 3:6] = np.eye(3), R_ba
-        M[k, :3, 6] = pose.t / max(float(np.linalg.norm(pose.t)), 1e-300)
+    M, scale = offsets(window, priors)
     columns = since_each(window.whiten, M)[1:]
-    values = free + mixed(columns, white, scale, _OFFSETS)
+    values = free + mixed(columns, white, scale, OFFSETS)
     onset = int(np.argmax(values)) + 1
     whitened = columns[onset - 1][:, :6]
     _, u, P = log_evidence(white, free, whitened, scale[:6])

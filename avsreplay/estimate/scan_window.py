@@ -34,6 +34,7 @@ EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis exp
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SUSPECTED = 5  # last scans in which a change may have begun
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
+OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # errors of the sensor: range, position, pose
 SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
@@ -150,6 +151,20 @@ def since_each(whiten: Array, columns: Array) -> Array:
     """
     by_scan = whiten.reshape(len(whiten), -1, 6).transpose(1, 0, 2) @ columns
     return np.asarray(np.cumsum(by_scan[::-1], axis=0)[::-1])
+
+
+def offsets(window: Window, priors: ChangePriors) -> tuple[Array, Array]:
+    """Derivatives (n, 6, 7) of the innovations by an offset in {A} of position, half angle and range, and its 1 sigma.
+
+    Args:
+        window: the scans.
+        priors: 1 sigma of the size of a change.
+    """
+    M = np.zeros((len(window.poses), 6, 7))
+    for k, (pose, R_ba) in enumerate(zip(window.poses, window.R_ba, strict=True)):
+        M[k, :3, :3], M[k, 3:, 3:6] = np.eye(3), R_ba
+        M[k, :3, 6] = pose.t / max(float(np.linalg.norm(pose.t)), 1e-300)
+    return M, np.concatenate([np.repeat([priors.position_m, priors.half_angle], 3), [priors.position_m]])
 
 
 def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors, prior: float) -> tuple[float, Array]:

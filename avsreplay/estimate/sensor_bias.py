@@ -14,13 +14,26 @@ import numpy as np
 
 from avsreplay.estimate.hypotheses import OVER_FREE, OVER_NEXT, Ranked
 from avsreplay.estimate.measurement import GATE
-from avsreplay.estimate.scan_window import Explanation, Hypothesis, odds_over_free
+from avsreplay.estimate.scan_window import (
+    OFFSETS,
+    PRIOR_ODDS,
+    ChangePriors,
+    Explanation,
+    Hypothesis,
+    Window,
+    log_mean,
+    mixed,
+    odds_over_free,
+    offsets,
+    since_each,
+)
 from avsreplay.estimate.track import Epoch, SensorBias
 from avsreplay.geometry import Array
 
-_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _MOST = 12  # scans of a bias that are compared
 
+Windowed = Callable[[tuple[Epoch, ...]], Window]
+"""The scans about the motion predicted from before the first of them (``scan_window.window_of``)."""
 Compare = Callable[[tuple[Epoch, ...], int], Ranked]
 """The hypotheses about scans, of which as many as stated are accepted (``hypotheses.explain``)."""
 
@@ -36,25 +49,39 @@ def begun(window: Sequence[Epoch], found: Explanation) -> SensorBias:
     return SensorBias(found.size, found.P, window[-1], tuple(window[:onset]), tuple(window[onset:]))
 
 
-def continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
+def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: ChangePriors) -> SensorBias | None:
     """Return the error after one more scan, None where it has ended.
 
     The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
-    scan to the next, where an offset that ends changes the innovation by its own size.
+    scan to the next, where an offset that ends changes the innovation by its own size. Where this change does not
+    decide, because the offset is small, all scans do that are compared.
 
     Args:
         bias: after the last scan.
         epoch: the scan.
+        windowed: the scans in coordinates of one prediction.
+        priors: 1 sigma of the size of an error.
     """
     last, prediction = bias.last, epoch.prediction
     turned = prediction.H @ prediction.Phi - last.prediction.H
     P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
-    if squared(bias.offset, P + bias.P) < _SIGNIFICANT:
-        return None
     change = epoch.innovation.alpha - last.innovation.alpha
     still, ended = squared(change, P), squared(change + bias.offset, P + bias.P)
-    gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
-    return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
+    ended += float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
+    lasts = still < min(GATE, ended)
+    if still < GATE and abs(ended - still) < -2.0 * PRIOR_ODDS and bias.before:
+        scans = (*bias.before, *bias.since, epoch)
+        lasts = _end_odds(windowed(scans), len(bias.before), priors) < 0.0
+    return replace(bias, last=epoch) if lasts else None
+
+
+def _end_odds(window: Window, onset: int, priors: ChangePriors) -> float:
+    """Log odds of an error that begins at the scan ``onset`` of a window and has ended, over one that lasts."""
+    white = window.whiten @ window.y
+    M, scale = offsets(window, priors)
+    since = since_each(window.whiten, M)[onset:]
+    ratios = mixed(since[0] - np.concatenate([since[1:], np.zeros((1, *since.shape[1:]))]), white, scale, OFFSETS)
+    return log_mean(ratios[:-1].tolist()) - float(ratios[-1]) + PRIOR_ODDS
 
 
 def compared(bias: SensorBias, compare: Compare) -> tuple[SensorBias, tuple[tuple[Epoch, ...], Explanation] | None]:
