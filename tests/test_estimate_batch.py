@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator, EstimatorParams, batch_covariance
+from avsreplay.estimate import Estimator, EstimatorParams, _motion, batch_covariance
 from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
     BatchCovariance,
@@ -215,6 +215,18 @@ def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
     ratios = np.linalg.eigvals(np.linalg.solve(*there)).real
     assert ratios.min() > 0.95
     assert ratios.max() < 1.15
+
+
+def test_poses_are_corrected_by_their_mean_errors() -> None:
+    """T Exp(-d) of the poses of {C} that attitudes and centres of mass give."""
+    rng, x = np.random.default_rng(8), tumbling.draw(3, seconds=1.0, hz=2.0).states[0]
+    q_ab, error = (geometry.normalise(rng.normal(size=(4, 4))) for _ in range(2))
+    centre, moved = rng.normal(size=(2, 4, 3))
+    q, t = _motion.corrected_poses(x.flat, q_ab, centre, error, moved)
+    want = geometry.multiply(geometry.multiply(q_ab, x.q_bc), error)
+    assert np.abs(q - want).max() < 1e-14
+    place = centre + geometry.rotate(geometry.matrix(q_ab), np.tile(x.c_b, (4, 1)))
+    assert np.abs(t - (place - geometry.rotate(geometry.matrix(want), moved))).max() < 1e-13
 
 
 @pytest.mark.parametrize(("n", "rate", "hz"), [(153, 0.1, 2.0), (1000, 0.05, 10.0), (500, 1e-6, 5.0), (300, 1.0, 2.0)])

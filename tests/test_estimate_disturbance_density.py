@@ -12,6 +12,7 @@ from avsreplay.estimate.disturbance_density import (
     Marginal,
     Present,
     Residuals,
+    _divided,
     density_in_use,
     marginal,
     probability_beside,
@@ -139,3 +140,11 @@ def test_torque_and_force_come_together() -> None:
     assert probability_beside(1e6) == pytest.approx(0.9)
     assert probability_beside(-1e6) == pytest.approx(0.1)
     assert np.all(np.diff([probability_beside(x) for x in np.linspace(-9.0, 9.0, 19)]) > 0.0)
+
+
+@pytest.mark.parametrize("n", [1, 36, 37, 144])
+def test_a_triangular_system_is_solved_by_halves(n: int) -> None:
+    rng = np.random.default_rng(n)
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, 5))
+    L = np.linalg.cholesky(A @ A.T + np.eye(n))
+    assert np.abs(_divided(L, B) - np.linalg.solve(L, B)).max() < 1e-12

@@ -17,11 +17,13 @@ import math
 import numpy as np
 
 from avsreplay.errors import value_class
+from avsreplay.estimate import _motion
 from avsreplay.geometry import Array
 
 DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
 _TOGETHER = 0.9  # prior probability that torque and force are both random where one is, and neither where one is not
 _SQUARES = np.append(0.0, DENSITIES**2)
+_FEW_ROWS = 36  # rows up to which a triangular matrix is inverted
 
 
 @value_class
@@ -83,8 +85,9 @@ class Marginal:
 
 def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     """Marginal likelihood of residuals with noise V (n, n) and impulses with ``effects`` (n, k)."""
-    root, prior, k = np.linalg.cholesky(V), np.linalg.cholesky(data.info).T, effects.shape[1]
-    white = np.linalg.solve(root, np.hstack([effects, data.J, data.e[:, None]]))
+    root = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
+    prior, k = np.linalg.cholesky(data.info).T, effects.shape[1]
+    white = _divided(root, np.hstack([effects, data.J, data.e[:, None]]))
     columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
     Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
     e = np.concatenate([white[:, -1], prior @ data.off])
@@ -95,6 +98,15 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     values = np.maximum(values, 0.0)
     most = np.sqrt(chi2 * values)  # by Cauchy and Schwarz; rounding can exceed it
     return Marginal(none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross)
+
+
+def _divided(L: Array, B: Array) -> Array:
+    """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves: numpy has the general solution only."""
+    if len(L) <= _FEW_ROWS:
+        return np.asarray(_motion.lower_inverse(np.ascontiguousarray(L)) @ B)
+    half = len(L) // 2
+    first = _divided(L[:half, :half], B[:half])
+    return np.concatenate([first, _divided(L[half:, half:], B[half:] - L[half:, :half] @ first)])
 
 
 def probability_beside(evidence: float) -> float:

@@ -287,48 +287,49 @@ def _compared(frame: DrivenFit, onsets: Array, widths: Array) -> list[_Found]:
     B = frame.equivalents(np.concatenate([times, onsets]))
     here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
     columns = (here - frame.G.reshape(-1, 12) @ B[n:]) * late[:, :, None]
+    back = np.swapaxes(columns, 1, 2)
+    products = frame.J.T @ frame.J, frame.J.T @ frame.e, frame.J.T @ columns, back @ columns, back @ frame.e
     inflation = 1.0
     for _ in range(2):
-        found = _explained(frame, columns, onsets, widths, inflation)
+        found = _explained(frame, products, onsets, widths, inflation)
         k = int(np.argmax([f.log_odds for f in found]))
         inflation = _remaining_noise(frame, columns[k], found[k])
     return found
 
 
-def _explained(linear: DrivenFit, columns: Array, onsets: Array, widths: Array, inflation: float) -> list[_Found]:
+def _explained(
+    linear: DrivenFit, products: tuple[Array, ...], onsets: Array, widths: Array, inflation: float
+) -> list[_Found]:
     """The drift since each onset: the kind with the greatest evidence. ``inflation`` is on the variance of the poses.
 
     Args:
-        linear: residuals and their Jacobian.
-        columns: (k, 6n, 6) of the drift since each onset.
+        linear: residuals e and their Jacobian J.
+        products: J' J, J' e, J' D (k, 20, 6), D' D (k, 6, 6), D' e (k, 6); D: effects of a drift since each onset.
         onsets: (k,) [s].
         widths: (6,) prior 1 sigma of torque and force.
         inflation: factor on the variance of the poses for errors that are correlated in time.
     """
-    J, e = linear.J, linear.e
-    solve = np.linalg.inv(J.T @ J / inflation + linear.info)
-    g = J.T @ e / inflation + linear.off
-    cross = J.T @ columns / inflation  # (k, 20, 6)
-    back = np.swapaxes(columns, 1, 2)
+    JJ, Je, cross, square, along = (each / inflation for each in products)
+    solve, g = np.linalg.inv(JJ + linear.info), Je + linear.off
     weighted = np.swapaxes(cross, 1, 2) @ solve
-    precision = back @ columns / inflation - weighted @ cross
-    rhs = weighted @ g - back @ e / inflation
-    best: list[_Found | None] = [None] * len(onsets)
+    precision, rhs = square - weighted @ cross, weighted @ g - along
+    tried, odds = [], []
     for (kind, prior_odds), width in product(zip(_KINDS, _PER_KIND, strict=True), _WIDTHS):
         scaled = width * widths[kind]
         own = np.linalg.inv(precision[:, kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled)))
         b = rhs[:, kind] * scaled
         v = (own @ b[:, :, None])[:, :, 0]
         gain = 0.5 * (v * b).sum(axis=1)
-        odds = gain + 0.5 * np.linalg.slogdet(own)[1] + prior_odds - math.log(len(_WIDTHS))
-        for k, known in enumerate(best):
-            if known is not None and known.log_odds >= odds[k]:
-                continue
-            u = np.zeros(6)
-            u[kind] = scaled * v[k]
-            y = -solve @ (g + cross[k] @ u)
-            best[k] = _Found(float(odds[k]), float(onsets[k]), u, y, width, inflation, float(gain[k]))
-    return [found for found in best if found is not None]
+        odds.append(gain + 0.5 * np.linalg.slogdet(own)[1] + prior_odds - math.log(len(_WIDTHS)))
+        tried.append((kind, width, scaled * v, gain))
+    found = []
+    for k, best in enumerate(np.argmax(odds, axis=0).tolist()):
+        kind, width, size, gain = tried[best]
+        u = np.zeros(6)
+        u[kind] = size[k]
+        y = -solve @ (g + cross[k] @ u)
+        found.append(_Found(float(odds[best][k]), float(onsets[k]), u, y, width, inflation, float(gain[k])))
+    return found
 
 
 def _remaining_noise(linear: DrivenFit, columns: Array, best: _Found) -> float:

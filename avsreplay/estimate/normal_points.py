@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
 from avsreplay.estimate.disturbance_density import Present
@@ -150,19 +151,9 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     shares = None if poses.shares is None else np.add.reduceat(poses.shares, first) / sizes
     times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
     x = to_state(reference)
-    q_ab = rotation_path(x).at(times)[0]
-    q = geometry.multiply(geometry.multiply(q_ab, x.q_bc), geometry.exp(-mean[:, :3]))
-    t = translated(x, times, poses.arc)[0] + geometry.matrix(q_ab) @ x.c_b
-    return Poses(
-        times,
-        q,
-        t - (geometry.matrix(q) @ mean[:, 3:, None])[:, :, 0],
-        0.5 * (C + np.swapaxes(C, 1, 2)),
-        counts,
-        shares,
-        within,
-        poses.arc,
-    )
+    q_ab, centre = rotation_path(x).at(times)[0], translated(x, times, poses.arc)[0]
+    q, t = _motion.corrected_poses(x.flat, q_ab, centre, geometry.exp(-mean[:, :3]), mean[:, 3:])
+    return Poses(times, q, t, 0.5 * (C + np.swapaxes(C, 1, 2)), counts, shares, within, poses.arc)
 
 
 def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:

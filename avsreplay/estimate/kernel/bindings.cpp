@@ -523,6 +523,25 @@ nb::tuple without_drift(const Flat& from, const Vector<SEEN>& u, double onset, c
   return nb::make_tuple(qs, ps);
 }
 
+// Poses (n) of {C} at attitudes of {B} with the centre of mass `centre`, each corrected by its mean error in {C}: the turn
+// `error`, and `moved` at the corrected attitude. `mean`: of the motion, with the fixture.
+nb::tuple corrected_poses(const Mean& mean, const Matrix<-1, 4>& attitude, const Matrix<-1, 3>& centre,
+                          const Matrix<-1, 4>& error, const Matrix<-1, 3>& moved) {
+  const size_t n = attitude.shape(0);
+  if (centre.shape(0) != n || error.shape(0) != n || moved.shape(0) != n)
+    throw std::invalid_argument("attitudes, centres and errors must be equally many");
+  double *turned, *placed;
+  Numpy qs = array({n, 4}, &turned), ps = array({n, 3}, &placed);
+  const State x = state(mean);
+  for (size_t k = 0; k < n; ++k) {
+    const Quad body = quad(attitude.data() + 4 * k), q = body * quad(x.q_bc) * quad(error.data() + 4 * k);
+    const V3 t = vector(centre.data() + 3 * k) + matrix(body) * vector(x.c_b) - matrix(q) * vector(moved.data() + 3 * k);
+    std::memcpy(turned + 4 * k, &q, sizeof q);
+    std::memcpy(placed + 3 * k, t.x, sizeof t.x);
+  }
+  return nb::make_tuple(qs, ps);
+}
+
 // Of the components of a mixture: charts, references and P (n, 20, 20) h seconds later and corrected by a pose, and the
 // chi-square of the pose with the log determinant of its covariance (n).
 nb::tuple carry_of(const Matrix<-1, CHART>& from, const Matrix<-1, CHART>& along, const Matrix<-1, DIM, DIM>& P0, double h,
@@ -692,6 +711,8 @@ NB_MODULE(_motion, m) {
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
   m.def("without_drift", &without_drift, nb::arg("chart"), nb::arg("u"), nb::arg("onset"), nb::arg("times"), nb::arg("centre"),
         nb::arg("q"), nb::arg("t"), nb::arg("back"));
+  m.def("corrected_poses", &corrected_poses, nb::arg("x"), nb::arg("attitude"), nb::arg("centre"), nb::arg("error"),
+        nb::arg("moved"));
   m.def("roots", &roots_of, nb::arg("C"));
   m.def("above", &above_of, nb::arg("P"), nb::arg("least"));
   m.def("impulses", &impulses, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"),
