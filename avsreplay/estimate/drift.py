@@ -92,12 +92,12 @@ def find_drift(
     if not frame.u.any() or (known is not None and best.log_odds < _FOUND):
         return None
     if known is None:
+        if poor_fit(frame, factors, levels) or _odds(best, frame, free) < _FOUND:
+            return None
         nearer = yield from fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
         free = min(free, nearer, key=lambda f: f.cost)
         yield _size(free)
-        # Laplace's approximation about each minimum: a linear problem about one of them does not reach the other
-        odds = best.log_odds - best.gain + (free.cost - frame.cost) / best.noise
-        if poor_fit(frame, factors, levels) or min(odds, free.cost - frame.cost) < _FOUND:
+        if _odds(best, frame, free) < _FOUND:
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
         if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
@@ -241,6 +241,15 @@ def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Arra
         likely = [(scale * unknown, size / scale) for scale in _SCALES]
     yield BUDGET // 2
     return disturbed_likelihood(points, coarse, levels, kinds, likely)
+
+
+def _odds(best: _Found, frame: DrivenFit, free: DrivenFit) -> float:
+    """Log odds of a drift by Laplace's approximation about the minimum with it and that of free motion.
+
+    A linear problem about one of them does not reach the other. The odds are at most the decrease of the cost.
+    """
+    decrease = free.cost - frame.cost
+    return min(best.log_odds - best.gain + decrease / best.noise, decrease)
 
 
 def _cost(frame: DrivenFit, poses: Poses) -> float:
