@@ -95,10 +95,10 @@ class Monitors:
             track: estimate after the scan.
             belief: what is published of it.
         """
-        healthy = innovation if gamma else None
+        healthy, seen = innovation if gamma else None, self.consistency.observe(state.consistency, innovation, gamma)
         motion, gramian = self._gramian(state, estimator, prior, healthy, track)
-        rank, consistency = monitor.measure(gramian), self.consistency.observe(state.consistency, innovation, gamma)
-        window, found = self.consistency.judge(consistency), healthy and estimator.residual_after(track, prior, healthy)
+        rank, window = monitor.measure(gramian), self.consistency.judge(seen, max(track.levels.common))
+        found = estimator.residual_after(track, prior, healthy) if healthy else None
         failed = violations(track.belief, *found) if found else ()
         consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
         forecast = estimator.track_forecast(track, self.convergence.times_s)
@@ -118,7 +118,7 @@ class Monitors:
             unconverged=judged.unknown,
             forecast=forecast,
         )
-        return MonitorState(gramian, consistency, judged, state.violations + len(failed), motion), report
+        return MonitorState(gramian, seen, judged, state.violations + len(failed), motion), report
 
     def _gramian(
         self, state: MonitorState, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from avsreplay.monitor.convergence import Consistency, ConsistencyParams, mean_band, violations
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams, ConsistencyTrack, mean_band, violations
 from avsreplay.records import Belief, Innovation, State
 
 STRICT = ConsistencyParams(slack=1.0)
@@ -49,6 +49,31 @@ def test_an_over_confident_filter_is_detected_and_a_conservative_one_is_accepted
     cautious = watch(*draws(0, factor=0.5))
     assert cautious.consistent
     assert cautious.nis_mean < cautious.band[0]
+
+
+def test_a_small_error_that_all_innovations_share_is_inconsistent() -> None:
+    """0.8 standard deviations along one axis: the mean NIS is 6.6, inside its band, the sum of 50 is 5.7 of its own."""
+    shifted, held = 0, 0
+    for seed in range(40):
+        alphas, S = draws(seed)
+        off = 0.8 * np.linalg.cholesky(S)[:, 0]
+        verdict = watch(alphas + off, S)
+        shifted += verdict.nis_mean < verdict.band[1] and not verdict.consistent
+        held += bool(watch(alphas, S).consistent)
+    assert shifted >= 20
+    assert held == 40
+
+
+def test_errors_that_near_views_have_in_common_shift_the_innovations_without_an_error_of_the_estimate() -> None:
+    wrong, allowed, n, share = 0, 0, 50, 0.1
+    for seed in range(40):
+        alphas, S = draws(seed, n=n + 1)
+        alphas = np.sqrt(1.0 - share) * alphas[1:] + np.sqrt(share) * alphas[0]
+        track = ConsistencyTrack(np.linalg.solve(np.linalg.cholesky(S), alphas.T).T, share)
+        wrong += Consistency(STRICT).judge(track, 0.0).consistent is False
+        allowed += Consistency(STRICT).judge(track).consistent is not False
+    assert wrong > 5
+    assert allowed >= 39
 
 
 def test_correlated_innovations_are_seen() -> None:

@@ -16,9 +16,11 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
+from avsreplay.monitor.chi_square import mean_band
 from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
+_BY_CHANCE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom
 _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
@@ -135,30 +137,6 @@ class ConvergenceParams(Settings):
         }
 
 
-def mean_band(dof: int, count: int, level: float) -> tuple[float, float]:
-    """Two-sided band of the mean of ``count`` > 2 / ``dof`` chi-square values of ``dof`` degrees of freedom each."""
-    a, tail = 0.5 * dof * count, 0.5 * (1.0 - level)
-    return 2.0 * _gamma_quantile(a, tail) / count, 2.0 * _gamma_quantile(a, 1.0 - tail) / count
-
-
-def _gamma_quantile(a: float, p: float) -> float:
-    """The x with P(a, x) = p, a > 1, P the regularised incomplete gamma function by its series.
-
-    Newton's method from the mode, the point of inflection, approaches x from one side. SciPy's takes 0.3 s to import.
-    """
-    x, step = a - 1.0, math.inf
-    while abs(step) > 1e-9 * x:  # the error of the next x is of second order
-        k, term, total = a, 1.0 / a, 1.0 / a
-        while term > 1e-17 * total:
-            k += 1.0
-            term *= x / k
-            total += term
-        density = math.exp((a - 1.0) * math.log(x) - x - math.lgamma(a))
-        step = p / density - x * total
-        x += step
-    return x
-
-
 def block_1s(P: Array) -> dict[str, float]:
     """Root of the trace of each block of P (20, 20), in its own units (half angles)."""
     variances = P.diagonal().tolist()
@@ -206,10 +184,12 @@ def violations(
 class ConsistencyTrack:
     """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first.
 
-    Each has its Cauchy weight, and the length that its NIS has as a chi-square value.
+    Each has its Cauchy weight, and the length that its NIS has as a chi-square value. ``share`` is the claimed part of
+    the variance of the last pose that near views have in common.
     """
 
     white: Array
+    share: float = 0.0
 
 
 @value_class(eq=True)
@@ -217,7 +197,8 @@ class ConsistencyReport:
     """The window in numbers, None before there are enough scans.
 
     Attributes:
-        consistent: the mean NIS is not above its band.  nis_mean: mean NIS.  band: its two-sided chi-square band.
+        consistent: neither the mean NIS nor the sum of the innovations is above its band.
+        nis_mean: mean NIS.  band: its two-sided chi-square band.
         autocorrelation: of the whitened innovations one healthy epoch apart, 0 where white.
     """
 
@@ -255,12 +236,18 @@ class Consistency:
         share = innovation.weight * (innovation.chi2 / innovation.nis if innovation.nis > 0.0 else 1.0)
         white = np.sqrt(share) * np.linalg.solve(np.linalg.cholesky(innovation.S), innovation.alpha)
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
-        return ConsistencyTrack(frozen(np.vstack([kept, white])))
+        return ConsistencyTrack(frozen(np.vstack([kept, white])), innovation.share)
 
-    def judge(self, track: ConsistencyTrack) -> ConsistencyReport:
-        """Test the window. Only a mean NIS above its band (times the slack) is inconsistent.
+    def judge(self, track: ConsistencyTrack, common: float = 1.0) -> ConsistencyReport:
+        """Test the window: a mean NIS above its band (times the slack) is inconsistent.
 
-        A mean below the band results from a covariance that is too large, which is safe.
+        A mean below the band results from a covariance that is too large, which is safe. A sum of the innovations that
+        is not zero by chance is inconsistent as well: an error of the estimate that is small beside that of one pose
+        shifts all innovations alike. Errors that the poses have in common enlarge the variance of the sum.
+
+        Args:
+            track: the window.
+            common: estimated factor on the variance that near views have in common.
         """
         n = len(track.white)
         if n < self.params.least:
@@ -268,7 +255,9 @@ class Consistency:
         band = self._band(n)
         mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
         lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
-        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag)
+        total, alike = track.white.sum(axis=0), min(common * track.share, 1.0)
+        centred = float(total @ total) <= _BY_CHANCE * n * (1.0 + (n - 1) * alike)
+        return ConsistencyReport(centred and mean <= self.params.slack * band[1], mean, band, lag)
 
     def _band(self, n: int) -> tuple[float, float]:
         if n not in self._bands:
