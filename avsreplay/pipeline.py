@@ -189,7 +189,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         The state after the scan and the outcome of the scan.
     """
     state, track, acquired = _track(stages, state, scan)
-    predicted = stages.estimator.predict(track, scan.t_ns)
+    errors, predicted = track.errors, stages.estimator.predict(track, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
     prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
@@ -197,8 +197,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         measurement = _acquire(stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired")
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
     track, verdict = stages.estimator.step(track, prior, innovation, verdict, state.monitors.convergence.converged)
-    gamma, belief = verdict.gamma, stages.estimator.published(track)
-    seen = innovation, gamma, track, belief
+    gamma, used = verdict.gamma, measurement.alignment if verdict.gamma else None
+    track = track.changed(errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor))
+    seen = innovation, gamma, track, (belief := stages.estimator.published(track))
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
@@ -329,8 +330,7 @@ def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, f
     """Return the predicted target after a belief, as the planner uses it: estimate and forecast, never the truth."""
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
-        predicted = forecast(times_s)
-        return predicted.pos_1s_m, predicted.rot_1s_rad
+        return (predicted := forecast(times_s)).pos_1s_m, predicted.rot_1s_rad
 
     return Scene(
         goal=estimator.motion(belief),

@@ -28,9 +28,7 @@ BLOCKS: Mapping[str, slice] = {
     "mu": slice(17, 20),  # dmu_v, half angle, {B}
 }  # the 20 error states by name, in the order of every covariance
 _SIZES = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}  # parts of a state
-_STATE = {
-    name: (end - size, end) for (name, size), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)
-}
+_STATE = {name: (end - n, end) for (name, n), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)}
 
 
 class ScanStatus(Enum):
@@ -235,9 +233,9 @@ class Alignment:
     Attributes:
         T_ac: measured; ICP iterates its inverse.  well_off: of 1,000 points, those over two gates from the model.
         info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
-        covariance: (6, 6) of d, systematic errors included; None if degenerate.  dof: of this estimate, inf if known.
+        covariance: (6, 6) of d; None if degenerate.  dof: of it.  systematic: its part from errors of model and ranges.
         message: why it failed or is not accepted.  free_directions: not determined, in words; free: columns d (6, k).
-        split_nis: of the poses of halves of the scan, see ``quality``.  size_1s: error of the size, until it is fitted.
+        split_nis, size: see ``quality``; with the 1 sigma of the size.  size_1s: error of the size, until it is fitted.
     """
 
     T_ac: Pose
@@ -256,6 +254,8 @@ class Alignment:
     free: Array | None = None
     well_off: int = 0
     size_1s: float | None = None
+    systematic: Array | None = None
+    size: tuple[float, float] | None = None
 
     @property
     def measured(self) -> bool:

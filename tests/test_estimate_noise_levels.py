@@ -12,9 +12,9 @@ from avsreplay import geometry
 from avsreplay.estimate.batch import Problem
 from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import to_chart
+from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, line_of_sight_1s
 from avsreplay.estimate.disturbance_density import density_in_use
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
-from avsreplay.estimate.noise import line_of_sight_1s
 from avsreplay.estimate.noise_levels import (
     MOST_POINTS,
     NO_LEVELS,
@@ -152,7 +152,7 @@ def test_normal_points_know_the_noise_within_them() -> None:
 
 def test_the_common_error_lies_along_the_line_of_sight() -> None:
     at, R = np.array([0.0, 3.0, 4.0]), np.diag([1.0, 4.0, 9.0])
-    b = line_of_sight_1s(at, R, 0.5)
+    b = line_of_sight_1s(at, 0.5 * R, NO_MODEL_ERRORS)
     assert b / np.linalg.norm(b) == pytest.approx(at / 5.0)
     assert b @ b == pytest.approx(0.25 * (0.36 * 4.0 + 0.64 * 9.0))
-    assert not line_of_sight_1s(np.zeros(3), R, 0.5).any()
+    assert not line_of_sight_1s(np.zeros(3), 0.5 * R, NO_MODEL_ERRORS).any()

@@ -18,6 +18,7 @@ from avsreplay.estimate.acceleration import accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD
+from avsreplay.estimate.common_errors import ModelErrors, motion_covariance
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast, propagated
 from avsreplay.estimate.error_state import RHO, semidefinite
@@ -43,7 +44,6 @@ from avsreplay.estimate.track import (
     Track,
     common_1s,
     common_motions,
-    motion_covariance,
     turned,
     undetermined,
 )
@@ -63,8 +63,7 @@ class Estimator:
             params: settings; lengths left out are taken from ``extent_m``.
             start: the first belief where one is given.
             extent_m: the target's bounding diagonal [m].
-            epoch_ns: instant at which the falling frame of a known acceleration coincides with {A}, and to which the
-                directions of a relative orbit belong: that of the first scan.
+            epoch_ns: of the first scan: the falling frame then coincides with {A}; directions of an orbit belong to it.
             centre_c: (3,) centre of the target's bounding box in {C} [m]; the paper's method does not use it.
 
         Raises:
@@ -96,11 +95,10 @@ class Estimator:
         """
         if self.start is not None:
             return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
-        T_ac = self.frame.pose_into(T_ac, t_ns)
+        belief = guessed_belief(t_ns, self.frame.pose_into(T_ac, t_ns), self.params)
         mode = "filter" if self.params.start is Start.PAPER else "start"
-        belief, any_motion = guessed_belief(t_ns, T_ac, self.params), np.eye(6)
-        unknown = common_motions(any_motion, any_motion if acquired else None, self._length_m)
-        return Track(belief, mode, started_ns=t_ns, undetermined=unknown)
+        unknown = common_motions(np.eye(6), np.eye(6) if acquired else None, self._length_m)
+        return Track(belief, mode, started_ns=t_ns, undetermined=unknown, errors=ModelErrors(kept=mode != "filter"))
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
@@ -113,7 +111,7 @@ class Estimator:
             UsageError: the instant is too far from the last scan to predict the rotation.
         """
         belief, Phi = self.batch.predicted(track, t_ns)
-        return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
+        return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window, counted=track.errors.counted)
 
     def determined(self, track: Track, prediction: Prediction, alignment: Alignment) -> tuple[Track, Prediction]:
         """The track before a scan and its prediction, turned if its pose first determines a rotation of the model.
@@ -139,7 +137,7 @@ class Estimator:
         """
         x, alignment = prediction.belief.x, self.frame.alignment_into(alignment, prediction.belief.t_ns)
         R, dof = self.noise.of(alignment, x, prediction.window), self.noise.dof(alignment)
-        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
+        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment, prediction.counted)
         found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
         return replace(found, rms_m=alignment.rms_m, free=alignment.free)
 
@@ -156,7 +154,7 @@ class Estimator:
             converged: t_1 was reached at the last scan.
 
         Returns:
-            The track, and the verdict with gamma 0 and reason ``doubtful`` while a decision is pending.
+            The track, and the verdict: gamma 0 and reason ``doubtful`` while a decision is pending.
         """
         if innovation is None:
             return self.update(track, prediction, None, 0), verdict
@@ -182,8 +180,8 @@ class Estimator:
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise, self.frame.origin_c)
         turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
-        if track.undetermined.size:
-            turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(track.undetermined), 2))
+        if (motions := self._common_motions(track)).size:
+            turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(motions), 2))
             turn, position = np.hypot(turn, turns), np.hypot(position, moves)
         return Forecast(found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD))
 
@@ -253,6 +251,9 @@ class Estimator:
     def _common_1s(self, track: Track) -> Array:
         return common_1s(track, self.frame.position_out(track.belief.x.r_a, track.belief.t_ns))
 
+    def _common_motions(self, track: Track) -> Array:
+        return np.hstack([track.undetermined, self.frame.motions_into(track.errors.motions)])
+
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
         old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
@@ -293,15 +294,14 @@ class Estimator:
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that the filter does not carry.
 
-        Later poses do not reduce the error of the position along the line of sight that all poses may have in common,
-        nor motions of the model that no healthy scan determines, such as the rotation of a body of revolution about its
-        axis. Later poses decide on a change of the velocities that the last scans make possible.
+        Later poses do not reduce errors that all poses may have in common, nor motions of the model that no scan
+        determines (bodies of revolution). They decide on a change of the velocities that the last scans make possible.
 
         Args:
             track: after a scan.
         """
         belief, b = track.belief, self._common_1s(track)
-        P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc) + track.change_P
+        P = belief.P + motion_covariance(self._common_motions(track), belief.x.q_bc) + track.change_P
         P[RHO, RHO] += np.outer(b, b)
         return self.frame.belief_out(replace(belief, P=P))
 

@@ -78,17 +78,23 @@ class EstimatorFrame:
         if not self.shifted:
             return replace(alignment, T_ac=T_ac)
         into, out, C, free = self._into, self._out, alignment.covariance, alignment.free
+        part = alignment.systematic
         return replace(
             alignment,
             T_ac=T_ac,
             info=out.T @ alignment.info @ out,
             covariance=None if C is None else into @ C @ into.T,
+            systematic=None if part is None else into @ part @ into.T,
             free=None if free is None else into @ free,
         )
 
     def instants_into(self, instants: Array) -> Array:
         """Convert the mean instants (6, 6) [s] by directions of {C} to those by directions of {C'}."""
         return self._into @ instants @ self._out if self.shifted else instants
+
+    def motions_into(self, motions: Array) -> Array:
+        """Convert motions d = [theta; v] of {C} (6, k) to those of {C'}."""
+        return self._into @ motions if self.shifted and motions.size else motions
 
     def motions_out(self, motions: Array) -> Array:
         """Convert motions d = [theta; v] of {C'} (6, k) to those of {C}."""

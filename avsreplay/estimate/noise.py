@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from avsreplay.errors import value_class
+from avsreplay.estimate.common_errors import systematic_share
 from avsreplay.estimate.measurement import registration_noise, residual
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
 from avsreplay.geometry import Array, frozen
@@ -29,7 +30,7 @@ _ONES = frozen(np.ones(6))
 _FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
 _LEVEL_DOF = 10.0  # degrees of freedom with which the level of the last fit counts in the window
-_LINE_OF_SIGHT = 0.5  # variance of an error that all views have in common over that of the common errors
+_MOST_COMMON = 0.8  # largest share from errors of the model: the views of two scans differ
 _LAGS = (5, 10, 20, 40)
 _EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
 _MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
@@ -203,23 +204,6 @@ def cholesky_root(C: Array) -> Array:
     raise ValueError("the covariance of the window is not finite")
 
 
-def line_of_sight_1s(x_position: Array, R: Array, share: float) -> Array:
-    """(3,) 1 sigma, along the line of sight, of an error of the position that all views have in common [m].
-
-    No residual shows such an error: the same offset of all poses is the same motion elsewhere.
-
-    Args:
-        x_position: (3,) of the fixture in {A} [m].
-        R: (3, 3) covariance of a measured position in {A} [m^2].
-        share: part of the variance of the position that near views have in common.
-    """
-    distance = float(np.linalg.norm(x_position))
-    if distance == 0.0:
-        return np.zeros(3)
-    u = x_position / distance
-    return np.asarray(u * np.sqrt(_LINE_OF_SIGHT * share * float(u @ R @ u)))
-
-
 class Noise:
     """R (6, 6) [m, half-angle] of a measured pose.
 
@@ -264,17 +248,22 @@ class Noise:
         """How many eigenvalues of R lie on the floor."""
         return at_floor(R, self._R0, self.params.r_floor)
 
-    def correlated_share(self, alignment: Alignment) -> float:
+    def correlated_share(self, alignment: Alignment, counted: float = 0.0) -> float:
         """The share of R, from 0 to 1, that poses from nearly the same view have in common.
 
         The variance from independent errors of the points falls with the number of inliers; that from the bias of
         points near edges does not. Their ratio is K inliers (rms / extent)^2, whatever the target's size. K was fitted
-        to simulated scans of five meshes.
+        to simulated scans of five meshes. Errors of the model are common to near views as well.
+
+        Args:
+            alignment: of the scan.
+            counted: how far its systematic errors count, from 0 to 1 (``ModelErrors.counted``).
         """
         if self.params.correlated_share is not None:
             return self.params.correlated_share
         lean = _EDGE_LEAN * alignment.inliers * (alignment.rms_m / self._extent_m) ** 2
-        return lean / (1.0 + lean)
+        edges = lean / (1.0 + lean)
+        return max(edges, min(counted * systematic_share(alignment), _MOST_COMMON)) if counted else edges
 
     def inflation(self, known: Array | None, mean: float, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
         """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.

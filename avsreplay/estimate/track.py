@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Prior
+from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, ModelErrors, line_of_sight_1s
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
-from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
-from avsreplay.estimate.noise import NoiseWindow, line_of_sight_1s
+from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
@@ -92,6 +92,7 @@ class Track:
         undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines, each
             as large as half the extent: 1 sigma.
         change_probability, change_P: of a change of the velocities in the last scans, and what it adds to P (20, 20).
+        errors: of the model and of the ranges, as the healthy scans so far show them.
     """
 
     belief: Belief
@@ -126,6 +127,7 @@ class Track:
     undetermined: Array = field(default_factory=lambda: _NO_MOTION)
     change_probability: float = 0.0
     change_P: Array = field(default_factory=lambda: NO_CHANGE)
+    errors: ModelErrors = NO_MODEL_ERRORS
 
     def changed(self, **values: Any) -> Track:
         """Return a copy with other values: ``dataclasses.replace``, faster for so many fields.
@@ -198,17 +200,10 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
 
 def common_1s(track: Track, r_a: Array) -> Array:
     """Return the 1 sigma (3,) in {A} [m] of the error along the line of sight to ``r_a`` (3,) that all poses have."""
-    if track.batch is None or track.batch.share == 0.0 or track.batch.position_m2 is None:
-        return np.zeros(3)
-    share = track.levels.common[1] * track.batch.share
-    return line_of_sight_1s(r_a, track.batch.position_m2, share)
-
-
-def motion_covariance(d: Array, q_bc: Array) -> Array:
-    """Return the covariance (20, 20) of the state for independent motions d (6, k) of {C}, each with 1 sigma."""
-    R_bc, E = geometry.matrix(q_bc), np.zeros((20, d.shape[1]))
-    E[VARRHO], E[DMU] = R_bc @ d[3:], 0.5 * R_bc @ d[:3]
-    return np.asarray(E @ E.T)
+    batch, variance = track.batch, _NO_NOISE[:3, :3]
+    if batch is not None and batch.position_m2 is not None:
+        variance = track.levels.common[1] * batch.share * batch.position_m2
+    return line_of_sight_1s(r_a, variance, track.errors)
 
 
 @value_class
@@ -219,6 +214,7 @@ class Prediction:
         belief: prior mean and covariance.  Phi: (20, 20) of the step.  H: (6, 20) at the prior.
         window: the track's noise window.
         lag_s: mean measurement instant of the scan's points after the scan's instant [s].
+        counted: how far systematic errors of its pose count (``ModelErrors.counted``).
         blur: (6, 6) covariance in {C} of treating the pose as one of a single instant although its points were
             measured at many; None for zero.
     """
@@ -229,6 +225,7 @@ class Prediction:
     window: NoiseWindow
     lag_s: float = 0.0
     blur: Array | None = None
+    counted: float = 0.0
 
 
 def confirmed(track: Track) -> tuple[Manoeuvre, ...]:

@@ -52,7 +52,7 @@ __all__ = [
 ]  # fmt: skip
 
 POINTS = 1500  # points used of each scan
-_LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
+_LEAST_RUN_ERROR = 0.001  # least error of size that is reported; a single scan cannot show so small a one
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of size that would be reported
 BIAS_SCANS = 4  # scans on which the bias of the noise is found

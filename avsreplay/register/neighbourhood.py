@@ -116,15 +116,15 @@ class Neighbourhood:
 
         The covariance is enlarged by the change of the pose that a significant error of the size causes.
         """
-        P = found.covariance
-        if found.size_1s is None or P is None:
+        P, part = found.covariance, found.systematic
+        if found.size_1s is None or P is None or part is None:
             return found
         budget.spend(SIZE_WORK)
         T_ca, target = found.T_ac.inverse(), self._target
         size = size_error(target.index, scan, T_ca, target.visibility.camera_c(target.index, scan, T_ca))
         if size is not None and size.significant:
-            P = geometry.frozen(P + np.outer(size.shift, size.shift))
-        return replace(found, covariance=P, message=size_remark(size, found.size_1s), size_1s=None)
+            P, part = (geometry.frozen(C + np.outer(size.shift, size.shift)) for C in (P, part))
+        return replace(found, covariance=P, systematic=part, message=size_remark(size, found.size_1s), size_1s=None)
 
     def of_one(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
         """Return the alignment of a scan (n, 3) in {A}, not accepted if the view shows faces of many bodies.

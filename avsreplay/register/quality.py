@@ -53,7 +53,8 @@ class PoseQuality:
         overlap, observable: there are enough inliers; they determine every motion.
         bounded: the standard deviations are below the extent and 1 rad.
         beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
-        covariance, dof: (6, 6) and its degrees of freedom.  split_nis: the test of halves, NaN where it was not made.
+        covariance, systematic: (6, 6) and the part of it from systematic errors.  dof: its degrees of freedom.
+        split_nis: the test of halves, NaN where it was not made.
         size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates away.
         patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
     """
@@ -71,6 +72,7 @@ class PoseQuality:
     bounded: bool
     beyond: bool
     covariance: Array
+    systematic: Array
     dof: float
     split_nis: float
     size: float
@@ -197,6 +199,8 @@ def grade(
         free=free if weakest else None,
         well_off=found.well_off,
         size_1s=found.size_1s if fitted else None,
+        systematic=frozen(found.systematic) if P is not None and systematic else None,
+        size=(found.size, found.size_1s) if P is not None and systematic else None,
     )
 
 

@@ -252,7 +252,7 @@ class Index {
     auto centre = array<double>({3}, &c);
     std::memcpy(c, g.centre, sizeof g.centre);
     return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
-                          g.observable, g.bounded, g.beyond, array66(g.covariance.P), g.covariance.dof, g.split,
+                          g.observable, g.bounded, g.beyond, array66(g.covariance.P), array66(g.covariance.systematic), g.covariance.dof, g.split,
                           g.size[0], g.size[1], g.well_off, patches(g.patches));
   }
 

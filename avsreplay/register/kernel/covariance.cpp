@@ -334,6 +334,8 @@ Estimated covariance(const PatchTable& t, const Systematic& errors, const std::v
   effect.add_to(errors, P);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) out.systematic.v[i][j] = P.v[i][j] - random.v[i][j];
   out.dof *= diluted(random, P);
   return out;
 }

@@ -44,10 +44,11 @@ struct Systematic {
 // is none. Stops, with `keep` as it was, where too few points would be left. `all`: of the sum of all normals.
 void drop_dominant(const double* normals, const int64_t* counts, int64_t m, const Inverted& all, uint8_t* keep);
 
-// A covariance and the degrees of freedom of the estimate.
+// A covariance, the degrees of freedom of the estimate, and the part of the covariance from systematic errors.
 struct Estimated {
   Six P;
   double dof = 0;
+  Six systematic = {};
 };
 
 // P = sum over the patches p of m_p m_p', m_p = N^+ ((1 + ALONE) I - N_p N^+)^-1 g_p with N the sum of all N_p.
