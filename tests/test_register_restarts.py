@@ -102,6 +102,22 @@ def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
     assert (len(calls), len(restarts)) == (2, 0)
 
 
+@pytest.mark.parametrize(("noise", "wrong", "rough"), [(0.002, 0.0, False), (0.015, 0.0, True), (0.002, 0.6, False)])
+def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise, wrong, rough):
+    """All points are needed for a close fit, and to tell outliers from the surface."""
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(6)
+    registrar, scan = Registrar(surface), seen(surface, T_ac, noise, rng)
+    spread = rng.random(len(scan)) < wrong
+    scan[spread] = scan.mean(axis=0) + 0.6 * surface.extent * rng.uniform(-1.0, 1.0, (int(spread.sum()), 3))
+    guess = near(T_ac, 1.0, 0.003 * surface.extent).inverse()
+    found, whole = registrar._backend.align_roughly(scan, guess), registrar._backend.align(scan, guess)
+    assert whole.converged
+    assert found.converged is not rough
+    assert (found.T_ca.matrix.tobytes() == whole.T_ca.matrix.tobytes()) is not rough
+    assert rough is (found.work < 0.5 * whole.work)
+    assert registrar.register(scan, guess.inverse()).status is AlignStatus.ALIGNED
+
+
 def test_the_size_is_fitted_for_the_pose_that_is_returned(monkeypatch):
     """Half of the points are far away: two alignments are graded, and the size is fitted to the second only."""
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(5)

@@ -138,6 +138,7 @@ class Index:
         newton: bool = False,
         few: int = 0,
         most_work: int = ...,
+        poor_m: float = 0.0,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
         self,

@@ -37,6 +37,7 @@ TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
+ROUGH_OF_GATE = 0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
 HEALTHY_WORK, HEALTHY_PASSES = 17_000, 2.5  # an ordinary registration: point searches in all, and besides per point
 FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
@@ -116,6 +117,8 @@ class HornBackend:
             threads=limits.threads,
         )
         self._rules = {facing: replace(rule, facing=facing) for facing in (False, True)}
+        poor_m = ROUGH_OF_GATE * limits.gate_m
+        self._rough = {facing: replace(rule, poor_m=poor_m) for facing, rule in self._rules.items()}
         passes = min(CLOUD_PLANE_PASSES, limits.n_max)
         self._more_plane = {facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()}
 
@@ -126,6 +129,10 @@ class HornBackend:
             return found
         other = self._run(points, guess, self._more_plane)
         return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
+
+    def align_roughly(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """Return T_ca as :meth:`align`; of a part of the scan, not converged, if that shows that no fit is close."""
+        return self.align(points, guess) if self._cloud else self._run(points, guess, self._rough)
 
     def _cost(self, points: NDArray[Any], T_ca: Pose) -> float:
         sums = self._index.normal_equations(points, T_ca, self._gate)
@@ -277,7 +284,7 @@ def _state(name: str) -> Availability:
 
 
 def aligned(
-    name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None, most_work: int
+    name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None, most_work: int, rough: bool
 ) -> Fit | str:
     """Run a back end. An exception, or a result of a wrong type, is returned as the text of a failure.
 
@@ -288,11 +295,13 @@ def aligned(
         guess: T_ca to begin with.
         width_m: rejection distance from the first pass on [m], for a back end with ``align_within``; None for its own.
         most_work: point searches after which it ends, for a back end with ``align_within`` and a given ``width_m``.
+        rough: without ``width_m``, align with ``align_roughly`` where the back end has it.
     """
     within = None if width_m is None else getattr(backend, "align_within", None)
     rule = {"near": True, "most_work": most_work}
     try:
-        fit = backend.align(scan, guess) if within is None else within(scan, guess, width_m, **rule)
+        align = getattr(backend, "align_roughly", backend.align) if rough else backend.align
+        fit = align(scan, guess) if within is None else within(scan, guess, width_m, **rule)
         if not isinstance(fit, Fit):
             return f"back end '{name}' returned {type(fit).__name__}, not Fit"
         finite = bool(np.isfinite(fit.T_ca.matrix).all())

@@ -94,7 +94,7 @@ class Registrar:
             return refused
         halves = seq % self.params.split_every == 0
         budget = Budget(len(scan), effort)
-        first = self._graded(scan, guess, budget, None, halves, carried)
+        first = self._graded(scan, guess, budget, None, halves, carried, rough=True)
         if first.status is AlignStatus.FAILED:
             return first
         sound = self._restarter.sound(scan, first, budget)
@@ -324,16 +324,18 @@ class Registrar:
         width_m: float | None,
         halves: bool,
         carried: bool,
+        rough: bool = False,
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers.
 
         A close fit that is not at a minimum before the last pass that is allowed is registered once more from there.
+        ``rough``: a part of the scan suffices where it shows that the fit is not close; it is then not converged.
         """
         start = T_ca = guess.inverse()
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         options = (self.params, halves, self._accuracy, not carried, start)
         for last in (budget.brief, True):
-            fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left)
+            fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left, rough and not last)
             if isinstance(fit, str):
                 return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
             found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)

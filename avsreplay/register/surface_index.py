@@ -57,6 +57,7 @@ class IcpParams(Settings):
     threads: int = setting(1, "Largest number of threads; no result depends on it.", low=1, high=1024)
     facing: bool = setting(False, "Match only faces that face the camera (origin of {A}); needs outward faces.")
     few: int = setting(0, "Points of the scan with which a much larger scan is aligned first; 0: none.", low=0)
+    poor_m: float = setting(0.0, "End with them where their rms is larger, and few are off.", unit="m", low=0.0)
     keep: bool = setting(True, "Keep a correspondence while it provably cannot change; does not change a result.")
 
     def check(self) -> None:
@@ -234,7 +235,7 @@ class SurfaceIndex:
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        flags = (params.threads, params.keep, params.facing, params.newton, params.few, most_work)
+        flags = (params.threads, params.keep, params.facing, params.newton, params.few, most_work, params.poor_m)
         return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
 
     def normal_equations(

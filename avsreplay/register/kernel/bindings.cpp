@@ -172,12 +172,12 @@ class Index {
 
   nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
                 double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing, bool newton,
-                int64_t few, int64_t most_work) const {
+                int64_t few, int64_t most_work, double poor) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
     require(few == 0 || few >= 6, "a part of the scan must have at least 6 points");
-    const Rule rule{n_max, n_plane, few, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton, most_work};
+    const Rule rule{n_max, n_plane, few, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton, most_work, poor};
     Outcome o;
     Matches matches;
     {
@@ -664,7 +664,7 @@ NB_MODULE(_kernel, m) {
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
            nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false,
-           nb::arg("few") = 0, nb::arg("most_work") = std::numeric_limits<int64_t>::max())
+           nb::arg("few") = 0, nb::arg("most_work") = std::numeric_limits<int64_t>::max(), nb::arg("poor_m") = 0.0)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
       .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),

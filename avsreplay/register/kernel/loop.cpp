@@ -258,6 +258,8 @@ class Passes {
 // Length of the first step over all points that is expected after the passes over few, in units of the error of a mean.
 constexpr double FEW_MOVE = 3.0, FEW_TURN = 12.0;
 constexpr int64_t SHARE = 4;  // the few points are at most one in four of a scan
+// With a smaller share of the few points near the model some are outliers, which only passes over all points tell from it.
+constexpr double LEAST_ROUGH = 0.8;
 
 }  // namespace
 
@@ -309,6 +311,7 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
     if (good) {
       plane = false;
       const double error = passes.error();
+      if (rule.poor > 0 && o.rms > rule.poor && (double)o.inliers >= LEAST_ROUGH * (double)size) return o;
       o.turn = std::max(o.turn, FEW_TURN * error / s.extent), o.move = std::max(o.move, FEW_MOVE * error);
     } else {
       begin();

@@ -13,6 +13,7 @@ struct Rule {
   double gate, tighten, floor, eps_rad, eps_m;
   bool facing, keep, newton;
   int64_t most_work;  // after the pass that reaches it the loop ends, not converged
+  double poor;        // with a larger rms distance after the passes over few points it ends there; 0: never
 };
 
 // In point searches. An ordinary one moves a point and compares about two blocks, which is 4/3 of this unit.
@@ -47,7 +48,7 @@ void copy_point(const View& points, int64_t k, double* p);
 Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);
 // T: rows of [R t], scan into {C}. A scan of at least twice `rule.few` points is first aligned by that many of its points,
 // or by one in four if these are fewer, until a step is below the error that so few points leave; then all of its points
-// go to the fixed point.
+// go to the fixed point, unless the rms distance of the part is poor.
 Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team,
             Matches& matches);
 
