@@ -124,15 +124,15 @@ class HornBackend:
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
-        found = self._run(points, guess, self._rules)
+        found = self._run(points, guess, self._rules.__getitem__)
         if not self._cloud:
             return found
-        other = self._run(points, guess, self._more_plane)
+        other = self._run(points, guess, self._more_plane.__getitem__)
         return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
 
     def align_roughly(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca as :meth:`align`; of a part of the scan, not converged, if that shows that no fit is close."""
-        return self.align(points, guess) if self._cloud else self._run(points, guess, self._rough)
+        return self.align(points, guess) if self._cloud else self._run(points, guess, self._rough.__getitem__)
 
     def _cost(self, points: NDArray[Any], T_ca: Pose) -> float:
         sums = self._index.normal_equations(points, T_ca, self._gate)
@@ -156,16 +156,17 @@ class HornBackend:
         """
         rule = self._rules[False]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
-        within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        rules = {facing: replace(within, facing=facing) for facing in (False, True)}
-        return self._run(points, guess, rules, max(1, min(most_work, _most(WITHIN_WORK, len(points)))))
+        within: dict[str, Any] = {"n_max": most, "n_plane": plane, "few": few, "tighten": 0.0}
+        within.update(gate_m=gate_m, floor_m=gate_m)
+        most_work = max(1, min(most_work, _most(WITHIN_WORK, len(points))))
+        return self._run(points, guess, lambda facing: replace(self._rules[facing], **within), most_work)
 
-    def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams], most_work: int = 0) -> Fit:
+    def _run(self, points: NDArray[Any], guess: Pose, rules: Callable[[bool], IcpParams], most_work: int = 0) -> Fit:
         """Align with one of the rules; ``most_work`` point searches at most, 0: those of an alignment."""
         most = most_work or _most(ALIGN_WORK, len(points))
 
         def align(start: Pose, facing: bool) -> Fit:
-            found = self._index.icp(points, start, rules[facing], most)
+            found = self._index.icp(points, start, rules(facing), most)
             return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches, found.work)
 
         return self._visibility.consistent(self._index, points, guess, align)

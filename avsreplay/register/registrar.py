@@ -166,15 +166,16 @@ class Registrar:
 
         Also returned: whether the points off the model are another object's: far away, or the visible side is complete.
         """
-        few = self._restarter.part(part)
-        start = self._restarter.measure(few, search.best)
-        if start.noise_m > restarts.HOPELESS * self.index.extent_m:
+        start = self._restarter.measure(few := self._restarter.part(part), search.best)
+        away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
+        sure, p = away or search.inlier_ratio >= self.params.acquire.least_ratio, self.params.acquire
+        spread = start.noise_m > restarts.HOPELESS * self.index.extent_m or search.inlier_ratio < p.least_separate
+        if spread or not (sure or self._test.check(few, search.best, self._restarter.part(scan)).covered):
             return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False
         found = self._regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
             return found, False
-        at, p = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)), self.params.acquire
-        away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
+        at = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan))
         alone = away or at.covered
         if search.inlier_ratio < (p.least_separate if alone else p.least_ratio) or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
@@ -278,7 +279,6 @@ class Registrar:
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
-        last = LAST_SCANS * healthy_work(len(scan))  # the best pose is registered once more
         work = self._symmetry.search_work(len(scan), 0) if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
@@ -288,7 +288,7 @@ class Registrar:
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
-            kept = last + (work if reason and step == "restart" and restart else 0)  # a search follows
+            kept = LAST_SCANS * healthy_work(len(scan)) + (work if reason and step == "restart" and restart else 0)
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._regraded(scan, few, before, budget, halves, carried)
