@@ -37,7 +37,7 @@ SHARED = 0.4  # of the rms distance; a correct pose of a correct model has less 
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
-COMPARED_WORK = 4 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about four times
+COMPARED_WORK = 6 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about six times
 HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise at the result of a search it is not registered to the whole scan
 
 
