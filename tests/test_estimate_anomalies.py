@@ -302,6 +302,20 @@ def test_a_small_bias_is_flagged_until_its_end(seed: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [21000, 21018])
+def test_a_bias_below_the_gate_of_a_single_scan_is_found(seed: int) -> None:
+    """Each scan with an offset of 1 cm would be accepted. Together they are those of a sensor error."""
+    case = surprises.Case("bias", at_s=45.0, until_s=60.0, bias=0.01, seconds=64.0)
+    result = surprises.run(case, seed)
+    first, after = result.t.index(45.0), result.t.index(60.0)
+    assert not any(result.gamma[first + 5 : after])
+    assert result.reason[after - 1] == "sensor_bias"
+    assert all(result.gamma[after + 2 :])
+    assert not any(c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True))
+    assert result.error[-1][0] < 0.005
+
+
+@pytest.mark.slow
 def test_a_push_during_a_bias_ends_the_claim_of_convergence() -> None:
     """The offset of 3 cm begins at once, so that no manoeuvre explains it; from the push on it grows."""
     case = surprises.Case("bias", at_s=45.0, bias=0.03, seconds=64.0)

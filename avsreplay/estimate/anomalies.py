@@ -52,6 +52,7 @@ _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decisio
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
+_STEPS = (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS)
 _DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)
 
 Replay = Callable[[Track, Epoch], tuple[Track, Epoch]]
@@ -96,7 +97,7 @@ class AnomalyTest:
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         window, ranked = self._explained(track, window, first)
         best = ranked[0].hypothesis
-        changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= OVER_FREE
+        changed = best in _STEPS and odds_over_free(ranked) >= OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free, window))
         disturbed = best in _DISTURBANCES and odds_over_free(ranked) >= OVER_FREE and ranked[0].explains

@@ -102,6 +102,7 @@ CASES = (
     Case("bias 3 cm from 60 s to the end", at_s=60.0, bias=0.03),
     Case("bias 5 cm from 40 to 55 s", at_s=40.0, until_s=55.0, bias=0.05),
     Case("bias 5 cm from 60 to 75 s", at_s=60.0, until_s=75.0, bias=0.05, seconds=100.0),
+    Case("bias 1 cm from 45 s to the end", bias=0.01),
     Case("bias 1.5 cm from 45 s to the end", bias=0.015),
     Case("noise x5 for 20 s", at_s=40.0, until_s=60.0, noise=5.0),
     Case("single outlier 0.1 m", at_s=45.0, until_s=45.4, bias=0.1),
