@@ -1,10 +1,11 @@
 """Processor time of the estimator's parts.
 
-``python tests/benchmarks/estimate_speed.py [--quick] [--scans] [--cases] [--long N]``. Each figure is the least of
-five repeats, so that other load on the machine matters little. ``--scans``: instead, the time of estimator and
+``python tests/benchmarks/estimate_speed.py [--quick] [--scans] [--cases] [--long N] [--log LOG]``. Each figure is the
+least of five repeats, so that other load on the machine matters little. ``--scans``: instead, the time of estimator and
 monitors scan by scan over whole runs with simulated poses, mean and largest, the least of three repeats of each scan.
-``--cases``: that of the estimator in cases of ``estimate_surprises.py``, the least of three runs. ``--long N``: as
-``--scans`` over a log of N scans at 10 Hz, by part of the log, for a tumbling body (the filter takes over), for a
+``--cases``: that of the estimator in cases of ``estimate_surprises.py``, the least of three runs. ``--log LOG``: that
+of estimator and monitors in replays of a log, the least of three repeats of each scan. ``--long N``: as ``--scans``
+over a log of N scans at 10 Hz, by part of the log, for a tumbling body (the filter takes over), for a
 spin about the axis of the largest moment (it stays with the fit), and for one about that of the middle moment. The
 last is unstable: the rounding of the simulated motion, 1e-18 rad/s, grows 18 times in 100 s and turns the body over
 after 1,200 s.
@@ -20,9 +21,10 @@ if __name__ == "__main__":
 import argparse
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import estimate_surprises as surprises
 import numpy as np
@@ -41,6 +43,7 @@ from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams
 from avsreplay.pipeline import Monitors
 from avsreplay.records import Alignment, Belief, ScanStatus
+from avsreplay.run import Job, Run
 
 
 def least(run: Callable[[], object], count: int) -> float:
@@ -190,6 +193,44 @@ def long_runs(scans: int, repeats: int) -> None:
             )
 
 
+def replay_ms(log: Path, assignments: Sequence[str], repeats: int) -> None:
+    """Mean and largest time of a scan of estimator and monitors in replays of a log."""
+    spent, inside = [0.0, 0.0], [False]
+
+    def timed(cls: type, name: str, place: int) -> None:
+        original = getattr(cls, name)
+
+        def found(*args, **named):
+            if inside[0]:
+                return original(*args, **named)
+            inside[0], begun = True, time.process_time()
+            try:
+                return original(*args, **named)
+            finally:
+                spent[place] += time.process_time() - begun
+                inside[0] = False
+
+        setattr(cls, name, found)
+
+    for name in ("predict", "determined", "innovate", "step"):
+        timed(Estimator, name, 0)
+    timed(Monitors, "observe", 1)
+    runs = []
+    for _ in range(repeats):
+        with Run(Job(source=log, assignments=tuple(assignments), prefetch=0)) as run:
+            each = []
+            for _ in run.rows():
+                each.append(tuple(spent))
+                spent[:] = 0.0, 0.0
+        runs.append(each)
+    least_ms = 1e3 * np.min(runs, axis=0)
+    estimator, both = least_ms[:, 0], least_ms.sum(axis=1)
+    print(
+        f"{len(both)} scans: estimator {estimator.mean():.2f} ms, at most {estimator.max():.1f};"
+        f" with monitors {both.mean():.2f} ms, at most {both.max():.1f}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses")
@@ -197,7 +238,12 @@ def main() -> None:
     parser.add_argument("--long", type=int, metavar="N", help="times over a log of N scans")
     parser.add_argument("--repeats", type=int, default=1, help="repeats of --long; the least time of each scan counts")
     parser.add_argument("--cases", action="store_true", help="times in cases of estimate_surprises.py")
+    parser.add_argument("--log", type=Path, metavar="LOG", help="times in replays of a log")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of --log")
     given = parser.parse_args()
+    if given.log:
+        replay_ms(given.log, given.set, max(3, given.repeats))
+        return
     if given.cases:
         cases()
         return
