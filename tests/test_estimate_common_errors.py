@@ -16,8 +16,8 @@ from avsreplay.estimate.common_errors import (
     systematic_share,
 )
 from avsreplay.geometry import Pose
-from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import Registrar
+from avsreplay.records import Alignment, AlignStatus, Scan, Surface
+from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, example_pose, view
 
 EXTENT_M = 4.0
@@ -116,13 +116,20 @@ def bent(surface: Surface, angle: float) -> Surface:
 
 def test_a_registration_to_a_bent_model_states_systematic_errors() -> None:
     surface, rng = boxes(), np.random.default_rng(7)
-    shares = []
+    shares, remarks = [], list[str]()
     for model in (surface, bent(surface, 0.06)):
         registrar, found = Registrar(model), []
+        check = ModelCheck(registrar, model)
         for k in range(6):
             pose = example_pose() @ Pose(geometry.exp(np.array([0.0, 0.2 * k, 0.0])), np.zeros(3))
             scan = pose.apply(view(surface, 6000, pose.inverse().t))
-            found.append(systematic_share(registrar.register(scan + 0.003 * rng.normal(size=scan.shape), pose, k)))
+            scan += 0.003 * rng.normal(size=scan.shape)
+            alignment = registrar.register(scan, pose, k)
+            found.append(systematic_share(alignment))
+            check.add(Scan(k, 10**9 * k, scan), alignment)
+        remarks.append(check.remark())
         shares.append(float(np.mean(found)))
     assert shares[0] < 0.4
     assert shares[1] > 0.6
+    assert remarks[0] == ""
+    assert "errors of the model or of the ranges" in remarks[1]

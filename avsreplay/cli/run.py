@@ -245,8 +245,8 @@ def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
     """Return the findings on the model from the rows unless size or background explain them; also said on stderr."""
     if any(a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail") for a in advice):
         return ()
-    notes = run.model_check.notes()
-    for note in notes:
+    notes, remark = run.model_check.notes(), run.model_check.remark()
+    for note in (*notes, remark) if remark else notes:
         click.echo(f"avsreplay: {note}", err=True)
     return notes
 

@@ -63,7 +63,7 @@ _PLACE_POINTS, _BLOCKS = 500, 6  # points of each, and blocks of consecutive pla
 _LEAST_EXPLAINED = 0.5  # least share, explained by the size, of what a uniform motion leaves of the places
 _DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
 _DURATION_POINTS = 800
-_LEAST_OF_PERIOD = 0.02  # least duration of a scan that is reported, over the period of the scans
+_LEAST_OF_PERIOD, _NOTED = 0.02, 0.5  # duration of a scan over the period, share of systematic errors: least reported
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
@@ -94,6 +94,7 @@ class ModelCheck:
         """
         self._registrar, self._surface = registrar, surface
         self._aligned, self._matched, self._ambiguous = 0, False, ""
+        self._systematic = 0.0  # sum of the shares of systematic errors
         self._size_open = self._duration_open = True  # whether the scans so far do not exclude a value to report
         self._deltas: list[float] = []
         self._weights: list[float] = []
@@ -125,6 +126,8 @@ class ModelCheck:
             self._unmatched = self._unmatched or scan
             return
         self._aligned += 1
+        if found.covariance is not None and found.systematic is not None:
+            self._systematic += float(np.trace(np.linalg.solve(found.covariance, found.systematic))) / 6.0
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
             self._measure(scan, found.T_ac)
         if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open:
@@ -191,6 +194,11 @@ class ModelCheck:
             return (several,) if self._ambiguous else ()
         found = [note for note in (self._size(), self._duration_note()) if note is not None]
         return (max(found)[1],) if found else ()  # each error makes the other one appear, with fewer standard errors
+
+    def remark(self) -> str:
+        """Return the share of systematic errors in the covariances of the poses where it is above a half; else ""."""
+        share, of = self._systematic / max(self._aligned, 1), "errors of the model or of the ranges, which remain"
+        return f"{100.0 * share:.0f} % of the variance of the poses comes from {of}" * (share > _NOTED)
 
     def _size(self) -> tuple[float, str] | None:
         """Standard errors by which the size is wrong, and the text; None if it is right."""
