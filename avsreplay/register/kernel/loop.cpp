@@ -311,7 +311,8 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
     if (good) {
       plane = false;
       const double error = passes.error();
-      if (rule.poor > 0 && o.rms > rule.poor && (double)o.inliers >= LEAST_ROUGH * (double)size) return o;
+      const bool ended = o.passes < rule.n_max / 2;  // by the error of the part, not by the limit of passes
+      if (ended && rule.poor > 0 && o.rms > rule.poor && (double)o.inliers >= LEAST_ROUGH * (double)size) return o;
       o.turn = std::max(o.turn, FEW_TURN * error / s.extent), o.move = std::max(o.move, FEW_MOVE * error);
     } else {
       begin();
