@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import tumbling
+from scipy.stats import chi2
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
@@ -63,7 +64,10 @@ HEADS = (
     "grasp 1 sigma, last 10 s [mm]",
     "claimed over true error during the event: position, attitude, velocity",
     f"NEES at {NEES_S} s, mean: all, attitude, rate, inertia, arm, position, velocity",
+    "share of these inside the 95 % band",
+    "t_1, median [s]",
 )
+NEES_DOF = np.array([20, 3, 3, 5, 3, 3, 3])  # of the blocks of nees_of
 EXTENT, POS_M, ROT_RAD = 4.0, 0.002, np.radians(0.1)
 
 
@@ -279,6 +283,12 @@ def nees_of(belief: Belief, truth: State) -> list[float]:
     return [float(e @ np.linalg.solve(C, e)) / len(e) for e, C in found]
 
 
+def inside_band(nees: Array) -> Array:
+    """Share of the values (bodies, instants, blocks) of NEES per degree of freedom in the two-sided 95 % band."""
+    low, high = chi2.ppf([[0.025], [0.975]], NEES_DOF) / NEES_DOF
+    return ((nees >= low) & (nees <= high)).mean(axis=(0, 1))
+
+
 def _direction(rng: np.random.Generator) -> Array:
     v = rng.normal(size=3)
     return v / np.linalg.norm(v)
@@ -325,6 +335,8 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
         _claims(results),
         ", ".join(f"{v:.2f}" for v in np.mean([r.nees for r in results], axis=(0, 1))),
+        ", ".join(f"{v:.0%}" for v in inside_band(np.array([r.nees for r in results]))),
+        f"{np.median([r.t[r.converged.index(True)] if any(r.converged) else np.inf for r in results]):.1f}",
     ]
     return "| " + " | ".join(cells) + " |"
 
