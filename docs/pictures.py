@@ -92,7 +92,7 @@ def plots(page: Path, to: Path, folder: Path) -> None:
     style = f"<style>{hidden} main {{ display: block !important }}</style></head>"
     bare = folder / "plots.html"
     bare.write_text(page.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
-    shot(bare, to, 900, 1130)
+    shot(bare, to, 900, 1170)
 
 
 def animation(frames: list[Path], to: Path) -> None:
