@@ -382,7 +382,7 @@ def test_the_campaign_of_removed_guards_covers_every_line_of_the_table_of_defect
             assert (ROOT / "avsreplay" / name).read_text(encoding="utf-8").count(text) == 1, (name, text)
         file, _, name = test.partition("::")
         assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), test
-    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reliability-tests.md").read_text(encoding="utf-8")
     table = page.partition("## Defects found")[2].partition("The observations of a new user")[0]
     lines = [set(re.findall(r"`(test_\w+)`", line)) for line in table.splitlines() if "`test_" in line]
     assert len(lines) > 20
