@@ -1,7 +1,8 @@
-"""Whether the tests of docs/reliability-tests.md fail without the code that they test: ``python tests/benchmarks/guards.py``.
+"""Whether tests fail without the code that they test: ``python tests/benchmarks/guards.py``.
 
-The tests named here must pass in a copy of the checkout. Then, for each guard, its text is replaced there, and its test
-must fail. Prints one line per guard; exit code 1 if a test passes without its guard.
+The tests of docs/reliability-tests.md that are named here must pass in a copy of the checkout. Then, for each guard,
+its text is replaced there, and its test must fail. Prints one line per guard; exit code 1 if a test passes without its
+guard.
 """
 
 from __future__ import annotations
