@@ -16,6 +16,8 @@ from avsreplay.geometry import Array
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
 LEAST_VOLUME = 1e-9  # least volume of a part with an inside, times six, in units of its area to the power of 3/2
 LEAST_PART = 1e-3  # least area of an open part over that of the mesh; smaller parts are remains of meshing
+OPENING = 0.01  # area of a circle as long as the open edges of a part, over its area; parts below it have no inner side
+MERGED_OF_EXTENT = 1e-6  # vertices on the same point of a grid this fine are one: exports round 0 to 1e-17
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
 
 Faces = NDArray[np.int32]
@@ -73,6 +75,17 @@ def distinct_rows(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.sort(first), number
 
 
+def normals(vertices: Array, faces: Faces) -> Array:
+    """Return the normals (m, 3) of faces by the right-hand rule, as long as twice their area [m^2].
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.asarray(np.cross(b - a, c - a), dtype=np.float64)
+
+
 def is_closed(vertices: Array, faces: Faces) -> bool:
     """Return whether each edge is used as often in one direction as in the other; equal vertices count as one.
 
@@ -80,14 +93,16 @@ def is_closed(vertices: Array, faces: Faces) -> bool:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
     """
-    return bool(_edges(_corners(vertices, faces)).paired().all())
+    corners = _corners(vertices, faces)
+    return bool(_edges(corners[(corners < len(vertices)).all(axis=1)]).paired().all())
 
 
 def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     """Wind the faces consistently and outwards.
 
     Within a part that is not consistent, the fewer faces are reversed. Then closed parts with a negative volume are
-    reversed, unless they are a cavity inside another closed part. Open parts have no outer side.
+    reversed, unless they are a cavity inside another closed part. Open parts have no outer side. Faces with the same
+    vertices get one winding if their part is closed; on an open part they may be its two sides, and stay.
 
     Args:
         vertices: (n, 3) [m].
@@ -98,16 +113,17 @@ def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     """
     if not len(faces):
         return faces, 0
-    first, number = _distinct(_corners(vertices, faces))
-    changed = _reversed(vertices, faces[first])[number]
+    first, number, turned = _distinct(_corners(vertices, faces))
+    reversed_, solid = _reversed(vertices, faces[first])
+    changed = reversed_[number] ^ (turned & solid[number])
     if not changed.any():
         return faces, 0
     result: Faces = np.ascontiguousarray(np.where(changed[:, None], faces[:, ::-1], faces))
     return result, int(changed.sum())
 
 
-def _reversed(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
-    """Which of distinct faces (m,) must be reversed."""
+def _reversed(vertices: Array, faces: Faces) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of distinct faces (m,) must be reversed, and which belong to a closed part with a volume."""
     parts = _parts(_edges(_corners(vertices, faces)))
     wound = np.where(parts.reversed[:, None], faces[:, ::-1], faces)
     volume, area = _volumes(vertices, wound, parts.of)
@@ -123,8 +139,7 @@ def _reversed(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
     ]
     inside_out = inside_out ^ negative
     inside_out[cavities] ^= True
-    changed: NDArray[np.bool_] = parts.reversed ^ inside_out[parts.of]
-    return changed
+    return parts.reversed ^ inside_out[parts.of], closed[parts.of]
 
 
 def signed_volume(vertices: Array, faces: Faces) -> float:
@@ -137,27 +152,51 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
     return float(_volumes(vertices, faces, np.zeros(len(faces), np.int64))[0].sum()) / 6.0
 
 
-def open_faces(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
-    """Return which faces (m,) belong to parts that are not closed, so that both of their sides can be seen.
+def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the faces that differ, and the part of each that has openings.
 
-    Parts with less than a thousandth of the area are left out.
+    The edges that no opposite half-edge meets are the rims of openings. A finely meshed bowl has few of them, and the
+    seams of patches with unequal vertices are rims as well: only the directions from which the faces of such a part are
+    seen tell its sides. Parts with less than a thousandth of the area are left out. All parts of a mesh without a
+    volume are open, as of one that lists each face with both windings; faces with equal vertices are then one.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
+
+    Returns:
+        Numbers (k,) of faces, and the numbers (k,) of their parts, -1 for parts without openings.
     """
     if not len(faces):
-        return np.zeros(0, bool)
-    first, number = _distinct(corners := _corners(vertices, faces))
-    edges = _edges(corners[first])
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    _, either, turned = _distinct(corners := _corners(vertices, faces))
+    volume, whole = (float(each[0]) for each in _volumes(vertices, faces, np.zeros(len(faces), np.int64)))
+    flat = abs(volume) <= LEAST_VOLUME * whole**1.5
+    first = distinct_rows(np.column_stack([either, np.zeros_like(turned) if flat else turned]).astype(np.float64))[0]
+    edges, few = _edges(corners[first]), faces[first]
     paired = edges.paired()
-    if paired.all():
-        return np.zeros(len(faces), bool)
+    if paired.all() and not flat:
+        return first, np.full(len(first), -1)
     parts = _parts(edges)
-    area = _volumes(vertices, faces[first], parts.of)[1]
-    large = area > LEAST_PART * area.sum()
-    opened: NDArray[np.bool_] = (~parts.closed & large & (_share(paired, parts.of) < PAIRED_EDGES))[parts.of][number]
-    return opened
+    area = _volumes(vertices, few, parts.of)[1]
+    opened = (area > LEAST_PART * area.sum()) & (
+        flat | (_openings(vertices, few, corners[first], paired, parts.of) > OPENING * area)
+    )
+    return first, np.where(opened[parts.of], parts.of, -1)
+
+
+def _openings(
+    vertices: Array, faces: Faces, corners: NDArray[np.int64], paired: NDArray[np.bool_], of: NDArray[np.int64]
+) -> Array:
+    """Area of the circles that are as long as the rims of each part; ``corners``: faces with equal vertices as one."""
+    rim = np.flatnonzero(~paired)
+    face, side = rim // 3, rim % 3
+    start, end = corners[face, side], corners[face, (side + 1) % 3]
+    length = np.linalg.norm(vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1)
+    loop = _components(int(corners.max()) + 1, start, end)[start]
+    key, number = np.unique(np.column_stack([of[face], loop]), axis=0, return_inverse=True)
+    around = np.bincount(number.ravel(), length, len(key))
+    return np.asarray(np.bincount(key[:, 0], around**2 / (4.0 * np.pi), int(of.max()) + 1), dtype=np.float64)
 
 
 @value_class
@@ -187,14 +226,20 @@ class _Parts:
 
 
 def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
-    """The faces (m, 3) with equal vertices as one."""
-    return distinct_rows(vertices)[1][faces]
+    """The faces (m, 3) with equal vertices as one. A face with two equal corners is a part of its own."""
+    step = MERGED_OF_EXTENT * float(np.ptp(vertices, axis=0).max())
+    corners = distinct_rows(np.round((vertices - vertices.min(axis=0)) / max(step, np.finfo(float).tiny)))[1][faces]
+    flat = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
+    corners[flat] = len(vertices) + np.arange(3 * np.count_nonzero(flat)).reshape(-1, 3)
+    return corners
 
 
-def _distinct(corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Faces without repetitions of the same winding: indices (k,), and which of them (m,) each face equals."""
-    begin = np.argmin(corners, axis=1)[:, None]
-    return distinct_rows(np.take_along_axis(corners, (begin + np.arange(3)) % 3, axis=1).astype(np.float64))
+def _distinct(corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Faces that differ: indices (k,), which of them (m,) each face equals, and whether its winding is the other."""
+    order = np.argsort(corners, axis=1, kind="stable")
+    even = (order[:, 1] - order[:, 0]) % 3 == 1
+    first, number = distinct_rows(np.take_along_axis(corners, order, axis=1).astype(np.float64))
+    return first, number, even != even[first[number]]
 
 
 def _edges(corners: NDArray[np.int64]) -> _Edges:

@@ -54,6 +54,13 @@ def some_reversed(rng: np.random.Generator, faces: mesh.Faces, share: float) -> 
     return np.take_along_axis(turned, (rng.integers(3, size=(len(faces), 1)) + np.arange(3)) % 3, axis=1)
 
 
+def opened(vertices: Array, faces: mesh.Faces) -> Array:
+    """Which of the faces, all different, belong to parts with openings."""
+    first, part = mesh.open_parts(vertices, faces)
+    np.testing.assert_array_equal(first, np.arange(len(first)))
+    return part >= 0
+
+
 def normals(vertices: Array, faces: mesh.Faces) -> Array:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
@@ -84,7 +91,9 @@ def test_repeated_vertices_and_repeated_faces_change_nothing(seed: int) -> None:
     found, _ = mesh.outward(soup, some_reversed(rng, apart, 0.3))
     np.testing.assert_allclose(normals(soup, found), normals(soup, apart), atol=1e-12)
     assert mesh.outward(soup, twice)[1] == 0
-    assert not mesh.open_faces(soup, twice).any()
+    first, part = mesh.open_parts(soup, twice)
+    np.testing.assert_array_equal(first, np.arange(len(apart)))
+    assert (part < 0).all()
 
 
 def test_a_single_reversed_part_of_several_is_found() -> None:
@@ -126,11 +135,69 @@ def test_open_parts_are_told_from_closed_ones() -> None:
     sheet.update_faces(np.arange(12) < 2)
     sheet.apply_translation((3, 0, 0))
     vertices, faces = joined([box, sheet])
-    np.testing.assert_array_equal(mesh.open_faces(vertices, faces), np.arange(14) >= 12)
-    assert not mesh.open_faces(np.where(np.arange(len(vertices))[:, None] < 8, vertices, 0.01 * vertices), faces).any()
+    np.testing.assert_array_equal(opened(vertices, faces), np.arange(14) >= 12)
+    assert not opened(np.where(np.arange(len(vertices))[:, None] < 8, vertices, 0.01 * vertices), faces).any()
     both = np.concatenate([faces, faces[12:, ::-1]])  # the other side of the sheet, as faces of their own
-    assert not mesh.open_faces(vertices, both).any()
+    assert not opened(vertices, both).any()
     assert mesh.outward(vertices, both)[1] == 0
+
+
+@pytest.mark.parametrize("subdivisions", [1, 3, 5])
+@pytest.mark.parametrize(("height", "is_open"), [(0.0, True), (0.995, False), (1.1, False)])
+def test_the_openings_of_a_part_do_not_depend_on_its_triangles(subdivisions: int, height: float, is_open: bool) -> None:
+    """A sphere without the faces above a height: a bowl, one with a small hole, and a whole one."""
+    ball = trimesh.creation.icosphere(subdivisions=max(subdivisions, 4) if height == 0.995 else subdivisions)
+    ball.update_faces(ball.triangles_center[:, 2] < height)
+    found = opened(np.array(ball.vertices), np.array(ball.faces, dtype=np.int32))
+    assert found.all() if is_open else not found.any()
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_corners_that_differ_by_rounding_are_one(seed: int) -> None:
+    """An STL file repeats each corner, and exports write 6e-17 in place of 0 for some of the faces."""
+    rng = np.random.default_rng(seed)
+    vertices, faces = joined(bodies(rng, 2))
+    apart = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+    soup = vertices[faces].reshape(-1, 3)
+    rounded = soup * (1.0 + 1e-13 * rng.normal(size=soup.shape)) + 1e-17
+    found, _ = mesh.outward(rounded, some_reversed(rng, apart, 0.3))
+    np.testing.assert_allclose(normals(rounded, found), normals(soup, apart), atol=1e-9)
+    assert not opened(rounded, apart).any()
+    assert mesh.is_closed(rounded, apart)
+
+
+def test_a_sliver_does_not_separate_its_neighbours() -> None:
+    """A face whose corners are nearer than the tolerance: the mesh stays closed, and the winding is found across it."""
+    box = trimesh.creation.box((1, 1, 1))
+    vertices, faces = np.array(box.vertices), np.array(box.faces, dtype=np.int32)
+    a, b, c = faces[0]
+    moved = np.vstack([vertices, vertices[b] + 1e-9 * (vertices[c] - vertices[b])])
+    split = np.vstack([[a, 8, c], [a, b, 8], faces[1:]]).astype(np.int32)
+    assert mesh.is_closed(moved, split)
+    assert not opened(moved, split).any()
+    wrong = np.where((np.arange(len(split)) == 5)[:, None], split[:, ::-1], split)
+    assert mesh.outward(moved, wrong)[1] == 1
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_a_body_that_lists_each_face_with_both_windings_is_wound_outwards(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vertices, faces = joined(bodies(rng, 2))
+    both = np.concatenate([faces, faces[:, ::-1]])[rng.permutation(2 * len(faces))]
+    found, count = mesh.outward(vertices, both)
+    assert count == len(faces)
+    assert mesh.signed_volume(vertices, found) == pytest.approx(2.0 * mesh.signed_volume(vertices, faces))
+
+
+def test_a_mesh_without_a_volume_is_open() -> None:
+    sheet = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    both = np.concatenate([faces, faces[:, ::-1]])
+    first, part = mesh.open_parts(sheet, both)
+    np.testing.assert_array_equal(first, [0, 1])
+    np.testing.assert_array_equal(part, [0, 0])
 
 
 def test_a_moebius_strip_is_left_as_it_is() -> None:
@@ -150,7 +217,7 @@ def test_a_moebius_strip_is_left_as_it_is() -> None:
 def test_no_faces() -> None:
     none = np.zeros((0, 3), np.int32)
     assert mesh.outward(np.eye(3), none)[1] == 0
-    assert not len(mesh.open_faces(np.eye(3), none))
+    assert not len(mesh.open_parts(np.eye(3), none)[0])
     assert [len(found) for found in mesh.distinct_rows(np.zeros((0, 3)))] == [0, 0]
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay import geometry
 from avsreplay.estimate.measurement import from_chi2
@@ -15,7 +16,7 @@ from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.params import Camera
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.visibility import Visibility
+from avsreplay.register.visibility import Visibility, seen_sides
 from avsreplay.simulate.target import box
 
 RNG_SEED = 11
@@ -140,3 +141,86 @@ def test_a_thin_panel_is_not_matched_to_its_reverse_side(offset: float) -> None:
     sight = T_ac.t / np.linalg.norm(T_ac.t)
     found = Registrar(surface).register(scan, Pose(T_ac.q, T_ac.t + offset * sight))
     assert np.linalg.norm(found.T_ac.t - T_ac.t) < 0.01
+
+
+def _patches(rng: np.random.Generator, joined: bool) -> Surface:
+    """Convex bodies whose faces are single patches, each wound at random; some of the patches are left unsplit."""
+    vertices, faces, count = [], [], 0
+    for _ in range(3):
+        hull = trimesh.convex.convex_hull(rng.normal(size=(9, 3)))
+        hull.apply_translation(2.5 * rng.normal(size=3))
+        for corners in hull.triangles:
+            a, b, c = corners
+            middle = 0.5 * (a + b)  # a vertex on the edge of a face that its neighbour does not have
+            split = [(a, middle, c), (middle, b, c)] if rng.random() < 0.5 else [(a, b, c)]
+            turned = -1 if rng.random() < 0.5 and not joined else 1
+            for triangle in split:
+                vertices += list(np.array(triangle)[::turned])
+                faces.append([count, count + 1, count + 2])
+                count += 3
+    return Surface(np.array(vertices), np.array(faces, dtype=np.int32), "patches", "")
+
+
+def _seen(surface: Surface, rng: np.random.Generator) -> np.ndarray:
+    """Slope of the first face on rays from outside, below 0 if it faces the eye; of faces there the least."""
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    middle = surface.vertices.mean(axis=0)
+    eyes = middle + 2.0 * surface.extent * np.array([v / np.linalg.norm(v) for v in rng.normal(size=(400, 3))])
+    rays = mesh.triangles_center[rng.integers(len(mesh.faces), size=400)] - eyes
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    at, ray, face = mesh.ray.intersects_location(eyes, rays, multiple_hits=True)
+    distance, slope = np.linalg.norm(at - eyes[ray], axis=1), np.einsum("ij,ij->i", mesh.face_normals[face], rays[ray])
+    first = np.full(400, np.inf)
+    np.minimum.at(first, ray, distance)
+    found = np.full(400, np.inf)
+    same = distance < first[ray] + 1e-6 * surface.extent
+    np.minimum.at(found, ray[same], slope[same])
+    return found[np.isfinite(found)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("joined", [False, True])
+def test_patches_that_no_edge_connects_face_the_cameras_that_see_them(seed: int, joined: bool) -> None:
+    """No two patches have an edge in common, so that only what cameras see tells the outer side of each."""
+    rng = np.random.default_rng(seed)
+    surface = _patches(rng, joined)
+    found, outward = seen_sides(surface)
+    assert outward
+    slopes = _seen(found, rng)
+    assert len(slopes) > 100
+    assert (slopes < 0.0).mean() > 0.99
+    assert len(found.faces) < 1.1 * len(surface.faces)
+
+
+@pytest.mark.parametrize("subdivisions", [2, 4])
+@pytest.mark.parametrize("turned", [False, True])
+def test_both_sides_of_a_bowl_are_matched_and_one_of_a_body(subdivisions: int, turned: bool) -> None:
+    """A bowl without thickness beside a box: finely meshed it has few open edges, and its sides are still two."""
+    bowl, body = trimesh.creation.icosphere(subdivisions=subdivisions), trimesh.creation.box((1.0, 0.8, 0.6))
+    bowl.update_faces(bowl.triangles_center[:, 2] < -0.3)
+    body.apply_translation((0.2, 0.1, -2.0))
+    faces = np.concatenate([bowl.faces[:, ::-1] if turned else bowl.faces, body.faces + len(bowl.vertices)])
+    surface = Surface(np.concatenate([bowl.vertices, body.vertices]), faces.astype(np.int32), "bowl and body", "")
+    found, outward = seen_sides(surface)
+    assert outward
+    assert len(found.faces) == 2 * len(bowl.faces) + 12
+    registrar, rng = Registrar(surface), np.random.default_rng(7)
+    for side in (0.7, -0.7):  # into the bowl, and at its back
+        turn = exp([0.3, np.arcsin(side) if side > 0 else np.pi - np.arcsin(-side), 0.2])
+        T_ac = Pose(turn, np.array([0.1, -0.2, 7.0]))
+        rays = np.column_stack([rng.uniform(-0.3, 0.3, (6000, 2)), np.ones(6000)])
+        shape = trimesh.Trimesh(T_ac.apply(surface.vertices), surface.faces, process=False)
+        scan = shape.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)[0]
+        found_pose = registrar.register(scan, T_ac @ Pose(exp([0.03, -0.02, 0.02]), np.array([0.05, -0.03, 0.04])))
+        assert found_pose.status is AlignStatus.ALIGNED
+        step = T_ac.inverse() @ found_pose.T_ac
+        assert float(geometry.angle(step.q)) < np.radians(0.05)
+        assert float(np.linalg.norm(step.t)) < 0.002 * surface.extent
+
+
+def test_the_sides_are_kept(tmp_path) -> None:
+    surface = _patches(np.random.default_rng(0), False)
+    found = seen_sides(surface, tmp_path)[0].faces
+    assert len(list(tmp_path.iterdir())) == 1
+    np.testing.assert_array_equal(seen_sides(surface, tmp_path)[0].faces, found)
+    np.testing.assert_array_equal(seen_sides(surface)[0].faces, found)

@@ -53,9 +53,9 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
-        self._visibility = Visibility(surface, self.params.camera)
-        surface, self.sided = self._visibility.surface, self._visibility.sided
         self._cache_dir = cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
+        self._visibility = Visibility(surface, self.params.camera, cache_dir)
+        surface, self.sided = self._visibility.surface, self._visibility.sided
         self.index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
         self._target = Target(surface, self.index, self.limits, self._visibility)
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)

@@ -42,7 +42,18 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
     """
     if len(surface.faces) == 0:
         return np.array(surface.vertices), np.zeros_like(surface.vertices)
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return sample_faces(surface.vertices, surface.faces, count)[:2]
+
+
+def sample_faces(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return ``count`` points of a mesh, uniform by area, the normals of their faces, (n, 3) each, and the faces (n,).
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices, m >= 1.
+        count: number of points.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     twice_area = np.linalg.norm(cross, axis=1)
     edges = np.cumsum(twice_area)
@@ -52,7 +63,7 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
     fold = u + v > 1.0
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
     points = a[face] + u * (b - a)[face] + v * (c - a)[face]
-    return points, cross[face] / np.maximum(twice_area[face], np.finfo(float).tiny)[:, None]
+    return points, cross[face] / np.maximum(twice_area[face], np.finfo(float).tiny)[:, None], face
 
 
 def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,21 @@ from numpy.typing import NDArray
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Fit, Surface
+from avsreplay.register import index_cache
 from avsreplay.register.params import Camera
-from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.sampling import directions, sample_faces
+from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 LEAST_SEEN, NEAR_FACE_OF_EXTENT = 0.85, 0.01  # share of points so near to a face towards a camera close to the model
 FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
 TESTED_POINTS = 200
+VIEWS, SIDE_POINTS, VIEWED_FROM = 24, 2000, 2.0  # cameras that look at points of open parts, so many extents away
+PATCH_OF_EXTENT, LEAST_INCIDENCE = 0.05, 0.05  # side of a patch; least cosine of a ray
+FROM_BEHIND, LEAST_ONE_SIDED = 0.05, 0.2  # share of the views of a patch; share of the area with one side
+FRONT, BACK, BOTH = 1, 2, 3
+VERSION = 1  # of the rule for the sides of open parts, for the cache
 
 
 class Visibility:
@@ -30,16 +38,16 @@ class Visibility:
     thickness of the panel, the measured front is next to the back of the model, and plain ICP converges there: on the
     built-in target, started 3 deg and 5 cm off, in every third view.
 
-    AUTO applies it if the mesh has a closed part and encloses a positive volume. If fewer than 40 % of the closest
-    faces of the scan face the origin of {A}, the camera was elsewhere and both sides are matched. Nearer to the
-    bounding box than a quarter of the extent, 85 % of the points must also be near a face that faces the origin.
+    AUTO applies it if the outer sides are known. If fewer than 40 % of the closest faces of the scan face the origin of
+    {A}, the camera was elsewhere and both sides are matched. Nearer to the bounding box than a quarter of the extent,
+    85 % of the points must also be near a face that faces the origin.
 
     Attributes:
         sided: the faces of this surface have a known outer side.
-        surface: the surface; where it is sided, with the other side of each face that belongs to an open part.
+        surface: the surface; where it is sided, faces of open parts towards the side that is seen, or with both sides.
     """
 
-    def __init__(self, surface: Surface, camera: Camera = Camera.AUTO) -> None:
+    def __init__(self, surface: Surface, camera: Camera = Camera.AUTO, cache_dir: Path | None = None) -> None:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
         self._sides, self._clear = list(zip(low.tolist(), high.tolist(), strict=True)), clear
@@ -47,12 +55,10 @@ class Visibility:
         self.sided, self.surface = False, surface
         if camera is Camera.NONE:
             return
-        opened = mesh.open_faces(surface.vertices, surface.faces)
-        outward = not opened.all() and mesh.signed_volume(surface.vertices, surface.faces) > 0.0
+        found, outward = seen_sides(surface, cache_dir)
         self.sided = camera is Camera.ORIGIN or outward
-        if self.sided and opened.any():
-            both = np.concatenate([surface.faces, surface.faces[opened][:, ::-1]])
-            self.surface = replace(surface, faces=np.ascontiguousarray(both))
+        if self.sided:
+            self.surface = found
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
@@ -112,3 +118,72 @@ class Visibility:
         if not self._known or distance < FAR_OF_EXTENT * self._extent:
             return None
         return frozen(-centre / distance)
+
+
+def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface, bool]:
+    """Wind the faces of parts with openings towards the sides from which cameras outside of the model see them.
+
+    A patch that is seen from both sides, as that of a bowl or of a sheet, gets faces with both windings. Closed parts
+    stay as they are.
+
+    Args:
+        surface: closed parts outwards.
+        cache_dir: folder where the sides are kept.
+
+    Returns:
+        The surface, and whether the outer sides of its faces are known: a closed surface encloses a positive volume; of
+        one with openings enough is seen from one side only.
+    """
+    distinct, part = mesh.open_parts(surface.vertices, surface.faces)
+    if not (part >= 0).any():
+        return surface, mesh.signed_volume(surface.vertices, surface.faces) > 0.0
+    faces = surface.faces[distinct]
+    closed, opened = faces[part < 0], faces[part >= 0]
+    kernel, path = kernel_module(), None
+    if cache_dir is not None:
+        layout = f"{kernel.LAYOUT} sides {VERSION}"
+        path = index_cache.cache_path(cache_dir, layout, surface.vertices, surface.faces, surface.extent)
+    kept = index_cache.read_arrays(path, kernel.checksum)
+    if "sides" not in kept:
+        kept["sides"] = _sides(replace(surface, faces=faces), opened, part[part >= 0])
+        index_cache.write_arrays(path, kept, kernel.checksum)
+    sides = kept["sides"]
+    wound = np.concatenate([closed, opened[sides != BACK], opened[sides != FRONT][:, ::-1]])
+    area = np.linalg.norm(mesh.normals(surface.vertices, faces), axis=1)
+    both = area[part >= 0][sides == BOTH].sum()
+    return replace(surface, faces=np.ascontiguousarray(wound)), bool(both <= (1.0 - LEAST_ONE_SIDED) * area.sum())
+
+
+def _sides(surface: Surface, faces: NDArray[np.int32], part: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The sides (m,) of faces (m, 3) that are seen: ``FRONT``, ``BACK`` or ``BOTH``; ``FRONT`` where neither is.
+
+    A patch is the faces of one part in one cube of the space whose normals are nearest to one axis.
+    """
+    v, extent = surface.vertices, surface.extent
+    points, normals, of = sample_faces(v, faces, SIDE_POINTS)
+    middle = 0.5 * (v.min(axis=0) + v.max(axis=0))
+    index = SurfaceIndex.build(surface, 0.05 * extent)
+    front, back = np.zeros(len(points)), np.zeros(len(points))
+    for direction in directions(VIEWS):
+        rays = points - (eye := middle + VIEWED_FROM * extent * direction)
+        length = np.linalg.norm(rays, axis=1)
+        rays /= length[:, None]
+        seen = index.cast(eye, rays)[0] > length - 1e-5 * extent
+        slope = np.einsum("ij,ij->i", rays, normals)
+        front += seen & (slope < -LEAST_INCIDENCE)
+        back += seen & (slope > LEAST_INCIDENCE)
+    corners, normal = v[faces], mesh.normals(v, faces)
+    axis = np.argmax(np.abs(normal), axis=1)
+    towards = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0.0)
+    cube = np.floor((corners.mean(axis=1) - middle) / (PATCH_OF_EXTENT * extent))
+    patch = np.unique(np.column_stack([part, towards, cube]), axis=0, return_inverse=True)[1].ravel()
+    of_part = np.unique(part, return_inverse=True)[1]
+    seen = _counts(patch, of, front, back)
+    seen = np.where(seen.sum(axis=0) > 0.0, seen, _counts(of_part, of, front, back))
+    share = seen[1] / np.maximum(seen.sum(axis=0), 1.0)
+    return np.where(share <= FROM_BEHIND, FRONT, np.where(share >= 1.0 - FROM_BEHIND, BACK, BOTH)).astype(np.float64)
+
+
+def _counts(group: NDArray[np.int64], of: NDArray[np.int64], *views: Array) -> Array:
+    """Sums (k, m) of the views (n,) of the points on faces ``of`` (n,) over the group (m,) of each face."""
+    return np.stack([np.bincount(group[of], each, int(group.max()) + 1)[group] for each in views])
