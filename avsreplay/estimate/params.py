@@ -161,7 +161,8 @@ class EstimatorParams(Settings):
     )
     robust: bool = setting(
         True,
-        "Reduce the weight of a healthy pose whose NIS exceeds its 99.99 % point; the paper's start never does.",
+        "Decide about scans with a large innovation by the test of hypotheses, and reduce the weight of a healthy pose"
+        " whose NIS exceeds its 99.99 % point. false switches both off, as the paper's start does.",
     )
     bias_s: float = setting(
         20.0,

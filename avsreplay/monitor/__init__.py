@@ -201,7 +201,11 @@ class FaultParams(Settings):
         " accepts more poses after a blackout.",
         above=0.0,
     )
-    min_inliers: int = setting(50, "Smallest number of inliers of a healthy scan.", low=0)
+    min_inliers: int = setting(
+        50,
+        "Smallest number of inliers of a healthy scan. A larger value rejects more scans of small or distant targets.",
+        low=0,
+    )
     split_nis_max: float = setting(
         60.0,
         "A scan is faulty if the normalised squared difference of the poses from its two halves is above this value.",

@@ -30,12 +30,12 @@ class ConsistencyParams(Settings):
 
     window: int = setting(
         50,
-        "Number of healthy scans in the window of the test. A larger value finds smaller deviations, but later.",
+        "Number of the last healthy scans whose mean NIS is tested. A larger value finds smaller deviations, later.",
         low=2,
     )
     least: int = setting(
         15,
-        "Smallest number of healthy scans in the window for which the test is made; with fewer, converged stays false.",
+        "Smallest number of healthy scans for which this test is made; with fewer, converged stays false.",
         low=2,
     )
     level: float = setting(

@@ -55,14 +55,15 @@ class AcquireParams(Settings):
     )
     least_separate: float = setting(
         0.4,
-        "The same limit if the other points are far from the model, as those of another object are.",
+        "Smallest inlier ratio of a pose that the search returns if the other points are far from the model, as those"
+        " of another object are.",
         low=0.0,
         high=1.0,
     )
     margin: float = setting(
         0.01,
-        "The result is ambiguous if the share of unexplained points of a second pose exceeds that of the best pose"
-        " by less. A larger value rejects more poses of nearly symmetric targets.",
+        "The result is ambiguous if the share of the points that a second pose leaves unexplained exceeds that of the"
+        " best pose by less than this. A larger value rejects more poses of nearly symmetric targets.",
         low=0.0,
         high=1.0,
     )
@@ -128,7 +129,8 @@ class RegisterParams(Settings):
     )
     camera: Camera = setting(
         Camera.AUTO,
-        "Position of the camera: the origin of the frame of the clouds, unknown (none), or detected (auto).",
+        "Position of the camera, which decides the side of a face on which a point can be: the origin of the frame of"
+        " the clouds (origin), unknown (none), or the origin where model and scan agree with it (auto).",
     )
     subsample_m: float = setting(
         0.0,
