@@ -102,7 +102,7 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Part
             point, steps = yield from _profile(problem, fitted, params, axis, row, side, left)
             left -= steps
             if point is None:
-                others = True  # its part of the covariance stays that of the fit
+                others = True  # this direction keeps the covariance of the fit
                 break
             points.append(point)
             yield steps * len(problem.poses)
@@ -206,7 +206,7 @@ def unseen_torque(problem: Problem, after_s: float) -> Array:
         return np.zeros((DIM, DIM))
     J, C = (H @ T).reshape(-1, DIM), (H[:, :, :REACHED] @ B[:-1]).reshape(-1, 3)
     P, cross, total = problem.covariance, J.T @ C, np.zeros((3, 3))
-    newton = P @ problem.core.normal()[1]  # to the minimum of the linearised cost, which a fit reaches approximately
+    newton = P @ problem.core.normal()[1]  # step to the minimum of the linearised cost, near which the fit ended
     moved = -P @ cross
     moved[:REACHED] += np.linalg.solve(T[:REACHED, :REACHED], B[-1])
     precision, found = C.T @ C - cross.T @ P @ cross, -C.T @ e.reshape(-1) - cross.T @ newton
@@ -254,17 +254,17 @@ def final_mixture(
     for weight, chart, pin in zip((weights / weights.sum()).tolist(), charts, pins, strict=True):
         y, P = process_noise_pass(chart, pin, problem, noise)
         yield 3 * len(problem.poses)
-        lost = not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE)  # far beyond what is linear
+        lost = not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE)  # the linearisation does not hold
         if pin is None:
             y, P = (np.zeros(DIM), fitted.P_chart) if lost else (y, P)
-            if spread is not None:  # for the trajectory of the fit alone
+            if spread is not None:  # the spread is that about the trajectory of the fit
                 P = spread[0] @ (spread[1] @ P @ spread[1].T) @ spread[0].T
             P = definite(P)
         if pin is None or not lost:
             there, share, step, beyond = _moved_on(chart, y, P, problem, recent, after_s)
-            added = step @ added @ step.T if pin is None else added  # it is valid about free motion only
+            added = step @ added @ step.T if pin is None else added  # the added covariance is that about the fit
             P = step @ _fixed(P, rows) @ step.T + added + beyond
-            lost = not _motion.above(P, -ROUNDING)  # about an unstable spin, by rounding at the epoch
+            lost = not _motion.above(P, -ROUNDING)  # rounding at the epoch, where the spin is unstable
         if pin is not None and lost:
             left = _without(found, pin)
             return (yield from final_mixture(left, problem, latest, noise, t_ns, after_s, spread, unseen))

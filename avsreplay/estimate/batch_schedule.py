@@ -104,7 +104,7 @@ class BatchSchedule:
         fix, factors, noise = track.fixes[-1], last.factors * np.sqrt(last.inflation), self.noise_levels(track)
         root = _motion.roots(fix.C[None])[0][0]
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
-        C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # the components may lie further apart
+        C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # components may lie further apart
         mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
         belief, t_ns = moments(mixture), prediction.belief.t_ns
         belief = belief if belief.t_ns == t_ns else self.propagated(track, belief, t_ns)[0]
@@ -122,7 +122,7 @@ class BatchSchedule:
         result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
         rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
         track = track.changed(reinitialised=track.reinitialised + rejected)
-        remembers = forgot and track.levels.slack > 1.0  # the filter keeps information that later fits cannot use
+        remembers = forgot and track.levels.slack > 1.0  # the filter keeps information of poses left out of fits
         return self.adopted(track, result, result.gaussian and (converged or remembers))
 
     def _at_present(self, track: Track, result: BatchResult) -> BatchResult:

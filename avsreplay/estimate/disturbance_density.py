@@ -96,7 +96,7 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     none = -0.5 * chi2 - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
     values, vectors = np.linalg.eigh(columns.T @ columns - cross.T @ cross)
     values = np.maximum(values, 0.0)
-    most = np.sqrt(chi2 * values)  # by Cauchy and Schwarz; rounding can exceed it
+    most = np.sqrt(chi2 * values)  # the bound of Cauchy and Schwarz, which rounding can exceed
     return Marginal(none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross)
 
 
@@ -132,7 +132,7 @@ def density_in_use(found: Marginal, present: Present, probability: float = 0.5) 
     log = np.append(math.log1p(-probability), found.log_odds + math.log(probability / len(DENSITIES)))
     weights = np.exp(log - log.max())
     weights /= weights.sum()
-    by_initial = np.zeros((3, len(found.R)))  # of unknowns besides the initial values it is not known
+    by_initial = np.zeros((3, len(found.R)))  # zero for unknowns besides the initial values
     by_initial[:, : present.by_initial.shape[1]] = present.by_initial
     own = np.linalg.solve(found.R.T, by_initial.T).T
     reach = (present.by_impulses - own @ found.cross) @ found.vectors

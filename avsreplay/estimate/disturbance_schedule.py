@@ -40,7 +40,7 @@ FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a tes
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _EARLY = 2.0  # age of the poses over that at the report of a drift, until which it is tested for as often as before
-_LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
+_LEAST_EXCESS = 1e-6  # least variance of a belief over that of a pose, less 1, for which the pose is used
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 _NOT_BY_CHANCE = {3: 21.1, 6: 27.9}  # 99.99 % point of chi-square with so many degrees of freedom
@@ -137,7 +137,7 @@ class DisturbanceSchedule:
         """The track with new noise levels."""
         used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
         more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
-        since = pose_count(track.fixes) if more else track.since  # the estimate does not allow for these: fit again
+        since = pose_count(track.fixes) if more else track.since  # estimated without these disturbances: fit again
         return track.changed(levels=levels, since=since)
 
     def _tested(self, track: Track, start: Chart, begun: tuple[float, Array] | None) -> Parts[_Driven | None]:
@@ -155,7 +155,7 @@ class DisturbanceSchedule:
             first = replace(track.levels, torque=0.0, force=0.0)  # the acceleration may have caused these disturbances
             before = first if begun is None else track.levels
             levels = yield from levels_of(best.fitted, before, widths, claimed, self.params.disturbances, seen)
-            if begun is None and levels.established:  # random disturbances are needed beside it: these may be all
+            if begun is None and levels.established:  # with random disturbances beside it, these may explain everything
                 return None
             motions = []
             for h in found.hypotheses:

@@ -180,7 +180,7 @@ def _improved(
         start = np.where(best.u != 0.0, frame.u, 0.0)
         closer = yield from fit_jointly(poses, frame.chart, prior, factors, best.onset_s, start, open_)
         yield _size(closer)
-        if closer.cost > frame.cost - _LEAST_GAIN and (only is None or k):  # a given onset may be a less likely one
+        if closer.cost > frame.cost - _LEAST_GAIN and (only is None or k):  # the first of given onsets may be worse
             break
         frame = closer
     return frame, found, onsets

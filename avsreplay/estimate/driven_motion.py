@@ -32,9 +32,9 @@ _PASSES, _SMALL = 10, 0.1  # most linearisations; size of a step, in 1 sigma, af
 _NEAR = 0.5  # size of the first step, in 1 sigma, below which the joint fit is the mean: the likelihood is bent there
 _LAST_STEPS, _LAST_GAIN = 20, 0.004  # most steps of a descent from a motion that is near; least decrease: 0.1 sigma
 _JOINT_STEPS, _LEAST_GAIN = 60, 0.05  # most steps of a joint fit; decrease of its cost below which it ends
-_COARSE = 0.1  # the same, as a part of the cost, with normal points about a motion that is far from the one found
-_DAMPING, _MOST_DAMPING = 1e-3, 1e8  # of Levenberg-Marquardt: first, last
-_PIN, _PIN_STEPS, _LEAST_RISE = 0.1, 20, 1.0  # of a profile: 1 sigma, most steps, least increase, 2 for a Gaussian one
+_COARSE = 0.1  # the same as a share of the cost, while the normal points are those of a motion that is still far away
+_DAMPING, _MOST_DAMPING = 1e-3, 1e8  # damping of Levenberg-Marquardt: first value, largest value
+_PIN, _PIN_STEPS, _LEAST_RISE = 0.1, 20, 1.0  # profile: 1 sigma of the pin, most steps, least increase (2 if Gaussian)
 _JOINT_WORK = 4  # work of a step for each pose, in linearised poses
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
@@ -56,7 +56,7 @@ def fit_jointly(
         widths: (6,) prior 1 sigma of the acceleration, zero for a component that is zero.
     """
     chart, left = start, _JOINT_STEPS
-    for last in (False, False, True):  # with normal points about a motion that comes closer
+    for last in (False, False, True):  # the normal points are formed about a better motion each time
         points = normal_points(without_drift(poses, chart, onset_s, u), chart, factors)
         seen, last = without_drift(points, chart, onset_s, u, back=True), last or len(points) == len(poses)
         joint = _joint(seen, prior, factors, onset_s, widths)
@@ -208,7 +208,7 @@ def driven_motion(
     joint.linearise(chart.flat, u)
     yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
     chart, u = Chart(joint.chart), joint.u
-    for k in range(_PASSES):  # linearised about the motion of the fit, then about the one found
+    for k in range(_PASSES):  # first about the motion of the fit, then about the one found
         off = np.concatenate([-chart.minus(prior.mean), -u, [fitted.onset_s - onset_s]])
         motion = replace(motion, chart=chart, u=u, onset_s=onset_s)
         v, P = _smoothed(motion, seen, float(seen.times_s[0]), off, before)

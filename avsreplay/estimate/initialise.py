@@ -320,7 +320,7 @@ def improved_levels(
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
     prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
     poses = poses.some(~gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors))
-    for _ in range(2):  # about the last motion, then about the one that fits
+    for _ in range(2):  # normal points about the given motion, then about the fitted one
         points = normal_points(poses, chart, gate, MOST_POINTS, scatter=True)
         problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1
         yield from problem.descended(_LEVEL_STEPS, _LEVEL_TOL)
