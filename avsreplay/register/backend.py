@@ -41,7 +41,7 @@ ROUGH_OF_GATE = 0.375  # with a larger rms distance of these points, in gates, t
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
 HEALTHY_WORK, HEALTHY_PASSES = 17_000, 2.5  # an ordinary registration: point searches in all, and besides per point
 FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
-ALIGN_WORK, WITHIN_WORK = (40_000, 15), (30_000, 15)  # most of an alignment and per point, also with a fixed gate
+ALIGN_WORK, WITHIN_WORK = (40_000, 15), (30_000, 15)  # most work of an alignment (fixed, per point); with a fixed gate
 
 
 @value_class

@@ -139,7 +139,7 @@ def unbounded_directions(P: Array, extent_m: float) -> tuple[tuple[str, ...], Ar
     """
     scale = np.repeat([1.0, extent_m], 3)
     scaled = P / np.outer(scale, scale)
-    if np.trace(scaled) < 1.0:  # the largest eigenvalue is not larger
+    if np.trace(scaled) < 1.0:  # all eigenvalues are then below 1
         return (), np.zeros((6, 0))
     values, vectors = np.linalg.eigh(scaled)
     free = vectors[:, values >= 1.0]

@@ -192,7 +192,7 @@ class PlausibilityTest:
         chance, seen = CHANCE * np.count_nonzero(on), len(against) > 1
         score, kind = _contradicted(support, np.array(against), chance)
         if seen and score > MOST_CONTRADICTED and self.predicted(T_ca, guess) and self._alone(rays, on, T_ca):
-            score, kind = _contradicted(support, np.array(against[:2]), chance)  # what is missing is hidden
+            score, kind = _contradicted(support, np.array(against[:2]), chance)  # missing surface may be hidden
         reason = ""
         if noise > NOISE_OF_EXTENT * self._extent:
             reason = f"distances to the model spread by {noise:.3g} m"

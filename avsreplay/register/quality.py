@@ -30,7 +30,7 @@ from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
-WELL_OFF, PART = 2.0, 1000  # gates; points among which those so far off are counted
+WELL_OFF, PART = 2.0, 1000  # gates from which a point is well off; points per which those are counted
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
@@ -179,7 +179,7 @@ def grade(
             facing = visibility.camera_c(index, points, kept) is not None
             at = index.normal_equations(points, kept, limits.gate_m, facing=facing)
             fits = at.inliers >= AS_MANY * found.inliers and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
-            T_ca = view.refined(kept, at.info, at.gradient) if fits else T_ca  # corrects errors of the directions
+            T_ca = view.refined(kept, at.info, at.gradient) if fits else T_ca  # corrects the observable directions
     settled = P is None or not found.beyond
     fitted = P is not None and settled and systematic and _other_size(found)
     return Alignment(

@@ -27,7 +27,7 @@ from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
-LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = 2, 0.2, 0.9  # kept for the last registration; least and sure inliers
+LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = 2, 0.2, 0.9  # work kept, in ordinary scans; inliers: least, sure
 
 
 class Registrar:
@@ -148,7 +148,7 @@ class Registrar:
             if found.status is AlignStatus.FAILED:
                 return found
             fits = alone and not search.rivals and not self._restarter.misfit(few, found.T_ac.inverse())
-            little = search.inlier_ratio >= SURE_RATIO or fits  # left to explain
+            little = search.inlier_ratio >= SURE_RATIO or fits  # little is left to explain
             if found.measured and little and search.width_m <= self.limits.gate_m:
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
@@ -276,7 +276,7 @@ class Registrar:
         reason = self._restarter.reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final)):
             return self._restarter.consistent(few, guess, final), False
-        before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
+        before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without: another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
         work = self._symmetry.search_work(len(scan), 0) if overlap else 0
