@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import estimate_surprises as surprises
 import numpy as np
@@ -79,7 +80,7 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     ratio, moments = _motion.change(Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, 1.0, share)
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
     ratios, weighted = [], []
-    for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1)):
+    for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1, 0.03, 0.01)):
         C = np.kron(np.diag([1.0, 0.0]), S[0]) + np.kron(np.diag([0.0, 1.0]), S[1])
         C *= 1.0 + share if first == 0 else 1.0  # errors that both scans have in common
         F = Phi[first][:, [3, 4, 5] if kind == 0 else [9, 10, 11]]
@@ -121,6 +122,36 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
     doubtful = [k for k, reason in enumerate(result.reason) if reason == "doubtful"]
     assert not any(result.converged[k] for k in doubtful)
     assert not any(claimed and ratio > 4.0 for claimed, ratio in zip(result.converged, result.ratio, strict=True))
+
+
+@pytest.mark.parametrize("seed", [719, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_step_far_below_the_expected_size_of_a_change_is_a_manoeuvre(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Poses of a tracker may show any motion: the changes that are expected are ten times those of scans."""
+    wide = partial(surprises.EstimatorParams, start_vel_1s_mps=2.0)
+    monkeypatch.setattr(surprises, "EstimatorParams", wide)
+    result = surprises.run(surprises.Case("push", velocity=0.01, seconds=60.0), seed)
+    assert result.track is not None
+    (found,) = result.track.manoeuvres
+    off = found.velocity - result.true_velocity
+    assert off @ np.linalg.solve(found.P[3:, 3:], off) < 16.3  # 99.9 % of chi-square with 3 degrees of freedom
+    assert found.detected_ns * 1e-9 <= 48.5
+    assert result.track.drift is None
+
+
+def test_a_change_of_the_rate_contains_the_error_of_the_mass_centre() -> None:
+    """Of a body at rest the centre of mass is unknown: its velocity after a release is known along the axis only."""
+    case = surprises.Case("release", speed=1e-9, rate=0.1, at_s=20.0, seconds=30.0)
+    for seed in range(3):
+        result = surprises.run(case, seed)
+        assert result.track is not None
+        (found,) = result.track.manoeuvres
+        C, off = found.P[3:, 3:], found.velocity - result.true_velocity
+        assert off @ np.linalg.solve(C, off) < 16.3
+        values = np.sqrt(np.linalg.eigvalsh(C))
+        assert values[0] < 0.005
+        assert 0.05 < values[1] < 0.2  # 1 m of start_varrho_1s_m at 0.1 rad/s
 
 
 def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> None:

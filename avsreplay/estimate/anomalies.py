@@ -9,6 +9,7 @@ poses before a jump may be the biased ones: it is then initialised again from th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,12 +20,12 @@ from avsreplay.estimate.batch_covariance import LATEST, SPHERE, BatchCovariance,
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, MOST_FIXES, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import OVER_FREE, OVER_NEXT, Ranked, explain, linear
+from avsreplay.estimate.error_state import VARRHO, VEL, W, definite_product, rotation
+from avsreplay.estimate.hypotheses import OVER_FREE, Ranked, certain, explain, linear
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.noise import cholesky_root, lasting, risen
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.scan_window import (
@@ -45,15 +46,18 @@ from avsreplay.estimate.scan_window import (
 from avsreplay.estimate.sensor_bias import begun, compared, continued, squared
 from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_scale, ready, with_history, with_nis
 from avsreplay.estimate.work import whole
+from avsreplay.geometry import skew
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
+_LEAST_RISE = 2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 _STEPS = (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS)
 _DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)
+_USED = (*_DISTURBANCES, Hypothesis.NOISIER)
 
 Replay = Callable[[Track, Epoch], tuple[Track, Epoch]]
 
@@ -100,10 +104,8 @@ class AnomalyTest:
         changed = best in _STEPS and odds_over_free(ranked) >= OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free, window))
-        disturbed = best in _DISTURBANCES and odds_over_free(ranked) >= OVER_FREE and ranked[0].explains
-        if (large or track.doubtful) and disturbed:
-            track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
-        if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
+        noisier = best is Hypothesis.NOISIER and certain(ranked)
+        if not (large or changed or (track.doubtful and (noisier or best is Hypothesis.SENSOR_BIAS))):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
 
@@ -121,11 +123,14 @@ class AnomalyTest:
         """
         after = update(track.changed(doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
         after = with_nis(after, track, epoch.innovation.chi2)
+        after = after.changed(window=lasting(after.window, epoch.innovation))
         return after.changed(recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
     def _explained(self, track: Track, window: tuple[Epoch, ...], first: int) -> Ranked:
         allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
-        return explain(window, first, self._priors, *allowed)
+        used, ranked = explain(window, first, self._priors, *allowed)
+        least = math.sqrt(_LEAST_RISE * nis_scale(track))  # noise that the accepted poses have as well is no rise
+        return used, [e for e in ranked if e.hypothesis is not Hypothesis.NOISIER or e.size.max() > least]
 
     def _windowed(self, track: Track, scans: tuple[Epoch, ...]) -> Window:
         start, orbit = scans[0].track.belief, self.batch.orbit
@@ -150,9 +155,7 @@ class AnomalyTest:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
         best, explained = ranked[0], ranked[0].explains
-        certain = explained and best.log_evidence - ranked[1].log_evidence >= OVER_NEXT
-        certain = certain and (odds_over_free(ranked) >= OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
-        if doubtful < _MOST and not certain:
+        if doubtful < _MOST and not certain(ranked):
             return in_doubt
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
             reported = self._reported(track, window, best)
@@ -162,14 +165,20 @@ class AnomalyTest:
                 return reported, Verdict(0, Reason.DOUBTFUL)
         if doubtful < _FEWEST:
             return in_doubt
-        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis in _DISTURBANCES and explained):
-            before = with_history(track.doubtful[0].track, track).changed(recent=track.recent, levels=track.levels)
-            return self._used(before, track.doubtful), Verdict(1, Reason.OK)
+        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis in _USED and explained):
+            return self._used(self._allowing(track, best), track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
             return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
         if best.hypothesis is not Hypothesis.FROZEN or not explained:
             return self._by_agreement(track)
         return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
+
+    def _allowing(self, track: Track, found: Explanation) -> Track:
+        """The track before the doubtful scans with the disturbances or the noise that explain them."""
+        before = with_history(track.doubtful[0].track, track).changed(recent=track.recent)
+        if found.hypothesis is Hypothesis.NOISIER:
+            return before.changed(window=risen(before.window, found.size))
+        return self._disturbed(before, found) if found.hypothesis in _DISTURBANCES else before
 
     def _disturbed(self, track: Track, found: Explanation) -> Track:
         """The track with levels of the disturbances that explain the scans, until they are estimated from all poses."""
@@ -267,7 +276,10 @@ class AnomalyTest:
         """The track with the manoeuvre in its list; a later report of the same one replaces the first."""
         at_ns = window[0].track.belief.t_ns + round(best.after_s * 1e9)
         now_ns = track.manoeuvres[-1].detected_ns if track.pending else window[-1].prediction.belief.t_ns
-        found = Manoeuvre(at_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
+        (then, _), P = self.batch.propagated(track, window[0].track.belief, at_ns), best.P.copy()
+        turn = rotation(then.x.q_ab) @ skew(best.size[:3])  # the linear effect of the rate has the mean of varrho
+        P[3:, 3:] += turn @ then.P[VARRHO, VARRHO] @ turn.T
+        found = Manoeuvre(at_ns, best.after_1s_s, best.size[3:], best.size[:3], P, now_ns)
         return track.changed(manoeuvres=(*confirmed(track), found), pending=True)
 
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:

@@ -242,6 +242,7 @@ class BatchSchedule:
     def adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
         """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""
         window = filled(self.noise.base(track.R, track.window), result.factors, self.params.window)
+        window = replace(window, rise=track.window.rise)
         track = track.changed(mode="filter" if to_filter else "fit", window=window, since=0)
         return track.changed(belief=result.belief, batch=result, inflation=result.inflation)
 

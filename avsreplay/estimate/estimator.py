@@ -238,15 +238,16 @@ class Estimator:
         if track.mode not in ("fit", "filter"):
             return None
         if prediction.lag_s or prediction.blur is not None:  # the pose belongs to the mean instant of its points
-            fix, scaled = self.batch.fix(prediction, innovation), NoiseWindow.empty()
+            fix, scaled = self.batch.fix(prediction, innovation), NoiseWindow.empty(prediction.window.rise)
             belief, _ = propagated(track.belief, fix.t_ns, 0.0, 0.0, self.batch.orbit)
             left, R = innovation_vector(belief.x, fix.T_ac), in_camera(fix.C, fix.T_ac.q, belief.x.q_bc)
         else:
             belief, R, scaled = track.belief, innovation.R, prediction.window
             left = residual(belief.x, prediction.belief.x, innovation.alpha)
-        R, covariance = self.noise.rescaled(R, scaled, track.window), self.pose_covariance(belief)
-        gate, inflation = gate_of(innovation.dof, R, R + covariance), track.inflation
-        return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
+        used = track.recent[-1].prediction if track.recent else prediction
+        R = self.noise.rescaled(R, scaled, replace(track.window, rise=used.window.rise))
+        C, inflation = self.pose_covariance(belief), NO_INFLATION if track.inflation is None else track.inflation
+        return semidefinite(track.belief.P), C, left, R, inflation, gate_of(innovation.dof, R, R + C)
 
     def _common_1s(self, track: Track) -> Array:
         return common_1s(track, self.frame.position_out(track.belief.x.r_a, track.belief.t_ns))
@@ -258,11 +259,10 @@ class Estimator:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
         old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
         prediction = replace(prediction, lag_s=old.lag_s, blur=old.blur)
-        alpha = innovation_vector(prediction.belief.x, measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
-        R = self.noise.rescaled(epoch.innovation.R, epoch.prediction.window, track.window)
-        seen, P = epoch.innovation, prediction.belief.P
-        innovation = innovation_of(P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
-        innovation = replace(innovation, rms_m=seen.rms_m)
+        seen, R = epoch.innovation, self.noise.rescaled(epoch.innovation.R, old.window, track.window)
+        alpha = innovation_vector(prediction.belief.x, measured_pose(old.belief.x, seen.alpha))
+        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
+        innovation = replace(found, rms_m=seen.rms_m)
         used = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.estimate import _motion
+from avsreplay.estimate.bad_scans import bad_scans, frozen_sensor, noisier
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
@@ -24,12 +25,11 @@ from avsreplay.estimate.scan_window import (
     Explanation,
     Hypothesis,
     Window,
-    log_density,
     log_evidence,
     log_mean,
     mixed,
+    odds_over_free,
     offsets,
-    pose_difference,
     since_each,
     window_of,
 )
@@ -40,7 +40,6 @@ from avsreplay.records import Belief
 OVER_FREE, OVER_NEXT = 3.0, 2.0  # log odds over free motion and over the next hypothesis of an early decision
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
-_PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
 _LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
 _FINE, _REFINEMENTS, _NO_WEIGHT = 16, 5, 1e-4  # instants of a refined grid, refinements, share of evidence neglected
@@ -49,6 +48,7 @@ _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
 _A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
+_BEGINS = 4.6  # log of the prior odds of a manoeuvre over random disturbances that begin within the scans: 1 to 0.01
 _PER_S = 0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
 
 Ranked = tuple[tuple[Epoch, ...], list[Explanation]]
@@ -95,8 +95,9 @@ def explain(
         _disturbed(edges, between, white, free),
         _accelerated(edges, between, white, free, priors),
         _sensor_bias(window, white, free, priors, n),
-        _bad_scans(window, priors, first_doubtful, n),
-        _frozen(window, first_doubtful, n),
+        bad_scans(window, white, priors, first_doubtful),
+        noisier(window, white, first_doubtful),
+        frozen_sensor(window, first_doubtful),
     ]
     return tuple(epochs), _ranked(sorted(found, key=lambda e: -e.log_evidence), quiet)
 
@@ -109,9 +110,16 @@ def _ranked(found: list[Explanation], quiet: bool) -> list[Explanation]:
     """
     if not quiet or found[0].hypothesis is not Hypothesis.DISTURBED:
         return found
-    least = found[0].log_evidence - OVER_NEXT
+    least = found[0].log_evidence - _BEGINS
     close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and e.explains]
     return close + [e for e in found if e not in close]
+
+
+def certain(ranked: Sequence[Explanation]) -> bool:
+    """Return whether the most likely hypothesis explains the scans and the odds suffice for a decision."""
+    best, free = ranked[0], ranked[0].hypothesis is Hypothesis.FREE_MOTION
+    sure = best.explains and best.log_evidence - ranked[1].log_evidence >= OVER_NEXT
+    return sure and (free or odds_over_free(ranked) >= OVER_FREE)
 
 
 def linear(chi2: float, epochs: Sequence[Epoch]) -> bool:
@@ -318,24 +326,3 @@ def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors
     left = white - whitened @ u
     odds = log_mean(values.tolist()) + PRIOR_ODDS
     return Explanation(Hypothesis.SENSOR_BIAS, odds, float(left @ left), 6 * n - 6, onset, size=u, P=P)
-
-
-def _bad_scans(window: Window, priors: ChangePriors, first: int, n: int) -> Explanation:
-    """Every doubtful scan has an error of its own."""
-    C = window.C.copy()
-    extra = np.repeat([priors.position_m, priors.half_angle], 3) ** 2
-    for k in range(first, n):
-        C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += np.diag(extra)
-    value, chi2 = log_density(window.y, C)
-    value += PRIOR_ODDS + _PER_BAD_SCAN * (n - first)
-    return Explanation(Hypothesis.BAD_SCANS, value, chi2, 6 * n, first)
-
-
-def _frozen(window: Window, first: int, n: int) -> Explanation:
-    """The doubtful scans repeat the last accepted one: their poses equal its pose."""
-    value, chi2 = log_density(window.y[: 6 * first], window.C[: 6 * first, : 6 * first])
-    for k in range(first, n):
-        away = pose_difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
-        part, size = log_density(away, 2.0 * window.R[k])
-        value, chi2 = value + part, chi2 + size
-    return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, 6 * n, first)

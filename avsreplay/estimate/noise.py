@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,6 +33,7 @@ _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of t
 _LEVEL_DOF = 10.0  # degrees of freedom with which the level of the last fit counts in the window
 _MOST_COMMON = 0.8  # largest share from errors of the model: the views of two scans differ
 _LAGS = (5, 10, 20, 40)
+_CALM = 7.0  # log likelihood ratio of the usual noise over the risen one from which the rise has ended
 _EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
 _MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
 
@@ -64,6 +66,27 @@ class NoiseEpoch:
 
 
 @value_class
+class NoiseRise:
+    """A rise of the noise of the poses that their covariance does not contain.
+
+    Attributes:
+        factor: (6,) on the standard deviation of a pose (position, half angle); 1 without a rise.
+        calm: log likelihood ratio of the usual noise over the risen one in the last scans, 0 at least.
+    """
+
+    factor: Array
+    calm: float = 0.0
+
+    @property
+    def squared(self) -> Array:
+        """(6, 6) factors on the covariance of a pose."""
+        return self.factor[:, None] * self.factor
+
+
+NO_RISE = NoiseRise(_ONES)
+
+
+@value_class
 class NoiseWindow:
     """The last healthy epochs, oldest first, at most the window's length.
 
@@ -72,17 +95,19 @@ class NoiseWindow:
             the window is full.
         many_outliers: more than a tenth of the weight is lost: the poses contradict the estimate.
         level: (2,) variance of position and attitude relative to the base R by the last fit.
+        rise: of the noise, which the base R contains.
     """
 
     epochs: tuple[NoiseEpoch, ...]
     factors: Array
     many_outliers: bool
     level: tuple[float, float] = (1.0, 1.0)
+    rise: NoiseRise = NO_RISE
 
     @classmethod
-    def empty(cls) -> NoiseWindow:
+    def empty(cls, rise: NoiseRise = NO_RISE) -> NoiseWindow:
         """A window without epochs."""
-        return cls((), frozen(np.ones(6)), False)
+        return cls((), frozen(np.ones(6)), False, rise=rise)
 
 
 def push(
@@ -94,7 +119,32 @@ def push(
     known = np.linalg.solve(_blocks(base), _blocks(HPH)).trace(axis1=1, axis2=2) / window.factors[::3] ** 2
     left = np.maximum(3.0 - known, 0.0).tolist()
     epoch = NoiseEpoch(outer, HPH, (squares[0], squares[1]), (left[0], left[1]), weight)
-    return _summed((*window.epochs[-length + 1 :], epoch), length, window.level)
+    return replace(_summed((*window.epochs[-length + 1 :], epoch), length, window.level), rise=window.rise)
+
+
+def risen(window: NoiseWindow, factor: Array) -> NoiseWindow:
+    """The window with noise that has risen by a factor (6,) on the standard deviations."""
+    return replace(window, rise=NoiseRise(frozen(window.rise.factor * factor)))
+
+
+def lasting(window: NoiseWindow, seen: Innovation) -> NoiseWindow:
+    """The window after an accepted scan: without a rise if the last scans show the usual noise.
+
+    The log likelihood ratio of the two noise levels is summed over the scans (cumulative sum; Page, Biometrika 41,
+    1954).
+
+    Args:
+        window: before the scan.
+        seen: innovation of the scan, with the risen noise.
+    """
+    rise = window.rise
+    if rise is NO_RISE:
+        return window
+    usual = seen.S - seen.R + seen.R / rise.squared
+    chi2 = [float(seen.alpha @ np.linalg.solve(C, seen.alpha)) for C in (seen.S, usual)]
+    logs = np.linalg.slogdet(np.stack([seen.S, usual]))[1]
+    calm = max(0.0, rise.calm + 0.5 * float(chi2[0] - chi2[1] + logs[0] - logs[1]))
+    return replace(window, rise=NO_RISE if calm > _CALM else NoiseRise(rise.factor, calm))
 
 
 def _blocks(A: Array) -> Array:
@@ -219,8 +269,8 @@ class Noise:
         self._free = (_FREE_RAD, 0.5 * extent_m)
 
     def of(self, alignment: Alignment, x: State, window: NoiseWindow) -> Array:
-        """The base R adapted by the window, with the floor applied."""
-        R = self._base(alignment, x)
+        """The base R with the rise and the adaptation of the window, and with the floor applied."""
+        R = self._base(alignment, x) * window.rise.squared
         if self.params.adapt is Adaptation.MATRIX:
             R = matrix_noise(window, self._R0, self.params.window)
         elif self.params.adapt is Adaptation.SCALE:
@@ -233,10 +283,10 @@ class Noise:
         return np.asarray(R / (s[:, None] * s))
 
     def rescaled(self, R: Array, before: NoiseWindow, after: NoiseWindow) -> Array:
-        """An R that ``of`` returned with one window, as it is with the factors of another."""
-        if self.params.adapt is not Adaptation.SCALE:
-            return R
-        s = after.factors / before.factors
+        """An R that ``of`` returned with one window, as it is with the factors and the rise of another."""
+        s = after.rise.factor / before.rise.factor
+        if self.params.adapt is Adaptation.SCALE:
+            s = s * (after.factors / before.factors)
         return np.asarray(R * (s[:, None] * s))
 
     def dof(self, alignment: Alignment) -> float:

@@ -35,7 +35,7 @@ PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to fr
 _SUSPECTED = 5  # last scans in which a change may have begun
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # errors of the sensor: range, position, pose
-SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
+SCALES = (1.0, 0.1, 0.01)  # factors on the prior standard deviations: a large, a small or a very small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
 _LONGEST = 3.0  # interval between two of them over the median
@@ -53,6 +53,7 @@ class Hypothesis(Enum):
     SENSOR_BIAS = "sensor_bias"
     FROZEN = "frozen"  # the sensor repeats an old scan
     BAD_SCANS = "bad_scans"
+    NOISIER = "noisier"  # the errors of the poses are larger than their covariance
 
 
 @dataclass(frozen=True, slots=True)

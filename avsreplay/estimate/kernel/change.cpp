@@ -9,8 +9,8 @@
 namespace avs {
 namespace {
 
-constexpr int SIZES = 2;  // prior standard deviations of a change that are compared: a large and a small one
-constexpr double SIZE[SIZES] = {0.3, 0.1}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
+constexpr int SIZES = 4;  // prior standard deviations of a change that are compared: from a large to a very small one
+constexpr double SIZE[SIZES] = {0.3, 0.1, 0.03, 0.01}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
 
 constexpr double MOST = 600;  // log of a likelihood ratio, larger ones are cut
 
