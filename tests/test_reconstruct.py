@@ -509,6 +509,27 @@ def test_a_plate_of_the_cad_model_from_which_no_scan_has_a_return_is_reported(fu
     assert found.regions[0].size_m == pytest.approx(0.4 * np.sqrt(2.0), abs=0.06)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 8, 13])
+def test_the_origin_of_a_reconstruction_is_not_taken_for_the_sensor(full_turn_small, seed):
+    """Exact points of the sides of the CAD model that face half of all directions, in a frame with any origin.
+
+    No single position sees these points. With the origin as the camera these four comparisons ended without a pose.
+    """
+    rng, cad = np.random.default_rng(seed), builtin_surface()
+    corners = cad.vertices[cad.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    towards = rng.normal(size=3)
+    area = np.linalg.norm(normals, axis=1)
+    area *= normals @ towards > -0.2 * area * np.linalg.norm(towards)
+    face = rng.choice(len(area), 8000, p=area / area.sum())
+    points = np.einsum("ni,nij->nj", rng.dirichlet([1.0, 1.0, 1.0], 8000), corners[face])
+    moved = Pose(geometry.exp(rng.normal(size=3)), 2.0 * rng.normal(size=3)).apply(points)
+    found = deviations(replace(full_turn_small, points=moved, sights=()), cad)
+    assert found.median_m < 1e-9
+    assert found.inlier_ratio == 1.0
+    np.testing.assert_allclose(found.T_mc.apply(moved), points, atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def full_turn_small():
     scans, _ = turning(10, 15.0, noise_m=0.003)

@@ -247,9 +247,10 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
         UnreadableInput: no pose was found at which the two agree.
     """
     from avsreplay.register import Registrar
+    from avsreplay.register.params import Camera, RegisterParams
     from avsreplay.register.surface_index import SurfaceIndex
 
-    found = Registrar(cad).acquire(made.points)
+    found = Registrar(cad, RegisterParams(camera=Camera.NONE)).acquire(made.points)  # its points were seen from all sides
     if not found.measured:
         raise UnreadableInput(
             "the reconstruction does not fit the CAD model", where=cad.name, hint="check model and unit"
