@@ -10,7 +10,6 @@ import contextlib
 import ctypes
 import itertools
 import os
-import re
 import shutil
 import stat
 import sys
@@ -18,12 +17,12 @@ import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO
 
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.locks import PART, check_alone, lock
 
 STDOUT, _NAME_BYTES = Path("-"), 255
-_PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
 _CLEANED, _COUNTER = set[Path](), itertools.count()
 
 
@@ -165,7 +164,7 @@ def output_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
         own: names that may be in such a folder; everything else in the former folder is kept in the new one.
 
     Raises:
-        UsageError: the folder cannot be written (see ``check_output``).
+        UsageError: the folder cannot be written (see ``check_output``), or another process writes it.
         UnreadableInput: writing failed; the text states why.
     """
     check_output(path, folder=True)
@@ -208,7 +207,7 @@ def _exchange(one: Path, other: Path) -> bool:
 def _keep_others(place: Path, part: Path, own: Collection[str]) -> None:
     """Link everything in the former folder that is not its own into the new one."""
     for entry in place.iterdir() if place.is_dir() else ():
-        if entry.name in own or _PART.fullmatch(entry.name) or (part / entry.name).exists():
+        if entry.name in own or PART.fullmatch(entry.name) or (part / entry.name).exists():
             continue
         if entry.is_dir() and not entry.is_symlink():
             shutil.copytree(entry, part / entry.name, symlinks=True, copy_function=_link)
@@ -245,7 +244,7 @@ def _publish(part: Path, place: Path, overwrite: bool) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> UnreadableInput:
-    if _PART.fullmatch(path.parent.name):  # the final name of a folder, not the temporary one
+    if PART.fullmatch(path.parent.name):  # the final name of a folder, not the temporary one
         path = path.parent.with_name(path.parent.name[1:].rsplit(".", 3)[0]) / path.name
     hint = "nothing was changed; check the folder, its rights and its space"
     return UnreadableInput(f"cannot be written: {error.strerror or error}", where=str(path), hint=hint)
@@ -260,73 +259,27 @@ def _beside(place: Path) -> Path:
 def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
     """Create a locked temporary file or folder beside ``place`` and remove it at the end if it is still there."""
     _remove_stale(place.parent)
-    part, lock = _beside(place), None
+    part, held = _beside(place), None
     while True:  # between its creation and its lock, another process may take it for a leftover and remove it
         if folder:
             part.mkdir()
         else:
             part.touch(exist_ok=False)
         with contextlib.suppress(FileNotFoundError):
-            lock = _lock(part, wait=True)
+            held = lock(part, wait=True)
         if part.exists():
             break
-        if lock is not None:
-            os.close(lock)
-            lock = None
+        if held is not None:
+            os.close(held)
+            held = None
     try:
+        if folder and held is not None:
+            check_alone(part, place)
         yield part
     finally:
-        if lock is not None:
-            os.close(lock)
+        if held is not None:
+            os.close(held)
         _remove(part)
-
-
-def _lock(part: Path, *, wait: bool = False) -> int | None:
-    """Lock a temporary file or folder until this process ends; None if the system cannot. ``wait`` for another lock."""
-    if os.name == "nt":  # an open file cannot be removed there
-        return None
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        _flock(handle, wait)
-    except OSError:
-        os.close(handle)
-        return None
-    return handle
-
-
-def _flock(handle: int, wait: bool) -> None:
-    """Lock an open file; Windows has no such lock. Raises OSError if that is impossible."""
-    with contextlib.suppress(ModuleNotFoundError):
-        import fcntl
-
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-
-
-def open_alone(path: Path) -> BinaryIO:
-    """Open a file for writing, emptied, that no other process writes; the lock ends when the file is closed.
-
-    Args:
-        path: the file; it is created if it does not exist.
-
-    Raises:
-        UsageError: another process writes the file.
-        OSError: the file cannot be opened.
-    """
-    while True:
-        stream = path.open("ab")  # the content of another writer is not removed
-        try:
-            _flock(stream.fileno(), wait=False)
-        except BlockingIOError:
-            stream.close()
-            hint = "wait for it, or name another output"
-            raise UsageError("another process is writing it", where=str(path), hint=hint) from None
-        except OSError:
-            pass  # a file system that cannot lock files
-        if path.exists() and os.fstat(stream.fileno()).st_ino == path.stat().st_ino:
-            stream.seek(0)
-            stream.truncate()
-            return stream
-        stream.close()  # the other process renamed it between the two calls
 
 
 def _remove_stale(folder: Path) -> None:
@@ -336,12 +289,12 @@ def _remove_stale(folder: Path) -> None:
     _CLEANED.add(folder)
     with contextlib.suppress(OSError):
         for entry in folder.iterdir():
-            if _PART.fullmatch(entry.name):
-                lock = _lock(entry)
-                if lock is not None or (os.name == "nt" and entry.is_file()):  # it cannot remove a file that is open
+            if PART.fullmatch(entry.name):
+                held = lock(entry)
+                if held is not None or (os.name == "nt" and entry.is_file()):  # it cannot remove a file that is open
                     _remove(entry)
-                if lock is not None:
-                    os.close(lock)
+                if held is not None:
+                    os.close(held)
 
 
 def _remove(path: Path) -> None:

@@ -200,7 +200,7 @@ def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kep
 @pytest.mark.parametrize("output", [output_path, output_folder])
 def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(tmp_path, monkeypatch, output, locked) -> None:
     """The other process comes between the creation and the lock, or waits for the lock."""
-    lock, taken = files._lock, []
+    lock, taken = files.lock, []
 
     def late(part, **options):
         if taken:
@@ -210,12 +210,42 @@ def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(tmp_path
         files._remove(part)
         return made if locked else lock(part, **options)
 
-    monkeypatch.setattr(files, "_lock", late)
+    monkeypatch.setattr(files, "lock", late)
     with output(tmp_path / "x") as part:
         (part / "file" if part.is_dir() else part).write_text("complete")
     assert taken
     assert (tmp_path / "x" / "file" if output is output_folder else tmp_path / "x").read_text() == "complete"
     assert only(tmp_path, "x")
+
+
+@posix
+def test_a_folder_that_another_process_writes_is_refused_before_any_work(tmp_path: Path) -> None:
+    """Neither result may replace the other unseen; another folder beside it may be written."""
+    code = (
+        "import sys; from pathlib import Path; from avsreplay.files import output_folder\n"
+        "with output_folder(Path(sys.argv[1])) as part:\n"
+        "    print('ready', flush=True); sys.stdin.readline(); (part / 'rows').write_text('theirs')"
+    )
+    place, entered = tmp_path / "result", []
+
+    def write_folder(name: str) -> None:
+        with output_folder(tmp_path / name) as part:
+            entered.append(name)
+            (part / "rows").write_text("mine")
+
+    command = [sys.executable, "-c", code, str(place)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "ready\n"
+        with pytest.raises(UsageError, match="result: another process is writing it"):
+            write_folder("result")
+        write_folder("results")
+        assert entered == ["results"]
+        other.communicate("\n")
+    assert (place / "rows").read_text() == "theirs"
+    assert only(tmp_path, "result", "results")
+    write_folder("result")  # the other process has ended
+    assert (place / "rows").read_text() == "mine"
 
 
 def test_a_folder_is_replaced_when_it_is_complete(tmp_path: Path) -> None:

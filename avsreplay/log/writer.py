@@ -15,8 +15,9 @@ from types import TracebackType
 from typing import Any, BinaryIO, cast
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import STDOUT, check_output, is_stream, open_alone
+from avsreplay.files import STDOUT, check_output, is_stream
 from avsreplay.geometry import Pose
+from avsreplay.locks import open_alone
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS

@@ -250,7 +250,9 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     from avsreplay.register.params import Camera, RegisterParams
     from avsreplay.register.surface_index import SurfaceIndex
 
-    found = Registrar(cad, RegisterParams(camera=Camera.NONE)).acquire(made.points)  # its points were seen from all sides
+    found = Registrar(cad, RegisterParams(camera=Camera.NONE)).acquire(
+        made.points
+    )  # its points were seen from all sides
     if not found.measured:
         raise UnreadableInput(
             "the reconstruction does not fit the CAD model", where=cad.name, hint="check model and unit"
