@@ -16,6 +16,7 @@ from avsreplay.errors import UsageError
 from avsreplay.report import Summary
 from avsreplay.report.compare import METRICS
 from avsreplay.report.conclusion import HEADLINES, changes_table, conclude
+from avsreplay.report.intervals import interval_of_roots
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.table import make_console, print_table
 
@@ -52,7 +53,38 @@ def test_larger_errors_are_worse_and_smaller_ones_better(make_rows):
     worse, better = (_changes(conclude("x", [pair]))["all_pos_rmse_m"] for pair in ((base, other), (other, base)))
     assert (worse.word, better.word) == ("worse", "better")
     assert worse.low < worse.other - worse.base < worse.high
-    assert worse.low == pytest.approx(-better.high)
+    assert 1.0 + worse.low / worse.base == pytest.approx(1.0 / (1.0 + better.high / better.base))  # of the ratio
+
+
+def _with_errors(rows, errors):
+    return [dataclasses.replace(r, pos_err_m=float(e)) for r, e in zip(rows, errors, strict=True)]
+
+
+@pytest.mark.parametrize("slope", [2.0, 10.0, 100.0])
+def test_an_error_that_grows_during_the_run_is_worse(make_rows, slope):
+    """Larger in every block of scans; the differences of the mean squares spread over powers of ten."""
+    rows, base = make_rows(200), [r.pos_err_m for r in _noisy(make_rows(200), 1.0)]
+    other = [e * (1.0 + slope * k / 200.0) for k, e in enumerate(r.pos_err_m for r in _noisy(rows, 1.0, seed=6))]
+    change = _changes(conclude("b", [(Saved("a", _with_errors(rows, base)), Saved("b", _with_errors(rows, other)))]))
+    assert change["all_pos_rmse_m"].word == "worse"
+    assert change["all_pos_rmse_m"].low > 0.0
+
+
+def test_an_error_in_a_few_scans_is_no_evidence(make_rows):
+    """Smaller in nine blocks of ten and much larger in one: the rms is larger, but by chance in one place."""
+    rows = make_rows(200)
+    base = np.array([r.pos_err_m for r in _noisy(rows, 1.0)])
+    other = 0.9 * base
+    other[100:103] *= 100.0
+    change = _changes(conclude("b", [(Saved("a", _with_errors(rows, base)), Saved("b", _with_errors(rows, other)))]))
+    assert change["all_pos_rmse_m"].other > change["all_pos_rmse_m"].base
+    assert change["all_pos_rmse_m"].word == "no evidence"
+
+
+def test_a_block_without_an_error_has_an_interval():
+    """Where a ratio does not exist, the differences of the mean squares decide."""
+    low, high = interval_of_roots(np.array([0.0, 1.0, 4.0, 1.0, 1.0]), np.array([9.0, 9.0, 16.0, 9.0, 9.0]))
+    assert 0.0 < low < np.sqrt(10.4) - np.sqrt(1.4) < high
 
 
 def test_errors_that_differ_by_chance_are_no_evidence(make_rows):

@@ -5,9 +5,6 @@ A value that is missing in one run counts as worse; it is never skipped. A diffe
 blocks of consecutive scans, because successive errors are correlated. For groups of at least five runs, paired by name,
 every metric gets the interval of its mean paired difference. Counts of events need no interval; any other figure
 without one is reported as changed.
-
-Few blocks make the percentile interval too narrow; its level is that of the expanded percentile interval of T. C.
-Hesterberg, "What Teachers Should Know About the Bootstrap", The American Statistician 69 (2015), section 4.3.
 """
 
 from __future__ import annotations
@@ -24,6 +21,7 @@ from avsreplay.report import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.charts import values
 from avsreplay.report.compare import METRICS, different_inputs, metrics
 from avsreplay.report.golden import GoldenResult, compare_rows
+from avsreplay.report.intervals import interval_of_mean, interval_of_roots
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 
@@ -46,7 +44,7 @@ _COUNTS = {"scans", "healthy", "faults_missed", "scans_missed", "false_alarms", 
            "losses", "ogm_rank"}  # fmt: skip
 _MENTIONED = 0.1  # relative change of a main metric without an interval that the sentence mentions
 _MARKS = {"better": "good", "worse": "bad"}
-_BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 10, 5, 5, 5, 9999
+_BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
 
 
 def _scanwise(
@@ -205,22 +203,19 @@ def _interval(
 ) -> tuple[float, float] | None:
     """95 % interval of the mean difference; None with too few pairs of runs or of scans."""
     if len(pairs) >= _LEAST_RUNS:
-        return _bootstrap(np.array(differences))
+        return interval_of_mean(np.array(differences))
     if len(pairs) > 1 or not (name in _ROOTS or name in _MEANS):
         return None
     found = _blocks(pairs[0], _ROOTS.get(name) or _MEANS[name])
     if found is None:
         return None
-    blocks, base, other = found
-    if name in _ROOTS:  # sqrt(other) - sqrt(base) = (other - base) / (sqrt(other) + sqrt(base))
-        blocks = blocks / max(math.sqrt(base) + math.sqrt(other), 1e-300)
-    return _bootstrap(blocks, correlated=True)
+    return interval_of_roots(*found) if name in _ROOTS else interval_of_mean(found[1] - found[0], correlated=True)
 
 
 def _blocks(
     pair: tuple[ComparedRun, ComparedRun], value: Callable[[Sequence[Row]], Array]
-) -> tuple[Array, float, float] | None:
-    """Mean differences in blocks of consecutive scans that both runs have, and both means; None for too few scans."""
+) -> tuple[Array, Array] | None:
+    """Means of both runs in blocks of consecutive scans that both have; None for too few scans."""
     stamps: list[Array] = []
     found: list[Array] = []
     for run in pair:
@@ -232,35 +227,9 @@ def _blocks(
     count = min(_BLOCKS, len(shared) // _IN_BLOCK)
     if count < _LEAST_BLOCKS:
         return None
-    left, right = (figures[at] for figures, at in zip(found, places, strict=True))
-    blocks = np.array([part.mean() for part in np.array_split(right - left, count)])
-    return blocks, float(left.mean()), float(right.mean())
-
-
-def _bootstrap(differences: Array, *, correlated: bool = False) -> tuple[float, float]:
-    """95 % interval of the mean by a bootstrap with a fixed seed; ``correlated``: the differences are a time series.
-
-    The half widths are then multiplied by sqrt((1 + r) / (1 - r)), the factor of a first-order autoregressive series
-    with the lag-1 autocorrelation r of the differences (r is corrected for its bias of -1/n and limited to 0 to 0.8).
-    """
-    from scipy.stats import bootstrap, norm, t
-
-    n, mean = len(differences), float(np.mean(differences))
-    away = differences - mean
-    if not away.any():
-        return mean, mean
-    tail = float(norm.cdf(-math.sqrt(n / (n - 1)) * t.ppf(0.975, n - 1)))
-    found = bootstrap(
-        (differences,),
-        np.mean,
-        confidence_level=1.0 - 2.0 * tail,
-        n_resamples=_RESAMPLES,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    r = float((away[1:] * away[:-1]).sum() / np.square(away).sum()) + 1.0 / n if correlated else 0.0
-    factor = math.sqrt((1.0 + min(max(r, 0.0), 0.8)) / (1.0 - min(max(r, 0.0), 0.8)))
-    return mean + factor * (float(found.low) - mean), mean + factor * (float(found.high) - mean)
+    parts = [np.array_split(figures[at], count) for figures, at in zip(found, places, strict=True)]
+    base, other = (np.array([part.mean() for part in blocks]) for blocks in parts)
+    return base, other
 
 
 def _overall(changes: Sequence[Change], *, same: bool, rows: int) -> tuple[str, str]:

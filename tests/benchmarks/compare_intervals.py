@@ -11,7 +11,8 @@ import argparse
 import numpy as np
 from scipy.signal import lfilter
 
-from avsreplay.report.conclusion import _BLOCKS, _IN_BLOCK, _bootstrap
+from avsreplay.report.conclusion import _BLOCKS, _IN_BLOCK
+from avsreplay.report.intervals import interval_of_roots
 
 
 def contains_zero(rng: np.random.Generator, count: int, phi: float) -> bool:
@@ -19,8 +20,8 @@ def contains_zero(rng: np.random.Generator, count: int, phi: float) -> bool:
     drawn = rng.standard_normal((2, count)) * np.sqrt(1.0 - phi**2)
     drawn[:, 0] /= np.sqrt(1.0 - phi**2)
     base, other = np.square(0.01 + 0.003 * lfilter([1.0], [1.0, -phi], drawn, axis=1))
-    blocks = np.array_split(other - base, min(_BLOCKS, count // _IN_BLOCK))
-    low, high = _bootstrap(np.array([block.mean() for block in blocks]), correlated=True)
+    blocks = [np.array_split(squares, min(_BLOCKS, count // _IN_BLOCK)) for squares in (base, other)]
+    low, high = interval_of_roots(*(np.array([block.mean() for block in run]) for run in blocks))
     return low <= 0.0 <= high
 
 
