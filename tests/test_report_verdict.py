@@ -13,8 +13,9 @@ import pytest
 from avsreplay.records import Label
 from avsreplay.report import Summary
 from avsreplay.report.export import dump_document
+from avsreplay.report.moments import worst_moments
 from avsreplay.report.page import build_page
-from avsreplay.report.verdict import Grade, first_pose, verdict_of, worst_moments
+from avsreplay.report.verdict import Grade, first_pose, verdict_of
 
 HEADER = {"model": {"extent_m": 8.0}, "config": {"init": "log", "estimator": {"start": "auto"}, "plan": {}}}
 
@@ -50,6 +51,34 @@ def test_no_healthy_scan_fails(make_rows):
 def test_one_used_scan_of_35_fails(make_rows):
     rows = [dataclasses.replace(r, gamma=int(r.seq == 0), reason="fit_error") for r in make_rows(35, fault=None)]
     assert _judged(rows, labels=None).grade is Grade.FAIL
+
+
+@pytest.mark.parametrize(
+    ("column", "end", "said"),
+    [
+        (
+            "pos_err_m",
+            0.1,
+            "the position error grows: median 16 mm in the first third of the used scans, 85 mm in the last",
+        ),
+        (
+            "rot_err_deg",
+            1.0,
+            "the attitude error grows: median 0.16 deg in the first third of the used scans, 0.85 deg",
+        ),
+    ],
+)
+def test_an_error_that_grows_is_stated(make_rows, column, end, said):
+    """An error in proportion to the time. In the reverse order it decreases, as while an estimate converges."""
+    rows = make_rows(100, seed=3)
+    errors = [end * k / 100 for k in range(1, 101)]
+    grown = [dataclasses.replace(row, **{column: e}) for row, e in zip(rows, errors, strict=True)]
+    shrunk = [dataclasses.replace(row, **{column: e}) for row, e in zip(rows, errors[::-1], strict=True)]
+    assert next(reason.text for reason in _judged(grown).reasons if "grows" in reason.text).startswith(said)
+    assert not any("grows" in reason.text for reason in _judged(shrunk).reasons)
+    small = [dataclasses.replace(row, **{column: e / 100}) for row, e in zip(rows, errors, strict=True)]
+    assert not any("grows" in reason.text for reason in _judged(small).reasons)  # 0.8 mm of 8 m, 0.01 deg
+    assert not any("grows" in reason.text for reason in _judged(grown[:80], labels=None).reasons)  # too few scans
 
 
 def test_an_injected_blackout_is_no_reason(make_rows):

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
-from itertools import chain, groupby
+from itertools import chain
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array
-from avsreplay.report import NIS_LIMIT, Summary
+from avsreplay.report import Summary
 from avsreplay.report.charts import values
+from avsreplay.report.moments import Moment, median_of, plain, worst_moments
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
 
@@ -26,8 +23,12 @@ INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
 FALSE_ALARMS = 0.05  # share of the scans without a fault
 ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
+GROWTH, GROWTH_SCANS = (
+    3.0,
+    30,
+)  # ratio of the median errors of the last and the first third of the used scans, and scans
+GROWN_LEAST, TURNED_LEAST = 0.001, 0.25  # smallest median of the last third, over the extent, and [deg]
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
-MOMENTS = 5
 
 
 class Grade(Enum):
@@ -44,22 +45,6 @@ class Concern:
 
     grade: Grade
     text: str
-
-
-@value_class(eq=True)
-class Moment:
-    """An interval with a large error or without a used scan.
-
-    Attributes:
-        row: index of its worst row.  start_s, end_s: since the first scan.
-        what: what happened, with its size and what is usual.  cause: its cause by the rows.
-    """
-
-    row: int
-    start_s: float
-    end_s: float
-    what: str
-    cause: str
 
 
 @value_class(eq=True)
@@ -124,7 +109,9 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
     found = (
         _use(rows, summary),
-        _errors(rows, extent_m) if summary.healthy else (),  # without a used scan there is no estimate to judge
+        (*_errors(rows, extent_m), *_growth(rows, extent_m))
+        if summary.healthy
+        else (),  # without a used scan there is no estimate to judge
         _faults(summary, extent_m),
         _filter(rows, summary),
         _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
@@ -149,13 +136,13 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Scans that updated the filter; those with a harmful fault are not expected to."""
     common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
     if not summary.healthy:
-        yield Concern(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {_plain(common)})")
+        yield Concern(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {plain(common)})")
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
     if share < USED_CHECK:
         grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
-        text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {_plain(common)})"
+        text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {plain(common)})"
         yield Concern(grade, text)
     last = next((k for k in range(len(rows) - 1, -1, -1) if rows[k].gamma == 1), 0)
     if rows[-1].t_s - rows[last].t_s > 0.1 * (rows[-1].t_s - rows[0].t_s) and len(rows) - last > 3:
@@ -164,7 +151,7 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
-    position, turn = _median(values(rows, "pos_err_m")), _median(values(rows, "rot_err_deg"))
+    position, turn = median_of(values(rows, "pos_err_m")), median_of(values(rows, "rot_err_deg"))
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
@@ -172,11 +159,29 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     if turn is not None and turn > TURN_CHECK:
         grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
         yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
-    fit = _median(values([row for row in rows if row.gamma == 1], "rms_m"))
+    fit = median_of(values([row for row in rows if row.gamma == 1], "rms_m"))
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
         text = f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its extent"
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
+
+
+def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
+    """Errors of the used scans that are larger at the end than at the beginning."""
+    used = [row for row in rows if row.gamma == 1]
+    third = len(used) // 3
+    if third < GROWTH_SCANS:
+        return
+    for column, name, least in (
+        ("pos_err_m", "position", GROWN_LEAST * (extent_m or 0.0)),
+        ("rot_err_deg", "attitude", TURNED_LEAST),
+    ):
+        first, last = (median_of(values(part, column)) for part in (used[:third], used[-third:]))
+        if first is None or last is None or not least or last < max(GROWTH * first, least):
+            continue
+        sizes = [length_text(v) if column == "pos_err_m" else f"{v:.3g} deg" for v in (first, last)]
+        text = f"the {name} error grows: median {sizes[0]} in the first third of the used scans, {sizes[1]} in the last"
+        yield Concern(Grade.CHECK, text)
 
 
 def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
@@ -188,12 +193,12 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
         yield Concern(grade, f"{text}, with a position error up to {length_text(used)}")
     missed = [e for e in faults.episodes if e.harmful and not e.detected]
     if missed:
-        first = f"{_plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
+        first = f"{plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
         text = f"{len(missed)} of {faults.injected} harmful faults were not detected, the first: {first}"
         yield Concern(Grade.FAIL, text)
     lost = next((e for e in faults.episodes if e.lost), None)
     if lost is not None:
-        yield Concern(Grade.FAIL, f"the estimate did not recover from {_plain(lost.kind)} at {lost.start_s:.1f} s")
+        yield Concern(Grade.FAIL, f"the estimate did not recover from {plain(lost.kind)} at {lost.start_s:.1f} s")
     if faults.known and faults.false_alarm_rate > FALSE_ALARMS:
         share = 100 * faults.false_alarm_rate
         yield Concern(Grade.CHECK, f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)")
@@ -247,14 +252,6 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
             yield Concern(Grade.CHECK, f"{summary.counts[name]} {text}")
 
 
-def _plain(name: str) -> str:
-    return "no points" if name == "no_scan" else name.replace("_", " ")
-
-
-def _median(figures: Array) -> float | None:
-    return float(known[len(known) // 2]) if len(known := np.sort(figures[np.isfinite(figures)])) else None
-
-
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
     """Where the first pose came from, in words."""
     if not rows:
@@ -267,7 +264,7 @@ def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
         "given": f"the option --init {config.get('init', '')}".rstrip(),
         "measured": "the first measured pose",
         "acquired": "a global search without any prior knowledge",
-    }.get(rows[0].guess, _plain(rows[0].guess))
+    }.get(rows[0].guess, plain(rows[0].guess))
     return said + (f"; initialisation '{mode}'" if mode else "")
 
 
@@ -281,70 +278,3 @@ def _robot(header: Mapping[str, Any]) -> str:
     figures = (("a_max", "a_max_mps2", "m/s2"), ("latency", "latency_s", "s"))
     known = [(name, plan[key], unit) for name, key, unit in figures if isinstance(plan.get(key), (int, float))]
     return ", ".join(["default robot", *(f"{name} {value:g} {unit}" for name, value, unit in known)])
-
-
-def worst_moments(rows: Sequence[Row]) -> list[Moment]:
-    """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
-    kept: list[Moment] = []
-    for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
-        if len(kept) == MOMENTS:
-            break
-        if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
-            kept.append(moment)
-    return kept
-
-
-def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
-    """Candidates with a weight: flagged intervals and single scans whose error or NIS stands out."""
-    for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
-        places = list(group)
-        if flagged:
-            yield _flagged_moment(rows, places)
-    used = values(rows, "gamma") != 0.0  # the others belong to their interval
-    for column, name in (("pos_err_m", "position error"), ("rot_err_deg", "attitude error")):
-        typical = _median(figures := values(rows, column))
-        for value, k in _largest(figures, used):
-            if typical and value > 3.0 * typical:
-                size = length_text(value) if column == "pos_err_m" else f"{value:.3g} deg"
-                text = f"{name} {size}, {value / typical:.0f} times the median"
-                yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
-    for value, k in _largest(values(rows, "nis"), used):
-        if value > NIS_LIMIT:
-            text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
-            yield 3.0 * value / NIS_LIMIT, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
-
-
-def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]:
-    places = np.flatnonzero(used & np.isfinite(figures))
-    chosen = places[np.argsort(figures[places], kind="stable")[: -MOMENTS - 1 : -1]]
-    return list(zip(figures[chosen].tolist(), chosen.tolist(), strict=True))
-
-
-def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
-    worst = max(places, key=lambda k: rows[k].pos_err_m or 0.0)
-    largest = rows[worst].pos_err_m
-    error = "" if largest is None else f", position error up to {length_text(largest)}"
-    count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
-    span = rows[places[0]].t_s, rows[places[-1]].t_s
-    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1]))
-
-
-def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
-    """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or at k."""
-    row, end = rows[k], rows[k if last is None else last]
-    before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
-    if row.fault:
-        return f"injected: {_plain(row.fault)}"
-    moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
-    manoeuvre = "manoeuvre of the target" + ("" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s")
-    if row.gamma == 0:
-        return f"rejected: {_plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
-    if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
-        return manoeuvre if moved else "the estimate was reinitialised"
-    if k and rows[k - 1].gamma == 0:
-        return "first used scan after rejected scans"
-    if row.guess == "acquired":
-        return "pose found by a search"
-    if not row.converged:
-        return "the estimate is not converged"
-    return f"undetermined: {row.free_directions}" if row.free_directions else "none known"

@@ -1,0 +1,111 @@
+"""The worst moments of a run, with their cause: intervals without a used scan, scans whose error or NIS stands out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array
+from avsreplay.report import NIS_LIMIT
+from avsreplay.report.charts import values
+from avsreplay.report.summary_parts import length_text
+from avsreplay.rows import Row
+
+MOMENTS = 5
+
+
+@value_class(eq=True)
+class Moment:
+    """An interval with a large error or without a used scan.
+
+    Attributes:
+        row: index of its worst row.  start_s, end_s: since the first scan.
+        what: what happened, with its size and what is usual.  cause: its cause by the rows.
+    """
+
+    row: int
+    start_s: float
+    end_s: float
+    what: str
+    cause: str
+
+
+def worst_moments(rows: Sequence[Row]) -> list[Moment]:
+    """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
+    kept: list[Moment] = []
+    for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
+        if len(kept) == MOMENTS:
+            break
+        if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
+            kept.append(moment)
+    return kept
+
+
+def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
+    """Candidates with a weight: flagged intervals and single scans whose error or NIS stands out."""
+    for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
+        places = list(group)
+        if flagged:
+            yield _flagged_moment(rows, places)
+    used = values(rows, "gamma") != 0.0  # the others belong to their interval
+    for column, name in (("pos_err_m", "position error"), ("rot_err_deg", "attitude error")):
+        typical = median_of(figures := values(rows, column))
+        for value, k in _largest(figures, used):
+            if typical and value > 3.0 * typical:
+                size = length_text(value) if column == "pos_err_m" else f"{value:.3g} deg"
+                text = f"{name} {size}, {value / typical:.0f} times the median"
+                yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
+    for value, k in _largest(values(rows, "nis"), used):
+        if value > NIS_LIMIT:
+            text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
+            yield 3.0 * value / NIS_LIMIT, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
+
+
+def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]:
+    places = np.flatnonzero(used & np.isfinite(figures))
+    chosen = places[np.argsort(figures[places], kind="stable")[: -MOMENTS - 1 : -1]]
+    return list(zip(figures[chosen].tolist(), chosen.tolist(), strict=True))
+
+
+def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
+    worst = max(places, key=lambda k: rows[k].pos_err_m or 0.0)
+    largest = rows[worst].pos_err_m
+    error = "" if largest is None else f", position error up to {length_text(largest)}"
+    count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
+    span = rows[places[0]].t_s, rows[places[-1]].t_s
+    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1]))
+
+
+def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
+    """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or at k."""
+    row, end = rows[k], rows[k if last is None else last]
+    before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
+    if row.fault:
+        return f"injected: {plain(row.fault)}"
+    moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
+    manoeuvre = "manoeuvre of the target" + ("" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s")
+    if row.gamma == 0:
+        return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
+    if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
+        return manoeuvre if moved else "the estimate was reinitialised"
+    if k and rows[k - 1].gamma == 0:
+        return "first used scan after rejected scans"
+    if row.guess == "acquired":
+        return "pose found by a search"
+    if not row.converged:
+        return "the estimate is not converged"
+    return f"undetermined: {row.free_directions}" if row.free_directions else "none known"
+
+
+def plain(name: str) -> str:
+    """A status or reason in words."""
+    return "no points" if name == "no_scan" else name.replace("_", " ")
+
+
+def median_of(figures: Array) -> float | None:
+    """Median of the finite figures, None if there is none."""
+    return float(known[len(known) // 2]) if len(known := np.sort(figures[np.isfinite(figures)])) else None
