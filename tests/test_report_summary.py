@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from avsreplay.geometry import exp
+from avsreplay.estimate.chart import AXIS_PERMUTATIONS, permute_axes
+from avsreplay.geometry import exp, matrix
 from avsreplay.records import Label, State
 from avsreplay.report import NEES_BAND, NIS_BAND, Summary, SummaryFold
 from avsreplay.report.summary_parts import Statistics, events
@@ -234,6 +235,26 @@ def test_parameters_are_compared_with_the_truth(make_rows):
     assert found["mu"].one_sigma == 0.2
 
 
+def test_values_in_the_fixture_frame_are_the_same_for_every_order_of_the_principal_axes(make_rows):
+    """24 descriptions of one body: the paper's parameters differ and say so, the others have the same true values."""
+    in_c = {"rate_cx_radps": 0.1, "rate_cy_radps": 0.0, "rate_cz_radps": 0.02, "rate_c_1s_radps": 0.003,
+            "ixx": 0.3, "iyy": 0.3, "izz": 0.4, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0,
+            "moment_small": 0.3, "moment_middle": 0.3, "moment_large": 0.4,
+            "com_x_m": 0.1, "com_y_m": 0.2, "com_z_m": 0.3}  # fmt: skip
+    rows = make_rows(2, **in_c)
+    truths = [permute_axes(_truth(w_b=[0.1, -0.2, 0.3]), each) for each in AXIS_PERMUTATIONS]
+    found = [{p.name: p for p in Summary.fold(rows, truth=truth).parameters} for truth in truths]
+    free = {name for name, p in found[0].items() if p.note == "does not depend on the order of the principal axes"}
+    assert len(free) == 4
+    assert set(found[0]) - free == {"sigma1", "sigma2", "c (varrho)", "mu"}
+    assert "arbitrary" in found[0]["sigma1"].note
+    for name in free:
+        np.testing.assert_allclose([p[name].truth for p in found], [found[0][name].truth] * len(found), atol=1e-12)
+    assert len({tuple(np.round(p["c (varrho)"].truth, 9)) for p in found}) == len(found)
+    assert found[0]["rate in {C}"].truth == pytest.approx(matrix(exp([0, 0, 0.1])).T @ [0.1, -0.2, 0.3])
+    assert found[0]["rate in {C}"].one_sigma == 0.003
+
+
 def test_the_angle_of_mu_ignores_the_sign(make_rows):
     rows = make_rows(2, mux=0.0, muy=0.0, muz=-math.sin(0.05), muw=-math.cos(0.05))
     found = {p.name: p for p in Summary.fold(rows, truth=_truth()).parameters}
@@ -319,7 +340,7 @@ def test_moments_follow_from_the_inertia_ratios() -> None:
     from itertools import permutations
 
     from avsreplay.records import State
-    from avsreplay.report.summary_parts import _moments
+    from avsreplay.report.parameters import _moments
 
     for xx, yy, zz in permutations((4.0, 8.0, 5.0)):
         sigma = np.array([(yy - zz) / xx, (zz - xx) / yy])

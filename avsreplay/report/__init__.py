@@ -19,16 +19,8 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
-from avsreplay.report.summary_parts import (
-    Capture,
-    Drifting,
-    Parameter,
-    Statistics,
-    VelocityChange,
-    add_rows,
-    median,
-    parameters,
-)
+from avsreplay.report.parameters import Parameter, parameters
+from avsreplay.report.summary_parts import Capture, Drifting, Statistics, VelocityChange, add_rows, median
 from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom

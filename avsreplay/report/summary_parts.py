@@ -1,4 +1,4 @@
-"""Parts of a run's summary: statistics of a list of numbers, estimated constants, planning.
+"""Parts of a run's summary: statistics of a list of numbers, planning.
 
 Sums are correctly rounded, so a statistic does not depend on the order of its values.
 """
@@ -16,9 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from avsreplay import geometry
 from avsreplay.errors import value_class
-from avsreplay.records import State
 from avsreplay.rows import Row
 
 _BLOCK = 256  # rows whose values are taken together, so that they are read from the cache
@@ -183,99 +181,6 @@ def median(values: ArrayLike) -> float:
     ordered: list[float] = np.sort(np.asarray(values)).tolist()
     half = len(ordered) // 2
     return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
-
-
-@value_class(eq=True)
-class Parameter:
-    """An estimated constant at the last scan.
-
-    Attributes:
-        estimate, truth: its components, in ``unit``.  error: length of their difference (rotation angle for mu).
-        one_sigma: root of the trace of its covariance.
-    """
-
-    name: str
-    unit: str
-    estimate: tuple[float, ...]
-    truth: tuple[float, ...] | None
-    error: float | None
-    one_sigma: float | None
-
-    @property
-    def undetermined(self) -> bool:
-        """Return whether 1 sigma is that of a sigma or mu about which nothing is known."""
-        if self.one_sigma is None or self.name not in ("sigma1", "sigma2", "mu"):
-            return False
-        free = 131.0 if self.name == "mu" else 0.99 * math.sqrt(1.0 / 3.0 + self.estimate[0] ** 2)
-        return self.one_sigma >= free
-
-
-def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is given."""
-    sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
-    found = [
-        _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
-        _vector("sigma2", "", (row.sigma2,), sigma[1], row.sigma2_1s),
-        _vector(
-            "c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), None if truth is None else _tuple(truth.c_b), row.c_1s_m
-        ),
-        _attitude(row, truth),
-        *_in_fixture_frame(row, truth),
-    ]
-    return tuple(p for p in found if p is not None)
-
-
-def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
-    """Parameters that do not depend on the order of the principal axes: moments, inertia and mass centre in {C}."""
-    moments = tensor = centre = None
-    if truth is not None:
-        R_cb, found = geometry.matrix(truth.q_bc).T, _moments(truth)
-        moments, centre = _tuple(np.sort(found)), _tuple(-R_cb @ truth.c_b)
-        full = R_cb @ np.diag(found) @ R_cb.T
-        tensor = _tuple(full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-    small = (row.moment_small, row.moment_middle, row.moment_large)
-    entries = (row.ixx, row.iyy, row.izz, row.ixy, row.ixz, row.iyz)
-    return [
-        _vector("moments / sum, ascending: 1 2 3", "", small, moments, row.moments_1s),
-        _vector("inertia / trace in {C}: xx yy zz xy xz yz", "", entries, tensor, row.inertia_1s),
-        _vector("mass centre in {C}", "m", (row.com_x_m, row.com_y_m, row.com_z_m), centre, row.com_1s_m),
-    ]
-
-
-def _moments(x: State) -> geometry.Array:
-    """Principal moments (3,) over their sum, from the inertia ratios: I / tr I is 1 over the diagonal of B(sigma)."""
-    s1, s2 = float(x.sigma[0]), float(x.sigma[1])
-    xx = 1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2)
-    yy = 1.0 + (2.0 + s1 * s2 - s2) / (1.0 + s1)
-    zz = 1.0 + (2.0 + s1 - s2) / (1.0 + s1 * s2)
-    return 1.0 / np.array([xx, yy, zz])
-
-
-def _tuple(values: geometry.Array | None) -> tuple[float, ...] | None:
-    return None if values is None else tuple(float(v) for v in values)
-
-
-def _vector(
-    name: str, unit: str, values: tuple[float | None, ...], truth: tuple[float, ...] | None, one_sigma: float | None
-) -> Parameter | None:
-    estimate = tuple(v for v in values if v is not None)
-    if len(estimate) != len(values):
-        return None
-    error = None if truth is None else math.dist(estimate, truth)
-    return Parameter(name, unit, estimate, truth, error, one_sigma)
-
-
-def _attitude(row: Row, truth: State | None) -> Parameter | None:
-    """Attitude mu as a rotation vector [deg]; its error is the angle of mu_true^-1 mu."""
-    q = (row.mux, row.muy, row.muz, row.muw)
-    if None in q:
-        return None
-    estimate = _tuple(np.degrees(geometry.log(np.array(q, dtype=np.float64)))) or ()
-    if truth is None:
-        return Parameter("mu", "deg", estimate, None, None, row.mu_1s_deg)
-    apart = geometry.multiply(geometry.conjugate(truth.q_bc), np.array(q, dtype=np.float64))
-    error = math.degrees(float(geometry.angle(apart)))
-    return Parameter("mu", "deg", estimate, _tuple(np.degrees(geometry.log(truth.q_bc))), error, row.mu_1s_deg)
 
 
 @value_class(eq=True)

@@ -11,7 +11,8 @@ from rich.console import Console
 from avsreplay.records import BLOCKS
 from avsreplay.report import Errors, Summary
 from avsreplay.report.episodes import Episode
-from avsreplay.report.summary_parts import Capture, Parameter, Statistics, length_text, times
+from avsreplay.report.parameters import Parameter
+from avsreplay.report.summary_parts import Capture, Statistics, length_text, times
 from avsreplay.report.table import (
     Table,
     TableCell,
@@ -192,7 +193,11 @@ def parameter_table(summary: Summary) -> Table:
     """Estimated constants against the true ones, one row for each component."""
     heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
     rows = tuple(row for p in summary.parameters for row in _parameter_rows(p))
-    note = "error and 1 sigma of a vector are those of all its components together, given in its first row"
+    note = (
+        "error and 1 sigma of a vector are those of all its components together, given in its first row; sigma, c and"
+        " mu refer to one order of the principal axes, which is arbitrary (a permutation describes the same body), the"
+        " values below them do not depend on it"
+    )
     return Table("Parameters at the last scan", heads, rows, align="llr", note=note)
 
 
