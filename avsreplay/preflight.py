@@ -16,7 +16,8 @@ from avsreplay.register import Registrar, SensorFrame
 
 SCANS = 5
 OFF_THE_MODEL = 0.25  # distance of the grasp point from the bounding box, in extents, above which it is reported
-_POSES = 200  # measured poses examined
+_POSES, _PAIRS = 200, 50  # measured poses, and pairs of successive ones, that are examined
+LARGEST_STEP = 0.25  # from one pose to the next, over the extent (docs/poses.md)
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 
 
@@ -112,11 +113,29 @@ def _poses(source: Source, surface: Surface | None) -> list[Advice]:
     else:
         text = "the source states none: R0 of the estimator, adapted to the residuals"
         out.append(Advice("ok", "covariance", text, "--pose-sigma MM,DEG"))
+    out += _step(source, surface)
     if surface is not None and not surface.sha256:
         text = f"no model: limits are those of a target of {surface.extent:.3g} m"
         given = source.options.extent_m != SourceOptions().extent_m
         out.append(Advice("ok" if given else "check", "size", text, "" if given else "--extent METRES or --model FILE"))
     return out
+
+
+def _step(source: Source, surface: Surface | None) -> list[Advice]:
+    """The motion from one pose to the next, where it is too large for a target of this size."""
+    if surface is None:
+        return []
+    pairs = [(source.scan_at(seq).pose, source.scan_at(seq + 1).pose) for seq in _spread(len(source) - 1, _PAIRS)]
+    steps = [float(np.linalg.norm(b.T_ac.t - a.T_ac.t)) for a, b in pairs if a is not None and b is not None]
+    step = float(np.median(steps)) if steps else 0.0
+    if step <= LARGEST_STEP * surface.extent:
+        return []
+    text = (
+        f"the target moves {step:.3g} m from one pose to the next, {step / surface.extent:.2g} times its size"
+        f" ({LARGEST_STEP:g} is the most): check the size and the unit; a column named 'x [mm]' is in millimetres,"
+        " all other positions in metres"
+    )
+    return [Advice("fail", "unit", text)]
 
 
 def _share_on_model(source: Source, registrar: Registrar) -> float | None:
@@ -170,5 +189,8 @@ def _clock(info: LogInfo) -> list[Advice]:
     if not problems:
         text = f"median period {clock.period_s:.4g} s" if clock.period_s else "no period: a single scan"
         return [Advice("ok", "time stamps", text)]
-    option = "--clock log" if clock.clock == "header" else ""
-    return [Advice("check", "time stamps", f"time stamps of scans: {', '.join(problems)}", option)]
+    text = f"time stamps of scans: {', '.join(problems)}"
+    if not info.topics:  # files have no other clock
+        more = "; several recordings in one source must be split" if clock.back else ""
+        return [Advice("check", "time stamps", f"{text}{more}")]
+    return [Advice("check", "time stamps", text, "--clock log" if clock.clock == "header" else "")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from avsreplay.errors import AvsError, UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.log.cdr import pose_stamped
+from avsreplay.preflight import preflight
 from avsreplay.records import ScanStatus
 from avsreplay.run import Job, Run
 
@@ -99,6 +101,57 @@ def test_all_formats_give_the_same_rows(tmp_path, motion) -> None:
     named, _ = rows(csv(tmp_path / "a.csv", times, noisy))
     logged, _ = rows(mcap(tmp_path / "a.mcap", times, stamped(times, noisy)))
     assert named == expected == logged
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t", "; with decimal commas"])
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001)])
+@pytest.mark.parametrize(("time", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)])
+def test_separators_and_units_that_the_heading_names(tmp_path, motion, mark, unit, metres, time, ns) -> None:
+    times, _, noisy = motion
+    names = [f"t_{time}", *(f"{axis} [{unit}]" for axis in "xyz"), "qx", "qy", "qz", "qw"]
+    lines = [mark[0].join(names)]
+    for t, pose in zip(times[:4], noisy[:4], strict=True):
+        text = mark[0].join(
+            [f"{Decimal(t) / ns:f}", *map(repr, (pose.t / metres).tolist()), *map(repr, pose.q.tolist())]
+        )
+        lines.append(text.replace(".", ",") if "decimal" in mark else text)
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    with open_source(path, SourceOptions(poses=True)) as source:
+        for scan, t, pose in zip(source.scans(), times, noisy, strict=False):
+            assert scan.t_ns == t
+            np.testing.assert_allclose(scan.pose.T_ac.t, pose.t, rtol=1e-12)
+            np.testing.assert_allclose(scan.pose.T_ac.q, pose.q, atol=1e-12)
+
+
+def checks(path: Path, **options) -> dict[str, tuple[str, str, str]]:
+    with open_source(path, SourceOptions(poses=True, **options)) as source:
+        return {a.about: (a.grade, a.text, a.option) for a in preflight(source, source.header.surface)}
+
+
+def test_poses_in_millimetres_are_found_by_the_step_from_one_to_the_next(tmp_path, motion) -> None:
+    times, _, noisy = motion
+    log = tum(tmp_path / "mm.tum", times, [Pose(p.q, 1000.0 * p.t) for p in noisy])
+    grade, text, _ = checks(log, extent_m=2.0)["unit"]
+    assert grade == "fail"
+    assert "check the size and the unit" in text
+    assert "unit" not in checks(tum(tmp_path / "m.tum", times, noisy), extent_m=2.0)
+
+
+def test_stamps_of_a_file_that_step_back_are_no_reason_for_another_clock(tmp_path, motion) -> None:
+    times, _, noisy = motion
+    log = tum(tmp_path / "a.tum", [*times[:9], *times[:9]], [*noisy[:9], *noisy[:9]])
+    assert checks(log)["time stamps"] == (
+        "check", "time stamps of scans: 9 back; several recordings in one source must be split", ""
+    )  # fmt: skip
+
+
+def test_only_complete_options_are_printed_to_be_copied(cli, tmp_path, motion) -> None:
+    times, _, noisy = motion
+    log = tum(tmp_path / "a.tum", times[:9], noisy[:9])
+    done = cli("info", log, "--poses", "--rate", "2")
+    assert "--pose-sigma MM,DEG" in done.out
+    assert "options to add" not in done.out
 
 
 def test_the_covariance_of_a_message_is_the_noise_of_the_measurement(tmp_path, motion) -> None:

@@ -152,11 +152,16 @@ def _print(info: LogInfo, advice: list[Advice]) -> None:
     print_table(console, _topics(info))
     print_table(console, _faults(info))
     print_table(console, _checks(advice))
-    options = [a.option for a in advice if a.option and not any(w.isupper() and w.isalpha() for w in a.option.split())]
+    options = [a.option for a in advice if a.option and not any(map(_is_placeholder, a.option.split()))]
     if len(options) > 1:
         click.echo(f"options to add: {' '.join(dict.fromkeys(options))}")
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
+
+
+def _is_placeholder(word: str) -> bool:
+    """Whether a word of an option is to be replaced by a value, as FILE and X,Y,Z are."""
+    return word.isupper() and word.replace(",", "").isalpha()
 
 
 def _checks(found: list[Advice]) -> Table:

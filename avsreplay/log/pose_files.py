@@ -78,14 +78,16 @@ def _whole_ns(word: str) -> int:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
-    """Yield (file and line, words, whether it has commas) of each line that is not empty or a comment."""
+    """Yield (file and line, words, whether "," or ";" separates them) of each line that is not empty or a comment."""
     text = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True).decode("utf-8", "backslashreplace")
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
-            commas = "," in stripped
-            words = [word.strip() for word in stripped.split(",")] if commas else stripped.split()
-            yield f"{shown(path)}:{number}", words, commas
+            mark = next((mark for mark in ";,\t" if mark in stripped), None)
+            words = [word.strip() for word in line.split(mark)]
+            if mark == ";":  # the comma is then the decimal point
+                words = [word.replace(",", ".") for word in words]
+            yield f"{shown(path)}:{number}", words, mark in (";", ",")
 
 
 def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]:
@@ -158,13 +160,15 @@ class MeasuredFile:
 
 
 _NOT_A_NAME = re.compile(r"[^a-z0-9]+")
-_TIME = re.compile(r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ns|nsec))?$")
-_POSITION = re.compile(r"(?:p|t|pos|position|translation)?_?([xyz])(?:_?(m|mm))?$")
+_TIME = re.compile(r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ms|msec|us|usec|ns|nsec))?$")
+_POSITION = re.compile(r"(?:p|t|pos|position|translation)?_?([xyz])(?:_?(m|cm|mm))?$")
 _QUATERNION = re.compile(r"(?:q|quat|quaternion|orientation|rot|rotation)_?([xyzw])$")
+_EXPONENTS = {"m": "e-3", "u": "e-6", "n": "e-9"}  # by the first letter of a unit of time
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _POSE_COLUMNS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
 _FORMATS = (
     "TUM: t tx ty tz qx qy qz qw; KITTI: twelve numbers; EuRoC: t[ns],x,y,z,qw,qx,qy,qz;"
-    " CSV with a header: t_s (or t_ns), x, y, z, qx, qy, qz, qw in any order"
+    " CSV with a header: t_s (or t_ms, t_ns), x, y, z, qx, qy, qz, qw in any order"
 )
 
 
@@ -183,7 +187,7 @@ def read_measured(path: Path) -> MeasuredFile:
     poses, times, first = list[MeasuredPose | str](), list[int](), ""
     columns: _Columns | None = None
     for where, words, commas in _lines(path):
-        if columns is None and not poses and commas and not _is_number(words[0]):
+        if columns is None and not poses and len(words) > 1 and not _is_number(words[0]):
             columns = _columns(words, where)
             continue
         t_ns, pose = columns.read(words, where) if columns else _measured_line(words, commas, where)
@@ -201,10 +205,10 @@ def read_measured(path: Path) -> MeasuredFile:
 
 @value_class(eq=True)
 class _Columns:
-    """Where a CSV with a header has time and pose, and the factor from its unit of length to metres."""
+    """Where a CSV with a header has time and pose; the exponent of its unit of time, and its unit of length [m]."""
 
     time: int
-    nanoseconds: bool
+    exponent: str
     pose: tuple[int, ...]
     metres: float
 
@@ -213,9 +217,9 @@ class _Columns:
         if len(words) <= max(self.time, *self.pose):
             raise UnreadableInput(f"only {len(words)} columns", where=where, hint="one value for each named column")
         text = words[self.time]
-        t_ns = seconds_to_ns(f"{text}e-9" if self.nanoseconds else text)
+        t_ns = seconds_to_ns(text + self.exponent)
         if t_ns is None:
-            hint = "a column t_s is in seconds, t_ns in nanoseconds"
+            hint = "a column t_s is in seconds, t_ms in milliseconds, t_ns in nanoseconds"
             raise UnreadableInput(f"'{shown(text)}' is not a time", where=where, hint=hint)
         values = [_number(words[k]) for k in self.pose]
         return t_ns, _checked([*(self.metres * v for v in values[:3]), *values[3:]])
@@ -234,8 +238,9 @@ def _columns(names: list[str], where: str) -> _Columns:
     missing = [key for key in ("t", *_POSE_COLUMNS) if key not in found]
     if missing:
         raise UnreadableInput(f"no column for {', '.join(missing)}", where=where, hint=_FORMATS)
-    nanoseconds, metres = found["t"][1].startswith("n"), 0.001 if found["px"][1] == "mm" else 1.0
-    return _Columns(found["t"][0], nanoseconds, tuple(found[key][0] for key in _POSE_COLUMNS), metres)
+    place, unit = found["t"]
+    pose = tuple(found[key][0] for key in _POSE_COLUMNS)
+    return _Columns(place, _EXPONENTS.get(unit[0], ""), pose, _METRES[found["px"][1]])
 
 
 def _measured_line(words: list[str], commas: bool, where: str) -> tuple[int | None, MeasuredPose | str]:

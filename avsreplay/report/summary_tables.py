@@ -254,7 +254,7 @@ def _error_words(summary: Summary) -> list[str]:
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
     """(name, value) of everything that takes one line: scans, faults, filter, plan, counts, speed."""
     facts = [*_scan_facts(summary), *_fault_facts(summary), *_filter_facts(summary), *_plan_facts(summary)]
-    facts += [(name, str(count)) for name, count in summary.counts.items() if count]
+    facts += [(name.replace("_", " "), str(count)) for name, count in summary.counts.items() if count]
     if scans_per_s is not None:
         facts.append(("speed", f"{scans_per_s:.1f} scans/s"))
     return facts
