@@ -29,8 +29,7 @@ COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and 
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
 MODEL_POINTS, CELLS = 3000, 40  # sampled from the model; cells of the grid along its diagonal
-COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
-MOST_OF_EXTENT = 0.05  # distances from the model are limited to this; those of a pose that is accepted are less
+COARSE_OF_EXTENT, MIDDLE_OF_EXTENT, MOST_OF_EXTENT = 0.03, 0.02, 0.05  # distances of unexplained points; the largest
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
 FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # after two passes with part of the points one start in three is kept
 SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # after two more passes with all of them one start in eight is kept
@@ -92,11 +91,12 @@ class GlobalSearch:
 
     Attributes:
         symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the identity.
+        same_rad: rotation below which two poses nearly at one place are the same.
     """
 
     def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
         """Sample the model and find its near-symmetries, or take both from ``kept``; what is missing is added to it."""
-        self._target, self._params, self._sided = target, params, target.visibility.sided
+        self._target, self._params, self._sided, self.same_rad = target, params, target.visibility.sided, SAME_RAD
         self._extent = target.surface.extent
         if "sampled" not in kept:
             kept["sampled"] = np.stack(sample_evenly(target.surface, MODEL_POINTS))
@@ -297,10 +297,10 @@ class GlobalSearch:
         return self._refine.align_within(points, T_ca, width_m).T_ca
 
     def same(self, first: Pose, other: Pose) -> bool:
-        """Return whether two poses T_ca differ by less than 10 deg and 0.05 of the extent."""
+        """Return whether two poses T_ca differ by less than ``same_rad`` and 0.05 of the extent."""
         step = first @ other.inverse()  # in {C}
-        shift = float(np.linalg.norm(step.apply(self._middle) - self._middle))
-        return float(geometry.angle(step.q)) < SAME_RAD and shift < SAME_OF_EXTENT * self._extent
+        near = float(np.linalg.norm(step.apply(self._middle) - self._middle)) < SAME_OF_EXTENT * self._extent
+        return near and float(geometry.angle(step.q)) < self.same_rad
 
 
 def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:

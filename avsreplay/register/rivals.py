@@ -19,29 +19,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache
 from avsreplay.register.backend import Target, healthy_work
 from avsreplay.register.budget import TEST_WORK
-from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
 from avsreplay.register.neighbourhood import VALLEY_WORK
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
 from avsreplay.register.sampling import EMPTY, Rays, sample
-from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
+from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 
-VERSION = 4  # version of the kept data of a model
+VERSION = 9  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
-TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; to recognise the axis
-REVOLVED, FITS = 0.02, 2  # distance of turned surface on the model [extent]; fits of the axis
 TRIED = 16  # motions of a kind by which the marks are found
-AXIS_STRIDE = 3  # every n-th of these points determines the axis
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
 NEAR = 0.004  # a point within this (over the extent), or within three sigma of the noise, is on the model
 OFF = 2.0  # a point farther from the model than this many widths is off it
@@ -56,7 +51,6 @@ LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 STEPS, LONGEST_STEP = 24, 0.05  # steps from a mark towards the camera; the longest, over the extent
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
-FINALISTS = 2  # poses of each kind of motion that are refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,10 +78,12 @@ class NearSymmetry:
         self._target, self._test, self.search, self._gate = target, test, search, target.limits.gate_m
         surface = target.surface
         if "kinds" not in kept:
-            kinds = self._all_motions(*sample(surface, SAMPLES)) if len(surface.faces) else []
-            kept["kinds"] = np.concatenate(kinds) if kinds else np.zeros((0, 4, 4))
-            kept["ends"] = np.cumsum([len(motions) for motions in kinds], dtype=np.int64)
+            found = near_symmetries(search, target.index, *sample(surface, SAMPLES)) if len(surface.faces) else NONE
+            kept["kinds"] = np.concatenate([np.zeros((0, 4, 4)), *found.kinds])
+            kept["ends"] = np.cumsum([len(motions) for motions in found.kinds], dtype=np.int64)
+            kept["least"] = np.array(found.least_rad)
         self._kinds = np.split(kept["kinds"], kept["ends"])[:-1]
+        search.same_rad = min(search.same_rad, 0.5 * float(kept["least"]))
         if "marks" not in kept:
             kept["marks"], kept["marked"] = self._found()
         self._marks, self._normals = kept["marks"]
@@ -191,50 +187,16 @@ class NearSymmetry:
         free = view_directions(target.index, target.visibility, scan, at, self._gate)
         return [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
 
-    def _all_motions(self, points: Array, normals: Array) -> list[Array]:
-        """The near-symmetries (k, 4, 4) without the identity: turns about an axis of revolution, and the others."""
-        found = self.search.symmetries
-        axis = self._axis(points[::AXIS_STRIDE], normals[::AXIS_STRIDE]) if len(found) else None
-        if axis is None:
-            return [found[k::FINALISTS] for k in range(min(FINALISTS, len(found)))]
-        direction, centre = axis
-        turns = revolved(direction, centre, TURNS)
-        flips = [T for T in found if direction @ T[:3, :3] @ direction < -0.9]
-        return [turns[1:], *(turns @ flip for flip in flips[:1])]
-
-    def _axis(self, points: Array, normals: Array) -> tuple[Array, Array] | None:
-        """Direction and a point of the axis about which most of the surface is a surface of revolution, or None."""
-        on = np.ones(len(points), dtype=bool)
-        for _ in range(FITS):
-            centre = points[on].mean(axis=0)
-            J = normal_jacobian(points[on], normals[on])
-            info, radius = scaled_information(J.T @ J, int(on.sum()), centre)
-            x = np.linalg.eigh(info)[1][:, 0]
-            theta = x[:3] / radius
-            size = float(np.linalg.norm(theta))
-            if size * radius < 0.5:
-                return None
-            direction, centre = theta / size, centre + np.cross(theta, x[3:]) / size**2
-            turns = revolved(direction, centre, TURNS)[list(GENERIC_TURNS)]
-            width = REVOLVED * self._target.index.extent_m
-            on = np.all(self._distances(points, turns, width) < width, axis=0)
-            if on.mean() < 0.5:
-                return None
-        return direction, centre
-
-    def _distances(self, points: Array, motions: Array, most_m: float = np.inf) -> Array:
-        """Distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most ``most_m`` and the reach."""
-        moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
-        most_m = min(most_m, self._target.index.reach_m)
-        d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=most_m).d2
-        return np.sqrt(np.minimum(d2, most_m**2)).reshape(len(motions), -1)
+    def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
+        return distances(self._target.index, points, motions, most_m)
 
     def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> list[Pose]:
         """The best poses that the near-symmetries give, registered with the points off the model in their number.
 
-        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays pass through a mark. ``better``: only
-        poses that explain more points, by ``LEAST_RAYS`` at least.
+        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose pass through a mark.
+        ``better``: only poses that explain more points, by ``LEAST_RAYS`` at least.
         """
+        most_passed = self._passed(rays, T_ca)[0] + LEAST_RAYS
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
         few = [k[:: max(1, -(-len(k) // SCREENED))] for k in kinds]
@@ -250,7 +212,7 @@ class NearSymmetry:
                 start = Pose.from_matrix(motions[k]) @ T_ca
                 if any(self.search.same(start, other) for other in (T_ca, *kept)):
                     continue
-                if self._passed(rays, start)[0] < LEAST_RAYS:
+                if self._passed(rays, start)[0] < most_passed:
                     kept.append(start)
                 if len(kept) == most:
                     break
@@ -338,11 +300,3 @@ def surface_area(surface: Surface) -> float:
     """Return the area of a mesh [m^2]."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
-def revolved(axis: Array, centre: Array, count: int) -> Array:
-    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}; the first is the identity."""
-    R = geometry.matrix(geometry.exp(2.0 * np.pi / count * np.arange(count)[:, None] * axis))
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, centre - R @ centre
-    return T
