@@ -29,7 +29,7 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
-from avsreplay.register import Registrar, SensorFrame, allowed_scans, measured_alignment
+from avsreplay.register import Registrar, SensorFrame, effort_after, measured_alignment
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -275,7 +275,7 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
-    effort, carried = allowed_scans(state.failed), points is not scan.points
+    effort, carried = effort_after(state.failed), points is not scan.points
     unknown = None if state.track is None else stages.estimator.frame.motions_out(state.track.undetermined)
     found = SensorFrame(stages.registrar, scan.sensor).register(points, guess, scan.seq, carried, effort, unknown)
     return _measurement(stages, scan, points, found, origin)
@@ -283,7 +283,7 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
 
 def _acquire(stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
     """Register the scan without a guess."""
-    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, allowed_scans(state.failed))
+    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, effort_after(state.failed))
     return _measurement(stages, scan, points, found, origin)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +11,7 @@ import trimesh
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar, allowed_scans
+from avsreplay.register import Effort, Registrar, effort_after
 from avsreplay.register.backend import healthy_work
 from avsreplay.register.budget import HEALTHY_SCANS, Budget
 from avsreplay.register.contract import example_pose, view
@@ -183,18 +185,47 @@ def test_the_budget_counts_work() -> None:
 
 def test_searches_become_rare_where_none_finds_a_pose() -> None:
     """Five in a row, then after delays of at most half of the scans so far: 13 in 100 scans."""
-    searched = [failed for failed in range(100) if allowed_scans(failed) == HEALTHY_SCANS]
+    searched = [failed for failed in range(100) if effort_after(failed) is Effort.FULL]
     assert searched == [0, 1, 2, 3, 4, 6, 9, 13, 19, 28, 42, 63, 94]
 
 
-def test_with_the_work_of_one_registration_nothing_is_searched(registrar: Registrar) -> None:
+def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
+    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most; on few of 2000."""
+    tried = [failed for failed in range(2000) if effort_after(failed) is not Effort.NONE]
+    assert tried[:50] == list(range(50))
+    assert all(after - before <= 2 + before / 25 for before, after in itertools.pairwise(tried))
+    assert len(tried) < 300
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.006])
+def test_a_guess_that_few_points_confirm_gets_the_full_effort(
+    registrar: Registrar, surface: Surface, noise: float
+) -> None:
+    """As at the end of an occlusion at the start of a run; another body costs no registration of the whole scan."""
+    rng, T_ac = np.random.default_rng(SEED), example_pose()
+    scan = hidden_view(surface, T_ac, 3000, rng, noise * surface.extent)
+    guess = T_ac @ Pose(exp([0.04, -0.03, 0.05]), np.array([0.05, 0.05, -0.05]))
+    found = registrar.register(scan, guess, effort=Effort.GUESS)
+    assert found.status is AlignStatus.ALIGNED
+    assert np.degrees(geometry.angle((T_ac.inverse() @ found.T_ac).q)) < 1.0
+    assert not registrar.register(scan, guess, effort=Effort.NONE).measured
+    ball = rng.standard_normal((3000, 3))
+    ball *= 0.3 * surface.extent / np.linalg.norm(ball, axis=1)[:, None]
+    ball = ball[ball[:, 2] < 0.0] + T_ac.apply(surface.vertices).mean(axis=0)
+    other = registrar.register(ball, guess, effort=Effort.GUESS)
+    assert other.status is AlignStatus.BUDGET_EXHAUSTED
+    assert not other.measured
+    assert "postponed" in other.message
+
+
+def test_without_the_full_effort_nothing_is_searched(registrar: Registrar) -> None:
     scan = np.random.default_rng(SEED).normal(size=(2000, 3)) + np.array([0.0, 0.0, 9.0])
-    found = registrar.acquire(scan, effort=1)
+    found = registrar.acquire(scan, effort=Effort.GUESS)
     assert found.status is AlignStatus.BUDGET_EXHAUSTED
     assert not found.measured
     assert "postponed" in found.message
     assert registrar.register(
-        scan, Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0])), effort=1
+        scan, Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0])), effort=Effort.GUESS
     ).status not in (
         AlignStatus.ALIGNED,
         AlignStatus.MEASURED,

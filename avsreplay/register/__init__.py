@@ -30,7 +30,8 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
-from avsreplay.register.budget import allowed_scans
+from avsreplay.register.budget import Effort, effort_after
+from avsreplay.register.neighbourhood import POSTPONED
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import at_instant, diameter, without_scattered_points
@@ -43,12 +44,13 @@ from avsreplay.register.size import (
     matched_points,
     noise_bias,
     normal_jacobian,
+    spread_of,
 )
 from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = [
-    "POSES", "Availability", "Backend", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits",
-    "SensorFrame", "Target", "allowed_scans", "available", "measured_alignment",
+    "POSES", "Availability", "Backend", "Effort", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits",
+    "SensorFrame", "Target", "available", "effort_after", "measured_alignment",
 ]  # fmt: skip
 
 POINTS = 1500  # points used of each scan
@@ -93,7 +95,7 @@ class ModelCheck:
             surface: its model, vertices in {C} [m].
         """
         self._registrar, self._surface = registrar, surface
-        self._aligned, self._matched, self._ambiguous = 0, False, ""
+        self._aligned, self._matched, self._ambiguous, self._several = 0, False, "", 0  # several less no poses of scans
         self._systematic = 0.0  # sum of the shares of systematic errors
         self._size_open = self._duration_open = True  # whether the scans so far do not exclude a value to report
         self._deltas: list[float] = []
@@ -118,7 +120,9 @@ class ModelCheck:
         if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
             self._matched = True  # the scan is on the model, although the pose is not accepted
         if found.status is AlignStatus.AMBIGUOUS:
-            self._ambiguous = self._ambiguous or found.free_directions
+            self._ambiguous, self._several = self._ambiguous or found.free_directions, self._several + 1
+        elif found.status is not AlignStatus.ALIGNED and found.message != POSTPONED:
+            self._several -= 1
         on_model = found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_ON_MODEL
         if (found.status is AlignStatus.ALIGNED or on_model) and self._size_open:
             self._add_place(scan, found.T_ac)
@@ -166,7 +170,7 @@ class ModelCheck:
         delta, left = _last_unknown(A, y)
         without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(_BLOCKS)])
         uniform = _last_unknown(A[:, :, :9], y)[1]
-        return (1.0 + delta, _spread(without)) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
+        return (1.0 + delta, spread_of(without)) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
 
     def _add_place(self, scan: Scan, T_ac: Pose) -> None:
         self._placed += 1
@@ -187,13 +191,15 @@ class ModelCheck:
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
-        if not self._matched:
-            return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
-        if not self._aligned:
-            several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
-            return (several,) if self._ambiguous else ()
-        found = [note for note in (self._size(), self._duration_note()) if note is not None]
-        return (max(found)[1],) if found else ()  # each error makes the other one appear, with fewer standard errors
+        if self._aligned:
+            found = [note for note in (self._size(), self._duration_note()) if note is not None]
+            return (
+                (max(found)[1],) if found else ()
+            )  # each error makes the other one appear, with fewer standard errors
+        if self._ambiguous and self._several >= 0:
+            return (f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init",)
+        unmatched = None if self._matched and not self._ambiguous else self._unmatched
+        return () if unmatched is None else (self._diagnosis(unmatched),)
 
     def remark(self) -> str:
         """Return the share of systematic errors in the covariances of the poses where it is above a half; else ""."""
@@ -341,10 +347,4 @@ def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:
     """Weighted mean of values, its standard error, and the weights, at most ``MOST_WEIGHT`` times their median."""
     weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
     without = (weight @ values - weight * values) / (weight.sum() - weight)
-    return float(weight @ values / weight.sum()), _spread(without), weight
-
-
-def _spread(without: Array) -> float:
-    """Standard error of an estimate by the jackknife: from its values (n,) without one of n parts of the data each."""
-    n = len(without)
-    return float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+    return float(weight @ values / weight.sum()), spread_of(without), weight

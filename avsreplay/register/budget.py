@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import Enum
+
 from avsreplay.records import Alignment, Fit
 from avsreplay.register.backend import FIXED_WORK, healthy_work
 
@@ -11,13 +13,23 @@ SCATTER_WORK = 10  # cost per point of leaving out scattered points
 TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size
 PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
+SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
 
 
-def allowed_scans(failed: int) -> int:
-    """Return the work allowed for a scan, in units of an ordinary registration, before the first accepted pose.
+class Effort(Enum):
+    """What is done for a scan of a run without an accepted pose."""
+
+    FULL = "registration, restarts and searches"
+    GUESS = "the same if few points confirm the guess"
+    NONE = "nothing"
+
+
+def effort_after(failed: int) -> Effort:
+    """Return what is done for a scan before the first accepted pose.
 
     Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far.
-    Their total work therefore stays small with a wrong model, of which no pose explains any scan.
+    On the scans between the guess is tested, after n scans on one in 1 + n / ``SPARED`` of them. The total work
+    therefore stays small with a wrong model, of which no pose explains any scan.
 
     Args:
         failed: scans before this one on which no pose was accepted.
@@ -25,7 +37,9 @@ def allowed_scans(failed: int) -> int:
     due = 0
     while due < failed:
         due += max(1, due // 2)
-    return HEALTHY_SCANS if due == failed else 1
+    if due == failed:
+        return Effort.FULL
+    return Effort.NONE if failed % (1 + failed // SPARED) else Effort.GUESS
 
 
 class Budget:
@@ -33,12 +47,10 @@ class Budget:
 
     Args:
         points: points of the scan.
-        scans: most work in units of an ordinary registration; 1 leaves nothing for restarts and searches.
     """
 
-    def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
-        self.brief = scans <= 1
-        self.left = scans * healthy_work(points)
+    def __init__(self, points: int) -> None:
+        self.left = HEALTHY_SCANS * healthy_work(points)
         self.exhausted = False
 
     def spend(self, searches: int) -> None:

@@ -15,7 +15,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
-from avsreplay.register.budget import HEALTHY_SCANS, LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget
+from avsreplay.register.budget import LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget, Effort
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.neighbourhood import NOT_COMPARED, POSTPONED, Neighbourhood
@@ -70,7 +70,7 @@ class Registrar:
         guess: Pose,
         seq: int = 0,
         carried: bool = False,
-        effort: int = HEALTHY_SCANS,
+        effort: Effort = Effort.FULL,
         unknown: Array | None = None,
     ) -> Alignment:
         """Register a scan from a guess (eq:ICP).
@@ -82,7 +82,7 @@ class Registrar:
             seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
             carried: the points were carried to one instant by the predicted motion. Its error distorts the scan, but
                 the estimator models this (``Alignment.instants``), so that the covariance leaves it out.
-            effort: most work, in ordinary registrations; with 1 an implausible pose is neither restarted nor searched.
+            effort: what is done for the scan; without an accepted pose of the run it is limited.
             unknown: (6, k) motions d of the model of which the guess has no information; None for no motion. The scan
                 determines them only if no pose turned by a near-symmetry of the model explains it as well.
 
@@ -92,8 +92,9 @@ class Registrar:
         scan = usable_points(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points), guess):
             return refused
-        halves = seq % self.params.split_every == 0
-        budget = Budget(len(scan), effort)
+        halves, budget = seq % self.params.split_every == 0, Budget(len(scan))
+        if effort is Effort.NONE or (effort is Effort.GUESS and not self._restarter.hopeful(scan, guess, budget)):
+            return replace(quality.not_measured(len(scan), AlignStatus.BUDGET_EXHAUSTED, guess), message=POSTPONED)
         first = self._graded(scan, guess, budget, None, halves, carried, rough=True)
         if first.status is AlignStatus.FAILED:
             return first
@@ -103,15 +104,15 @@ class Registrar:
             found = self._searched(scan, found, carried, budget)
         elif not searched:
             found = self._unique(scan, guess, found, budget, halves, carried)
-            found = found if effort <= 1 else self._settled(scan, found, budget, halves, carried, unknown)
+            found = self._settled(scan, found, budget, halves, carried, unknown)
         return self._neighbourhood.with_bias(scan, found, budget)
 
-    def acquire(self, points: NDArray[Any], effort: int = HEALTHY_SCANS) -> Alignment:
+    def acquire(self, points: NDArray[Any], effort: Effort = Effort.FULL) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
 
         Args:
             points: as for :meth:`register`.
-            effort: most work, in ordinary registrations; with 1 nothing is measured, because a search costs more.
+            effort: what is done for the scan; only with the full effort it is searched.
 
         Returns:
             The pose T_ac with its quality. The status is NO_OVERLAP if no pose explains enough of the scan, and
@@ -121,9 +122,9 @@ class Registrar:
         scan = usable_points(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points)):
             return refused
-        if effort <= 1:
+        if effort is not Effort.FULL:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
-        budget = Budget(len(scan), effort)
+        budget = Budget(len(scan))
         return self._neighbourhood.with_bias(scan, self._acquire(scan, budget, False), budget)
 
     def _acquire(
@@ -252,14 +253,13 @@ class Registrar:
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
         angle = float(geometry.angle(geometry.multiply(geometry.conjugate(guess.q), found.T_ac.q)))
-        if not found.measured or angle <= TURNED_RAD:
-            return False
-        free = found.status is AlignStatus.DEGENERATE
-        return angle > FAR_RAD or (not free and len(self._symmetry.search.symmetries) > 0)
+        if not found.measured or angle <= TURNED_RAD or angle > FAR_RAD:
+            return found.measured and angle > FAR_RAD
+        return found.status is not AlignStatus.DEGENERATE and len(self._symmetry.search.symmetries) > 0
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        if not budget.brief and budget.allows(self._symmetry.search_work(len(scan), 0)):
+        if budget.allows(self._symmetry.search_work(len(scan), 0)):
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED)
 
@@ -280,7 +280,7 @@ class Registrar:
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
         work = self._symmetry.search_work(len(scan), 0) if overlap else 0
-        for step in () if budget.brief else steps:
+        for step in steps:
             if step == "search":
                 known = final.T_ac.inverse() if final.measured else None
                 if overlap and (found := self._acquire(scan, budget, carried, 1, known)).status in ACCEPTED:
@@ -297,7 +297,7 @@ class Registrar:
                 return self._restarter.consistent(few, guess, final), False
         if not reason:
             return final, False
-        status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted or budget.brief else AlignStatus.IMPLAUSIBLE
+        status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
     def _regraded(
@@ -306,7 +306,7 @@ class Registrar:
         """Register with a rejection distance that follows the noise; among other objects also along the valley."""
         width = self._restarter.width(kept)
         found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO or budget.brief:
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
             return found
         moved = self._neighbourhood.along_valley(few, found.T_ac.inverse(), budget)
         if moved is None:
@@ -334,7 +334,7 @@ class Registrar:
         start = T_ca = guess.inverse()
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         options = (self.params, halves, self._accuracy, not carried, start)
-        for last in (budget.brief, True):
+        for last in (False, True):
             fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left, rough and not last)
             if isinstance(fit, str):
                 return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)

@@ -27,7 +27,7 @@ from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
 POOR_OF_GATE = 0.3  # with at least LEAST_RATIO of inliers and a smaller rms (in units of the gate) a fit is close
-POINTS = PART  # points of the scan used by restarts
+POINTS, FEW = PART, 150  # points of the scan used by restarts, and those that show whether a guess is hopeful
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
@@ -231,6 +231,14 @@ class Restarter:
             budget.spend(found.work + PASS_WORK)
         budget.spend(MEASURED_WORK * len(points))
         return self.measure(points, T_ca)
+
+    def hopeful(self, scan: NDArray[Any], guess: Pose, budget: Budget) -> bool:
+        """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are mostly on the model."""
+        few = scan[:: max(1, len(scan) // FEW)]
+        found = self.graduated(few, guess.inverse(), self._wide, budget)
+        width = max(self._target.limits.gate_m, 3.0 * found.noise_m)
+        on = float(np.mean(found.distance < width))
+        return found.noise_m <= NOISE_OF_EXTENT * self._extent and on >= LEAST_RATIO
 
     def best(
         self,

@@ -324,3 +324,9 @@ def _effect(rows: _Rows, B: Array) -> float:
     random = float(rows.left @ rows.left) / len(rows.left) / s[kept] ** 2
     variance = max(0.0, float(np.mean(amplitudes**2 - random)))
     return float(np.sqrt(variance * np.sum((change @ Vt.T[:, kept]) ** 2)))
+
+
+def spread_of(without: Array) -> float:
+    """Return the standard error of an estimate by the jackknife: from its values (n,) without one of n parts each."""
+    n = len(without)
+    return float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
