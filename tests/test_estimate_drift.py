@@ -16,9 +16,9 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors, to_state
 from avsreplay.estimate.disturbance_schedule import _significant
-from avsreplay.estimate.drift import DrivenHypothesis, find_drift, poor_fit
+from avsreplay.estimate.drift import DrivenHypothesis, find_drift
 from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, followed
-from avsreplay.estimate.driven_fit import fit_driven, without_drift
+from avsreplay.estimate.driven_fit import fit_driven, poor_fit, step_columns, without_drift
 from avsreplay.estimate.driven_motion import driven_motion, fit_jointly, is_bounded
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of, rough_state, weak_prior
@@ -73,6 +73,34 @@ def test_a_constant_force_is_found_with_its_onset(seed: int) -> None:
     assert np.linalg.norm(off) < 4.0 * np.sqrt(np.trace(belief.P_u[3:, 3:]))
     assert np.linalg.norm(belief.u[3:]) > 10.0 * np.sqrt(np.trace(belief.P_u[3:, 3:]))
     assert not belief.u[:3].any()
+
+
+@pytest.mark.parametrize("velocity", [0.004, 0.02])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_single_change_of_the_velocity_is_no_constant_force(velocity: float, seed: int) -> None:
+    """Until some time after the change, an acceleration that begins before it explains the poses nearly as well."""
+    for seconds in (52.0, 60.0):
+        case = surprises.Case("step", velocity=velocity, seconds=seconds)
+        assert found_in(fixes_of(case, seed), case, seed) is None
+
+
+def test_the_effect_of_a_step_is_that_on_the_poses_after_it() -> None:
+    """Columns against the residuals of poses of which those after an instant have another velocity."""
+    case, at_s, step = surprises.Case("clean", seconds=30.0), 11.75, np.array([1e-4, -2e-4, 3e-4])
+    times, states, _, _ = surprises.world_of(case, 1)
+    alignments, start = surprises.measured(case, times, states, 1), to_chart(states[0])
+    found = []
+    for size in (0.0, 1.0):
+        moves = (max(0.0, t - at_s) * size * step for t in times)
+        poses = zip(times, alignments, moves, strict=True)
+        fixes = tuple(PoseFix(round(t * 1e9), Pose(a.T_ac.q, a.T_ac.t + d), a.covariance) for t, a, d in poses)
+        prior = weak_prior(poses_of(fixes), PARAMS)
+        found.append(whole(fit_driven(poses_of(fixes), start, prior, np.ones(2), 0.0, np.zeros(6))))
+    columns = step_columns(found[0], np.array([at_s]))[0][:, 3:] @ step
+    J, free = found[0].J, found[0].e
+    y = -np.linalg.solve(J.T @ J + found[0].info, J.T @ columns)  # how the fit follows the step
+    left = columns + J @ y
+    assert found[1].e - free == pytest.approx(-left, abs=0.02 * np.abs(left).max())
 
 
 def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:

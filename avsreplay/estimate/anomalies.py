@@ -48,7 +48,6 @@ from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_sc
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
-from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
@@ -75,9 +74,8 @@ class AnomalyTest:
     def __init__(self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Replay) -> None:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
-        speed = 0.2 * given(params.start_vel_1s_mps)
         self._extent_m = extent_m
-        self._priors = ChangePriors(0.1 * params.start_rate_1s_radps, speed, 0.05 * extent_m, 0.05)
+        self._priors = ChangePriors(*params.change_1s, 0.05 * extent_m, 0.05)
 
     def step(
         self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]

@@ -23,10 +23,11 @@ from avsreplay.estimate.driven_fit import (
     DrivenFit,
     drift_unknowns,
     fit_driven,
+    poor_fit,
+    step_columns,
     without_drift,
 )
 from avsreplay.estimate.driven_motion import fit_jointly, is_bounded
-from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import (
@@ -34,7 +35,6 @@ from avsreplay.estimate.noise_levels import (
     NO_LEVELS,
     NoiseLevels,
     disturbed_likelihood,
-    pose_error_covariance,
 )
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
@@ -44,13 +44,15 @@ from avsreplay.geometry import Array
 _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and around the most likely one
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
-_CONSTANT = 2.5  # log odds over random disturbances: 3 less 0.5, the mean by which the likeliest density gains (Wilks)
+_CONSTANT = (
+    2.5  # log odds over one step of the velocity and random disturbances: 3 less 0.5, the likeliest's gain (Wilks)
+)
 _ROUNDS = 3  # largest number of joint fits with another onset or kind
 _LEAST_GAIN = 0.5  # decrease of the cost (half chi-square) above which another linearisation follows
-_CONFIDENCE = 3.09  # standard deviations of a normal distribution with 99.9 % below
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
+_SMALL = 0.1  # prior 1 sigma of a change that is compared with a drift, over that of a manoeuvre
 _NO_WEIGHT = 1e-3  # probability of an onset hypothesis that is left out
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 
@@ -97,7 +99,7 @@ def find_drift(
         nearer = yield from fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
         free = min(free, nearer, key=lambda f: f.cost)
         yield _size(free)
-        if _odds(best, frame, free) < _FOUND:
+        if _odds(best, frame, free) < _FOUND or best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT:
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
         if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
@@ -198,22 +200,6 @@ def _from_sphere(
     return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
 
 
-def poor_fit(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
-    """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
-
-    The noise is at least as claimed. Errors of near views are correlated, so that the squared residuals are not
-    chi-square. Their sum is approximated by the multiple of a chi-square value that has its mean and variance
-    (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by Wilson and Hilferty.
-    """
-    white, common = ((max(1.0, a), max(1.0, b)) for a, b in (levels.white, levels.common))
-    V = pose_error_covariance(frame.points, NoiseLevels(white, common), factors)
-    total, squares = 3.0 * float(np.trace(V, axis1=1, axis2=2).sum()), 3.0 * float((V * V).sum())
-    mean = total * max(1.0 - (DIM + 6) / (6 * len(frame.points)), 1.0 / len(frame.points))
-    dof = mean * total / squares
-    bound = mean * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
-    return 2.0 * frame.cost > bound
-
-
 def _size(fitted: DrivenFit) -> int:
     """Work of a fit and of what follows from it, in linearised poses."""
     return 12 * len(fitted.points) + len(fitted.poses)
@@ -296,14 +282,25 @@ def _compared(frame: DrivenFit, onsets: Array, widths: Array) -> list[_Found]:
     B = frame.equivalents(np.concatenate([times, onsets]))
     here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
     columns = (here - frame.G.reshape(-1, 12) @ B[n:]) * late[:, :, None]
-    back = np.swapaxes(columns, 1, 2)
-    products = frame.J.T @ frame.J, frame.J.T @ frame.e, frame.J.T @ columns, back @ columns, back @ frame.e
-    inflation = 1.0
+    products, inflation = _products(frame, columns), 1.0
     for _ in range(2):
         found = _explained(frame, products, onsets, widths, inflation)
         k = int(np.argmax([f.log_odds for f in found]))
         inflation = _remaining_noise(frame, columns[k], found[k])
     return found
+
+
+def _products(frame: DrivenFit, columns: Array) -> tuple[Array, ...]:
+    back = np.swapaxes(columns, 1, 2)
+    return frame.J.T @ frame.J, frame.J.T @ frame.e, frame.J.T @ columns, back @ columns, back @ frame.e
+
+
+def _step_odds(frame: DrivenFit, params: EstimatorParams, noise: float) -> float:
+    """Log odds over free motion of the most likely single change of the velocities: it may explain the poses better."""
+    times, widths = frame.points.times_s, _SMALL * np.repeat(params.change_1s, 3)
+    instants = 0.5 * (times[1:] + times[:-1])
+    found = _explained(frame, _products(frame, step_columns(frame, instants)), instants, widths, noise)
+    return max(f.log_odds for f in found)
 
 
 def _explained(

@@ -6,6 +6,8 @@ it. About this fit the problem is linear in the initial values, the acceleration
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,13 +18,15 @@ from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents, drive_of
 from avsreplay.estimate.dynamics import translated
-from avsreplay.estimate.error_state import REACHED
-from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
+from avsreplay.estimate.error_state import DIM, REACHED
+from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, pose_error_covariance
 from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 NO_ACCELERATION = np.zeros(6)
+_CONFIDENCE = 3.09  # standard deviations of a normal distribution with 99.9 % below
+_HALF_S = 1e-3  # half the time over which a derivative is taken [s]
 
 
 @value_class
@@ -116,6 +120,33 @@ def drift_columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Arr
 
 def _columns(G: Array, B: Array, times_s: Array, onset_s: float) -> Array:
     return np.asarray((G @ (B[:-1] - B[-1])) * (times_s > onset_s)[:, None, None])
+
+
+def step_columns(fitted: DrivenFit, instants_s: Array) -> Array:
+    """White columns (k, 6n, 6) of the residuals by a change of rate and velocity at each instant (k,), about the fit.
+
+    Such a change is a large acceleration for a short time: its effect is the derivative of that of an acceleration
+    by its onset.
+    """
+    B, k = fitted.equivalents(np.concatenate([instants_s - _HALF_S, instants_s + _HALF_S])), len(instants_s)
+    columns = fitted.G.reshape(-1, fitted.G.shape[2]) @ ((B[k:] - B[:k]) / (2.0 * _HALF_S))
+    return np.asarray(columns * (np.repeat(fitted.points.times_s, 6) > instants_s[:, None])[:, :, None])
+
+
+def poor_fit(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
+    """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
+
+    The noise is at least as claimed. Errors of near views are correlated, so that the squared residuals are not
+    chi-square. Their sum is approximated by the multiple of a chi-square value that has its mean and variance
+    (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by Wilson and Hilferty.
+    """
+    white, common = ((max(1.0, a), max(1.0, b)) for a, b in (levels.white, levels.common))
+    V = pose_error_covariance(frame.points, NoiseLevels(white, common), factors)
+    total, squares = 3.0 * float(np.trace(V, axis1=1, axis2=2).sum()), 3.0 * float((V * V).sum())
+    mean = total * max(1.0 - (DIM + 6) / (6 * len(frame.points)), 1.0 / len(frame.points))
+    dof = mean * total / squares
+    bound = mean * (1.0 - 2.0 / (9.0 * dof) + _CONFIDENCE * math.sqrt(2.0 / (9.0 * dof))) ** 3
+    return 2.0 * frame.cost > bound
 
 
 def levels_of(

@@ -250,6 +250,11 @@ class EstimatorParams(Settings):
         return self.torque_noise_radps15, self.force_noise_mps15
 
     @property
+    def change_1s(self) -> tuple[float, float]:
+        """Prior 1 sigma of a change of the rate [rad/s] and of the velocity [m/s]; auto values must be filled in."""
+        return 0.1 * self.start_rate_1s_radps, 0.2 * given(self.start_vel_1s_mps)
+
+    @property
     def start_1s(self) -> Array:
         """(20,) standard deviations of a start from a guessed pose alone."""
         half = 0.5 * math.radians(self.start_rot_1s_deg), 0.5 * math.radians(self.start_mu_1s_deg)
