@@ -81,6 +81,22 @@ def test_an_error_that_grows_is_stated(make_rows, column, end, said):
     assert not any("grows" in reason.text for reason in _judged(grown[:80], labels=None).reasons)  # too few scans
 
 
+@pytest.mark.parametrize(("spread", "said"), [(0.001, True), (0.2, False)])
+def test_errors_that_are_the_same_in_all_scans_are_those_of_another_frame(make_rows, spread, said):
+    """A constant displacement and rotation between the frames of model and truth, with the noise of the poses."""
+    rng, rows = np.random.default_rng(4), make_rows(100, seed=3)
+    noise = 1.0 + spread * rng.normal(size=(100, 2))
+    moved = [
+        dataclasses.replace(row, pos_err_m=3.7 * float(a), rot_err_deg=68.0 * float(b))
+        for row, (a, b) in zip(rows, noise, strict=True)
+    ]
+    found = _judged(moved)
+    assert found.grade is Grade.FAIL
+    assert found.reasons[0].text.startswith("the errors are the same in all used scans") == said
+    small = [dataclasses.replace(row, pos_err_m=0.01, rot_err_deg=0.5) for row in rows]
+    assert not any("the same in all" in reason.text for reason in _judged(small).reasons)
+
+
 def test_an_injected_blackout_is_no_reason(make_rows):
     rows = make_rows(100, seed=3, blackout=range(20, 80))
     labels = [Label("full_occlusion", rows[20].t_ns, rows[79].t_ns)]

@@ -11,6 +11,8 @@ from enum import Enum
 from itertools import chain
 from typing import Any
 
+import numpy as np
+
 from avsreplay.errors import value_class
 from avsreplay.report import Summary
 from avsreplay.report.charts import values
@@ -28,6 +30,7 @@ GROWTH, GROWTH_SCANS = (
     30,
 )  # ratio of the median errors of the last and the first third of the used scans, and scans
 GROWN_LEAST, TURNED_LEAST = 0.001, 0.25  # smallest median of the last third, over the extent, and [deg]
+SAME_ERROR = 0.02  # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -152,6 +155,9 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
     position, turn = median_of(values(rows, "pos_err_m")), median_of(values(rows, "rot_err_deg"))
+    share = position / extent_m if position is not None and extent_m else 0.0
+    if share > ERROR_CHECK or (turn or 0.0) > TURN_CHECK:
+        yield from _frame(rows, Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK)
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
@@ -164,6 +170,23 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
         share = 100 * fit / extent_m
         text = f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its extent"
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
+
+
+def _frame(rows: Sequence[Row], grade: Grade) -> Iterator[Concern]:
+    """Large errors that all used scans share: a constant displacement and rotation between two frames of the body.
+
+    With T_true = T X and a constant X the distance |R t_X| and the angle of X are the same at every attitude.
+    """
+    used = [row for row in rows if row.gamma == 1 and row.pos_err_m is not None and row.rot_err_deg is not None]
+    if len(used) < GROWTH_SCANS:
+        return
+    found = []
+    for column in ("pos_err_m", "rot_err_deg"):
+        low, middle, high = np.quantile(values(used, column), (0.05, 0.5, 0.95))
+        found.append(high - low < SAME_ERROR * middle)
+    if all(found):
+        text = "the errors are the same in all used scans: the model has another frame than the true poses"
+        yield Concern(grade, f"{text}; move the model into that frame")
 
 
 def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
