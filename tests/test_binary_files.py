@@ -139,13 +139,13 @@ def test_a_checkpoint_with_another_attribute_is_one_line(fixtures_folder, tmp_pa
 
 
 def test_a_damaged_log_of_an_interrupted_run_is_one_line(fixtures_folder, tmp_path):
-    """A byte in the middle of the file is another one, and the SHA-256 of the file is made to fit."""
+    """A text in a record is no longer UTF-8, and the SHA-256 of the file is made to fit."""
     work = job(fixtures_folder / "tumble.mcap", n_scans=4)
     replay(work, tmp_path / "r", 2)
     path = tmp_path / "r" / "result.mcap"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+    data = path.read_bytes()
+    assert b"/pose" in data[:200_000]
+    path.write_bytes(data.replace(b"std_msgs", b"std\x80msgs"))
     record = json.loads((tmp_path / "r" / "run.json").read_text())
     (tmp_path / "r" / "run.json").unlink()
     write_manifest(tmp_path / "r", record, 2)

@@ -67,7 +67,7 @@ def test_completion_names_the_commands(cli):
 def test_version_lists_the_libraries(cli):
     out = cli("--version").out
     assert out.startswith("avsreplay 0.1.0")
-    for name in ("numpy", "trimesh", "kiss-icp"):
+    for name in ("numpy", "mcap", "kiss-icp"):
         assert name in out
 
 

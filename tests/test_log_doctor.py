@@ -18,9 +18,8 @@ from rosbags.highlevel import AnyReader
 
 from avsreplay.cli import entry_point
 from avsreplay.log import open_source
-from avsreplay.log.cdr import point_cloud2
+from avsreplay.log.cdr import point_cloud2, schema_text
 from avsreplay.log.doctor import Severity, examine, repair
-from avsreplay.log.schemas import schema_text
 from avsreplay.records import LogHeader, Scan
 
 CLOUDS = scans(20, 100)

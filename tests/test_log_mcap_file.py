@@ -241,8 +241,7 @@ def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -
 def test_a_file_without_chunks_is_read_beyond_damage(tmp_path: Path) -> None:
     from mcap.writer import CompressionType, Writer
 
-    from avsreplay.log.cdr import point_cloud2
-    from avsreplay.log.schemas import schema_text
+    from avsreplay.log.cdr import point_cloud2, schema_text
 
     with (tmp_path / "flat.mcap").open("wb") as file:
         writer = Writer(file, use_chunking=False, compression=CompressionType.NONE)
@@ -380,8 +379,7 @@ def test_an_attachment_over_the_limit_is_skipped(tmp_path: Path) -> None:
     """Even one that is a log itself, whose chunks are not ours."""
     from mcap.writer import Writer
 
-    from avsreplay.log.cdr import point_cloud2
-    from avsreplay.log.schemas import schema_text
+    from avsreplay.log.cdr import point_cloud2, schema_text
 
     rng = np.random.Generator(np.random.PCG64(2))
     inner = [Scan(i, t, rng.normal(size=(9000, 3)).astype(np.float32), log_ns=t) for i, t in enumerate(range(1, 40))]

@@ -22,9 +22,8 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import ClockChoice, LogWriter, SourceOptions, open_source
-from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped
+from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text
 from avsreplay.log.doctor import examine
-from avsreplay.log.schemas import schema_text
 from avsreplay.records import Scan, ScanStatus
 
 CLOUDS = scans(12, 150)

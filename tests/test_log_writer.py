@@ -19,7 +19,7 @@ from true_scans import true_scans
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import LogWriter, SourceOptions, open_source
-from avsreplay.log.schemas import SCHEMAS, schema_text
+from avsreplay.log.cdr import SCHEMAS, schema_text
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus
 
 

@@ -120,7 +120,7 @@ class _Commands(click.Group):
             raise click.UsageError(f"{error.message} Known: {', '.join(SUMMARIES)}.", ctx) from None
 
 
-PARTS = ("numpy", "scipy", "kiss-icp", "trimesh", "embreex", "click", "rich")
+PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "click", "rich")
 
 
 def versions() -> dict[str, str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, pa
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
-from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import decode_cloud, read_layout
@@ -254,8 +253,11 @@ class _Copier:
     """A RecordSink that writes the records to a new file."""
 
     def __init__(self, stream: BinaryIO, profile: str) -> None:
+        from mcap.writer import Writer
+
         self.done = Repaired()
-        self._writer = McapWriter(stream, profile, LIBRARY, chunk_bytes=_CHUNK_BYTES)
+        self._writer: Any = Writer(stream, _CHUNK_BYTES, enable_data_crcs=True)
+        self._writer.start(profile=profile, library=LIBRARY)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, int] = {}
 

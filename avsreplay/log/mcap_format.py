@@ -15,8 +15,7 @@ from avsreplay.log.bytes_io import BadMessage, ByteFile
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
-CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = 8, 9, 10, 11, 12, 13
-SUMMARY_OFFSET, DATA_END = 14, 15
+ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
 CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")

@@ -9,27 +9,22 @@ of points hardly become smaller, and zstd takes three times as long.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
-from avsreplay.log.bytes_io import shown
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
-from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_format import Channel
-from avsreplay.log.mcap_writer import McapWriter
-from avsreplay.log.schemas import schema_text
 from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
-CHUNK_BYTES, _MAX_RECORD = 1 << 20, 1 << 30
+CHUNK_BYTES = 1 << 20
 _TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
 _TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -46,8 +41,7 @@ _TOPICS = {
     "/rosout": "rcl_interfaces/msg/Log",
 }
 _ROWS = "/rows/"
-_FLOAT64 = np.dtype([("encapsulation", "<u4"), ("data", "<f8")])  # a std_msgs/Float64
-_CDR_LITTLE = 0x100  # encapsulation of little-endian CDR, its four bytes read as a number
+_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -102,25 +96,30 @@ class ResultLog:
         Raises:
             UnreadableInput: the file cannot be written.
         """
+        from mcap.writer import CompressionType, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        self._definitions: Any = get_typestore(Stores.ROS2_HUMBLE)
         try:
             self._stream = path.open("wb")
         except OSError as error:
             what = error.strerror or "cannot be written"
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
-        self._writer = McapWriter(self._stream, "ros2", LIBRARY, "lz4", CHUNK_BYTES)
+        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
             self._writer.add_metadata("avsreplay", dict(metadata))
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._columns: dict[str, int] = {}  # channels of the columns, by their names
+        self._columns: dict[str, int] = {}
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
         if self._stream.closed:
             return
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._stream.close()
 
@@ -128,30 +127,30 @@ class ResultLog:
         """Append the messages of one scan."""
         t = frame.t_ns
         if self._count == 0:
-            self.append("/tf_static", t, transform(t, ROOT, CAMERA, Pose.identity()))
-            self.append("/model", t, _model_marker(t, TARGET, self._surface))
-            self.append("/truth/model", t, _model_marker(t, TRUE, self._surface))
+            self._append("/tf_static", t, transform(t, ROOT, CAMERA, Pose.identity()))
+            self._append("/model", t, _model_marker(t, TARGET, self._surface))
+            self._append("/truth/model", t, _model_marker(t, TRUE, self._surface))
             if self._cone is not None:
                 width_m = 0.002 * self._surface.extent
-                self.append("/plan/cone", t, _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m))
+                self._append("/plan/cone", t, _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m))
         self._count += 1
-        self.append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
+        self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
         pose = Packer().header(t, CAMERA).pose(frame.estimate).f64s(*frame.covariance.ravel())
-        self.append("/estimate/pose", t, pose.bytes())
+        self._append("/estimate/pose", t, pose.bytes())
         for topic, known in (("/registration/pose", frame.registration), ("/truth/pose", frame.truth)):
             if known is not None:
-                self.append(topic, t, pose_stamped(t, CAMERA, known))
+                self._append(topic, t, pose_stamped(t, CAMERA, known))
         if frame.truth is not None:
-            self.append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
+            self._append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
         aligned = frame.estimate.inverse().apply(frame.points)
         cloud = point_cloud2(t, TARGET, aligned, None, intensities=frame.intensities, residuals=frame.residuals)
-        self.append("/points_aligned", t, cloud)
+        self._append("/points_aligned", t, cloud)
         if frame.path is not None:
-            self.append("/plan", t, _path(t, *frame.path))
-        self.append("/diagnostics", t, _status(frame))
-        self.append_columns(frame.columns, t)
+            self._append("/plan", t, _path(t, *frame.path))
+        self._append("/diagnostics", t, _status(frame))
+        self._append_columns(frame.columns, t)
         if frame.message != self._state:
-            self.append("/rosout", t, _said(frame))
+            self._append("/rosout", t, _said(frame))
         self._state = frame.message
 
     def copy(self, written: Path, state: str, changed: Mapping[int, Mapping[str, float]] | None = None) -> None:
@@ -166,80 +165,45 @@ class ResultLog:
             UnreadableInput: the other log is damaged.
         """
         self._state = state
-        copier = _Copier(self, changed or {})
-        file = McapFile(written, _MAX_RECORD, copy_to=copier)
-        file.close()
-        damage = [loss.what for loss in file.losses] or copier.foreign
-        if damage:
+        try:
+            self._copy(written, changed or {})
+        except OSError:  # this one cannot be written
+            raise
+        except Exception as error:  # the library has no common class of errors
             hint = "start anew with --overwrite"
-            raise UnreadableInput(f"is damaged: {damage[0]}"[:200], where=str(written), hint=hint)
+            raise UnreadableInput(f"is damaged: {error}"[:200], where=str(written), hint=hint) from None
 
-    def append(self, topic: str, t_ns: int, payload: bytes | memoryview, scan: int | None = None) -> None:
-        """Append one message.
+    def _copy(self, written: Path, changed: Mapping[int, Mapping[str, float]]) -> None:
+        from mcap.reader import NonSeekingReader
 
-        Args:
-            topic: one of this log.
-            t_ns: its time [ns].
-            payload: its content.
-            scan: its scan, counted from 1; None: the one that is written.
-        """
-        self._count = self._count if scan is None else scan
+        with written.open("rb") as stream:
+            for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
+                columns = changed.get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
+                if columns is None:
+                    self._count = message.sequence
+                    self._append(channel.topic, message.log_time, message.data)
+                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
+                    self._append_columns(columns, message.log_time)
+
+    def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
+        channels, count, add, pack = self._columns, self._count, self._writer.add_message, _FLOAT64.pack
+        for name, value in columns.items():
+            channel = channels.get(name) or channels.setdefault(name, self._channel(_ROWS + name))
+            add(channel, t_ns, pack(1, value), t_ns, count)
+
+    def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         self._writer.add_message(self._channel(topic), t_ns, payload, t_ns, self._count)
-
-    def append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
-        """Append the numeric columns of a row.
-
-        Args:
-            columns: values by name.
-            t_ns: time of the scan [ns].
-        """
-        channels = tuple(self._columns[name] for name in columns if name in self._columns)
-        messages = np.empty(len(columns), _FLOAT64)
-        messages["encapsulation"], messages["data"] = _CDR_LITTLE, list(columns.values())
-        if len(channels) == len(columns):
-            self._writer.add_messages(channels, t_ns, messages, self._count)
-            return
-        for name, message in zip(columns, messages, strict=True):  # a channel is defined before its first message
-            self.append(_ROWS + name, t_ns, message.tobytes())
-            self._columns[name] = self._channels[_ROWS + name]
 
     def _channel(self, topic: str) -> int:
         """Return the number of a topic's channel, which is registered at the first message."""
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
+                text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
         return self._channels[topic]
-
-
-class _Copier:
-    """A RecordSink that appends the messages of an earlier log, with the columns of rows that have changed.
-
-    Attributes:
-        foreign: a topic that no result log has, in words; empty if there is none.
-    """
-
-    def __init__(self, log: ResultLog, changed: Mapping[int, Mapping[str, float]]) -> None:
-        self._log, self._changed, self.foreign = log, changed, list[str]()
-
-    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
-        """Append a message, or all columns of its row."""
-        topic = channel.topic
-        columns = self._changed.get(sequence - 1) if topic.startswith(_ROWS) else None
-        if topic not in _TOPICS and not topic.startswith(_ROWS):
-            self.foreign.append(f"topic {shown(topic)}")
-        elif columns is None:
-            self._log.append(topic, times[0], payload, sequence)
-        elif topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
-            self._log.append_columns(columns, times[0])
-
-    def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
-        """A result log has no attachments."""
-
-    def metadata(self, name: str, values: dict[str, str]) -> None:
-        """The new log has metadata of its own."""
 
 
 def _path(t_ns: int, times_s: Array, positions: Array) -> bytes:

@@ -18,11 +18,9 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import STDOUT, check_output, is_stream
 from avsreplay.geometry import Pose
 from avsreplay.locks import open_alone
-from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, transform
+from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS
-from avsreplay.log.mcap_writer import McapWriter
-from avsreplay.log.schemas import schema_text
 from avsreplay.records import Label, LogHeader, Scan, State
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
@@ -218,6 +216,12 @@ class LogWriter:
             ) from None
 
     def _begin(self, header: LogHeader, compression: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+        # The library closes a chunk only after it exceeds its size; sizes and spans are therefore checked here.
+        self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
+
         try:
             record = encode_header(header)
         except ValueError:
@@ -226,8 +230,7 @@ class LogWriter:
             raise UsageError("a state of the scenario is not finite", where=str(self._path), hint=hint) from None
 
         def begin() -> None:
-            # sizes and spans of the chunks are checked here
-            self._writer = McapWriter(self._stream, "ros2", LIBRARY, compression, 1 << 62)
+            self._writer.start(profile="ros2", library=LIBRARY)
             self._writer.add_metadata(HEADER_RECORD, record)
             if header.surface is not None:
                 data = surface_bytes(header.surface)

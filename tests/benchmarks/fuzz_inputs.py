@@ -20,8 +20,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from avsreplay.log import mcap_format as mcap
-from avsreplay.log.cdr import point_cloud2, pose_stamped
-from avsreplay.log.schemas import schema_text
+from avsreplay.log.cdr import point_cloud2, pose_stamped, schema_text
 
 CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
 NUMBERS = (
