@@ -18,7 +18,7 @@ from avsreplay.monitor import FaultParams
 from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
 from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.register import RegisterParams
-from avsreplay.settings import Settings, is_unit, setting
+from avsreplay.settings import SettingError, Settings, is_unit, setting
 from avsreplay.toml_document import Document, build, load, override, toml_value
 
 
@@ -89,9 +89,12 @@ class RunConfig(Settings):
     def check(self) -> None:
         """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an impossible robot."""
         if self.init not in ("log", "truth", "auto"):
-            parse_pose(self.init)
+            try:
+                parse_pose(self.init)
+            except ValueError as error:
+                raise SettingError("init", str(error)) from None
         if not is_unit(self.fixture_axis_c, 1e-6):
-            raise ValueError(f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
+            raise SettingError("fixture_axis_c", f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
         check_robot(self.robot, self.plan, self.limits)
 
 

@@ -61,6 +61,16 @@ def _hashed(self: Any) -> int:
     return hash(_compared(self))
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun for a message, in the plural unless it is one.
+
+    Args:
+        count: the number.
+        noun: in the singular; its plural ends in s.
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 class AvsError(Exception):
     """An error that the user can correct; its text is one line: where, what is wrong, what to do."""
 

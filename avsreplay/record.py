@@ -11,6 +11,7 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.files import STDOUT
 from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
+from avsreplay.log.options import lost_text
 from avsreplay.log.writer import ROOT_FRAME
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import (
@@ -51,10 +52,11 @@ class Recorded:
 
     Attributes:
         path: the log.  scans: number of clouds.  points: total number of points.  empty: clouds without points.
-        damaged: messages of the source that could not be decoded and were omitted.
+        damaged: scans of the source that could not be used and were omitted.
         span_s: time from first to last scan.  bytes: file size.  model: name of the model, None without.
-        faults: labels as (kind, start [s], end [s] after the first scan, harmful).  losses: of the source.
-        note: a remark for the user, empty if none.
+        faults: labels as (kind, start [s], end [s] after the first scan, harmful), without those outside of the
+            recording.  losses: of the source.
+        note: a remark for the user.  lost: what of the source could not be read.  Both are empty if there is nothing.
     """
 
     path: str
@@ -69,6 +71,7 @@ class Recorded:
     faults: tuple[tuple[str, float, float, bool], ...]
     losses: tuple[Loss, ...] = ()
     note: str = ""
+    lost: str = ""
 
 
 def record(
@@ -137,7 +140,9 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
     """
     meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
+    last_ns = EPOCH_NS + round((simulation.count - 1) * 1e9 / scenario.params.rate_hz)
     header = _labelled(simulation.header, options, EPOCH_NS, moving=scenario.params.camera is not None)
+    header, outside = _within(header, EPOCH_NS, last_ns)
     with (
         _writer(output, header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
@@ -147,7 +152,7 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
     done = tally.recorded(output, writer.bytes, header)
-    return replace(done, note=slow if by_hand else done.note)
+    return replace(done, note="; ".join(each for each in (slow if by_hand else "", outside) if each))
 
 
 def record_source(
@@ -164,7 +169,8 @@ def record_source(
 
     Raises:
         UsageError: the output is the source or cannot be written, or an option is invalid.
-        UnreadableInput: the source or the model cannot be read, or the output cannot be written.
+        UnreadableInput: the source or the model cannot be read, a part is lost and ``reading`` is strict, or the output
+            cannot be written.
     """
     if output != STDOUT and output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
@@ -176,6 +182,7 @@ def record_source(
         moved = opened.options.fixed_frame is not None or opened.options.sensor_topic is not None
         header, due = _labelled(opened.header, options, epoch_ns, moving=moved), opened.info().scans
         header = replace(header, sensor_at_stamp=moved)
+        header, outside = _within(header, epoch_ns, opened.scan_at(len(opened) - 1).log_ns if len(opened) else 0)
         with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
             # registration and faults need the position of the sensor: a log holds its frame and its poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
@@ -187,9 +194,10 @@ def record_source(
                 true_clock=False,
                 camera_of=lambda s: [(0, s.sensor)] if s.sensor else [],
             )
-        done = tally.recorded(output, writer.bytes, header, tuple(opened.losses))
+        lost = lost_text(opened.losses, opened.damaged, len(opened))
+        done = replace(tally.recorded(output, writer.bytes, header, tuple(opened.losses)), lost=lost)
         frame = f"scans are in the frame of the sensor, which moves in '{ROOT_FRAME}'; a replay transforms them to it"
-        return replace(done, note="; ".join(each for each in (frame if moved else "", done.note) if each))
+        return replace(done, note="; ".join(each for each in (frame if moved else "", outside) if each))
 
 
 @dataclass(slots=True)
@@ -224,13 +232,7 @@ class _Tally:
             seed=header.seed,
             faults=tuple(self._fault(label) for label in header.labels),
             losses=losses,
-            note=self._outside(header),
         )
-
-    def _outside(self, header: LogHeader) -> str:
-        """A remark on faults that begin after the last scan."""
-        late = [label.kind for label in header.labels if label.start_ns > self.last_ns]
-        return f"no scan lies in the window of {', '.join(late)}: the log ends before it" if late else ""
 
     def _fault(self, label: Label) -> tuple[str, float, float, bool]:
         start, end = ((t - self.first_ns) / 1_000_000_000 for t in (label.start_ns, label.end_ns))
@@ -274,6 +276,22 @@ def _labelled(header: LogHeader, options: RecordOptions, epoch_ns: int, *, movin
         return header
     labels = (*header.labels, *(fault.label(epoch_ns) for fault in options.faults))
     return replace(header, labels=labels, notes={**header.notes, "fault_seed": str(options.fault_seed)})
+
+
+def _within(header: LogHeader, first_ns: int, last_ns: int) -> tuple[LogHeader, str]:
+    """Return the header without the faults that begin after the last scan or end before the first, and a remark.
+
+    Args:
+        header: header with the labels of all faults.
+        first_ns: time of the first scan on the log clock.
+        last_ns: time of the last scan.
+    """
+    inside = [label.start_ns <= last_ns and label.end_ns > first_ns for label in header.labels]
+    left = [label.kind for label, kept in zip(header.labels, inside, strict=True) if not kept]
+    if not left:
+        return header, ""
+    kept = tuple(label for label, kept in zip(header.labels, inside, strict=True) if kept)
+    return replace(header, labels=kept), f"faults outside of the recording are left out: {', '.join(left)}"
 
 
 def _with_faults(

@@ -94,12 +94,29 @@ def parse(text: str, name: str) -> Document:
         raise UsageError(f"not valid TOML: {message}", where=name, hint="correct the syntax") from None
 
 
+class Assignment(str):
+    """An assignment ``a.b=value`` that an option other than ``--set`` stands for.
+
+    Attributes:
+        given: option or environment variable with its value, as the user wrote it; error messages name it.
+    """
+
+    __slots__ = ("given",)
+    given: str
+
+    def __new__(cls, text: str, given: str) -> Assignment:
+        """Create the assignment ``text`` that ``given`` stands for."""
+        made = super().__new__(cls, text)
+        made.given = given
+        return made
+
+
 def override(document: Document, assignments: Sequence[str]) -> Document:
     """Return the document with assignments applied.
 
     Args:
         document: the document; it is not changed.
-        assignments: each ``a.b=value``; a value that is not TOML is taken as text.
+        assignments: each ``a.b=value`` or an ``Assignment``; a value that is not TOML is taken as text.
 
     Raises:
         UsageError: an assignment has another form, or a part of its key is not a table.
@@ -107,6 +124,7 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
     table, origins = _deep_copy(document.table), dict(document.origins)
     for assignment in assignments:
         key, sep, raw = assignment.partition("=")
+        given = assignment.given if isinstance(assignment, Assignment) else f"--set {assignment}"
         if not sep or not key.strip():
             hint = "for example --set register.gate_m=0.2"
             raise UsageError(f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint)
@@ -119,9 +137,9 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
         for parent in path[:-1]:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
-                raise UsageError(f"'{parent}' is not a table", where=f"--set {assignment}", hint="check the key")
+                raise UsageError(f"'{parent}' is not a table", where=given, hint="check the key")
         node[path[-1]] = value
-        origins[path] = f"--set {assignment}"
+        origins[path] = given
     return Document(document.name, table, document.text, origins)
 
 

@@ -140,3 +140,25 @@ def test_every_setting_is_written_with_its_meaning():
     flat = " ".join(line.removeprefix("# ") for line in text.splitlines())
     for entry in settings.entries(RunConfig):
         assert entry.declared.doc in flat, entry.key
+
+
+@pytest.mark.parametrize(
+    ("words", "env", "begins"),
+    [
+        (("--init", "foo"), {}, "--init foo: init is 'foo', not log, truth, auto or seven numbers"),
+        (("--init", "foo", "--set", "register.gate_m=0.2", "--policy", "all"), {}, "--init foo: init is"),
+        (("--init", "5"), {}, "--init 5: init is '5'"),
+        (("--init", "0,0,1,0,0,0,9"), {}, "--init 0,0,1,0,0,0,9: init is '0,0,1,0,0,0,9', its quaternion"),
+        (("--set", "init=foo"), {}, "--set init=foo: init is 'foo'"),
+        ((), {"AVSREPLAY_RUN_INIT": "foo"}, "environment AVSREPLAY_RUN_INIT=foo: init is 'foo'"),
+    ],
+)
+def test_an_error_names_the_option_that_was_given(words, env, begins):
+    done = CliRunner().invoke(group, ["config", *words], env=env, auto_envvar_prefix="AVSREPLAY")
+    assert str(done.exception).startswith(begins)
+    assert "--set init" not in str(done.exception) or "--set" in words
+
+
+def test_an_initial_pose_of_another_command_is_named_as_given(fixtures_folder):
+    words = ["observability", str(fixtures_folder / "tumble.mcap"), "--init", "1,2,3"]
+    assert str(CliRunner().invoke(group, words).exception).startswith("--init 1,2,3: init is '1,2,3'")

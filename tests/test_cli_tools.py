@@ -88,3 +88,45 @@ def test_the_install_command_of_a_back_end_is_printed_whole(monkeypatch, capsys)
     state = backend.Availability("open3d", False, "", "about", "pip install 'avsreplay[open3d]'")
     monkeypatch.setattr(backend, "available", lambda: [state])
     assert "pip install 'avsreplay[open3d]'" in CliRunner().invoke(backends_command, []).output
+
+
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        (("-o", "rows.csv"), "seq"),
+        (("-o", "a.tum"), "1"),
+        (("-o", "a.kitti"), "0."),
+        (("-o", "a.txt", "--to", "tum"), "1"),
+        (("-o", "noending", "--to", "csv"), "seq"),
+    ],
+)
+def test_the_format_of_an_export_is_that_of_its_name(words, first, result, cli, tmp_path):
+    target = tmp_path / words[1]
+    done = cli("export", result, "--poses", "registration", "-o", target, *words[2:])
+    assert done.code == 0, done.err
+    assert target.read_text(encoding="utf-8").lstrip("#\ufeff- ").startswith(first)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("rows.csv", "--to", "kitti"), "the format is KITTI; name a file that ends in .kitti or .txt"),
+        (("rows.mcap", "--to", "csv"), "the format is CSV"),
+        (("a.txt",), "the name states no format; add --to, one of csv, parquet, tum, kitti"),
+        (("rows",), "the name states no format"),
+    ],
+)
+def test_an_export_whose_name_contradicts_its_format_is_refused(words, said, result, cli, tmp_path):
+    done = cli("export", result, "-o", tmp_path / words[0], *words[1:])
+    assert (done.code, len(done.err.strip().splitlines())) == (2, 1)
+    assert said in done.err
+    assert not (tmp_path / words[0]).exists()
+
+
+@pytest.mark.parametrize("words", [("odometry", "-o", "x.mcap"), ("model", "-o", "m.ply", "--poses", "x.csv")])
+def test_a_trajectory_in_a_file_of_another_format_is_refused(words, cli, fixtures_folder, tmp_path):
+    words = [tmp_path / word if "." in word else word for word in words]
+    done = cli(words[0], fixtures_folder / "tumble.mcap", *words[1:])
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "the format is TUM; name a file that ends in .tum or .txt" in done.err
+    assert not list(tmp_path.iterdir())

@@ -16,8 +16,9 @@ from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.estimate.initialise import BatchResult
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.relative_orbit import RelativeOrbit
+from avsreplay.geometry import Array
 from avsreplay.log import SourceOptions
-from avsreplay.monitor import from_trajectory, gramian, measure, observe, weakest
+from avsreplay.monitor import Gramian, from_trajectory, gramian, measure, observe, unobserved, weakest
 from avsreplay.records import Belief
 from avsreplay.rows import Row
 from avsreplay.run import Job, Run
@@ -87,15 +88,32 @@ def test_a_condition_beyond_double_precision_is_computed() -> None:
     assert measure(deep).log10_cond == pytest.approx(20.0, abs=1e-6)
 
 
+def seen(H: Array, noise: float = 1e-3) -> Gramian:
+    return observe(gramian(np.ones(20)), np.eye(20), H, noise**2 * np.eye(len(H)))
+
+
 def test_weakest_direction_in_words() -> None:
     H = np.eye(20)
-    H[14, 14] = 1e-4  # one direction of varrho
-    state = observe(gramian(np.ones(20)), np.eye(20), H, exact(20))
-    assert weakest(state, 1) == ("fixture position in the body (100%)",)
-    H[14, 14], H[0, 0], H[17, 17] = 1.0, 1e-3, 1e-3
-    H[0, 17] = H[17, 0] = 0.0
-    twins = observe(gramian(np.ones(20)), np.eye(20), H, exact(20))
-    assert all("attitude" in w or "misalignment" in w for w in weakest(twins, 2))
+    H[14, 14] = 1e-2  # one direction of varrho
+    assert weakest(seen(H), 1) == ("fixture position in the body x",)
+    assert unobserved(seen(H)) == ()
+
+
+def test_directions_that_are_not_observed_are_named_once_with_their_axes() -> None:
+    """Where a whole block is not observed, the axes of the singular vectors within it are arbitrary."""
+    both = np.eye(20)[0] + 2.0 * np.eye(20)[17]  # of these two states only this combination is observed
+    H = np.vstack([np.delete(np.eye(20), [0, 6, 7, 8, 13, 17], axis=0), both])
+    found = seen(np.linalg.qr(np.random.default_rng(3).normal(size=(15, 15)))[0] @ H)  # the Gramian is that of H
+    assert unobserved(found) == (
+        "attitude of the principal axes x (80%) with misalignment of the fixture x (20%)",
+        "centre of mass x",
+        "centre of mass y",
+        "centre of mass z",
+        "inertia ratios 2",
+    )
+    assert len(unobserved(found)) == 20 - measure(found).rank
+    assert not set(weakest(found, 20)) & set(unobserved(found))
+    assert len(set(weakest(found, 20))) == 15
 
 
 def test_prior_must_be_positive() -> None:

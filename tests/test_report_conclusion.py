@@ -213,6 +213,32 @@ def test_settings_that_differ_are_named(make_rows):
     )
 
 
+def _of_log(name, rows, sha256):
+    return Saved(name, rows, {"log": {"name": f"{name}.mcap", "sha256": sha256}})
+
+
+def test_runs_of_different_logs_are_not_compared_scan_by_scan(make_rows):
+    rows = _noisy(make_rows(200), 1.0), _noisy(make_rows(200), 1.5, seed=6)
+    assert conclude("b", [(_of_log("a", rows[0], "1"), _of_log("b", rows[1], "1"))]).word == "worse"
+    found = conclude("b", [(_of_log("a", rows[0], "1"), _of_log("b", rows[1], "2"))])
+    assert found.sentence.startswith(
+        "b: the logs differ ('b.mcap', baseline 'a.mcap'), so that a comparison scan by scan"
+    )
+    assert "rms position error of all scans (" in found.sentence  # the figures are still named
+    assert found.word == "no evidence"
+    assert found.divergence is None
+    assert {(c.word, c.low) for c in found.changes} == {("equal", None), ("changed", None)}
+
+
+def test_different_logs_of_many_pairs_are_named_before_the_conclusion(make_rows):
+    pairs = [
+        (_of_log("a", _noisy(make_rows(30), 1.0, k), "1"), _of_log("b", _noisy(make_rows(30), 1.5, 50 + k), f"{k}"))
+        for k in range(8)
+    ]
+    found = conclude("g", pairs)
+    assert found.sentence.startswith("g: the logs of 7 of 8 pairs differ ('b.mcap', baseline 'a.mcap'): worse in")
+
+
 def test_groups_of_seeds_get_intervals_and_few_do_not(make_rows):
     def pairs(n, factor):
         return [

@@ -48,6 +48,11 @@ def test_no_healthy_scan_fails(make_rows):
     assert not any("error" in reason.text for reason in found.reasons)  # errors of a start that nothing corrected
 
 
+def test_a_single_scan_that_is_not_used_is_said_in_the_singular(make_rows):
+    rows = _good(make_rows, 1, gamma=0, reason="not_aligned", nis=None, converged=False)
+    assert _judged(rows).line.startswith("FAIL: the only scan was not used (not aligned)")
+
+
 def test_one_used_scan_of_35_fails(make_rows):
     rows = [dataclasses.replace(r, gamma=int(r.seq == 0), reason="fit_error") for r in make_rows(35, fault=None)]
     assert _judged(rows, labels=None).grade is Grade.FAIL

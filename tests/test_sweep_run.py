@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -159,6 +160,27 @@ def test_a_killed_campaign_is_resumed(campaign, reference, tmp_path):
     assert 2 <= len(Journal(tmp_path / "out").status) < 6
     assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
     assert results(tmp_path / "out") == reference
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="POSIX signals")
+def test_ctrl_c_ends_workers_without_the_messages_of_dask(campaign, tmp_path):
+    """A terminal sends it to every process of the command."""
+    campaign.write_text(SMALL.replace("repeats = 3", "repeats = 300"))
+    args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "1"]
+    process = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    journal = tmp_path / "out" / "journal.txt"
+    for _ in range(600):
+        if process.poll() is not None or (journal.is_file() and journal.read_bytes().count(b"\n") > 1):
+            break
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert (process.returncode, out) == (130, "")
+    lines = [line for line in err.splitlines() if line]
+    assert len(lines) == 2, err
+    assert re.fullmatch(r"avsreplay: the results of \d+ runs are saved; the same command continues", lines[0])
+    assert lines[1] == "avsreplay: interrupted"
 
 
 @pytest.mark.slow

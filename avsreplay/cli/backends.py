@@ -140,7 +140,7 @@ Examples:
   avsreplay bench own.bag --model target.stl --topic /camera/points --json
 
 \b
-Exit codes: 0 ok, 2 usage, 3 unreadable input."""
+Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but data was lost."""
 
 
 @click.command("bench", epilog=BENCH_EPILOG)
@@ -168,7 +168,9 @@ def bench_command(log: Path, backends: str, model: Path | None, topic: str | Non
         UsageError: no back end is named, a back end is unknown, or the log has no model.
         MissingBackend: a back end is not installed.
         UnreadableInput: the log or the model cannot be read.
+        DataLost: a part of the log could not be read.
     """  # noqa: D301
+    from avsreplay.cli.options import report_losses
     from avsreplay.errors import UsageError
     from avsreplay.log import SourceOptions, open_source
 
@@ -185,6 +187,7 @@ def bench_command(log: Path, backends: str, model: Path | None, topic: str | Non
         click.echo(json.dumps({"log": str(log), "backends": summaries}, indent=2))
     else:
         _print_tallies(summaries)
+    report_losses(source)
 
 
 def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:

@@ -140,24 +140,29 @@ def run_settings(command: F) -> F:
 def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ...]]:
     """Take the options of ``run_settings`` out of ``flags``: the configuration file and ``a.b=value`` assignments.
 
-    Options come after environment variables, so that they take precedence.
+    Options come after environment variables, so that they take precedence. An error in a value names what gave it.
     """
+    from avsreplay.toml_document import Assignment, toml_value
+
     context = click.get_current_context()
     by_source: dict[bool, list[str]] = {False: [], True: []}
 
-    def put(name: str, assignments: list[str]) -> None:
-        by_source[context.get_parameter_source(name) is ParameterSource.COMMANDLINE].extend(assignments)
+    def put(name: str, assignments: list[str], option: str = "", value: object = "") -> None:
+        typed = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        variable = _variable(option[2:].replace("-", "_"))
+        given = f"{option} {value}".rstrip() if typed else f"environment {variable}={value or 1}"
+        by_source[typed] += [Assignment(text, given) for text in assignments] if option else assignments
 
     robot_file = flags.pop("robot_file")
     if robot_file is not None:
         from avsreplay.config import robot_settings
 
-        put("robot_file", list(robot_settings(robot_file)))
+        put("robot_file", list(robot_settings(robot_file)), "--robot", robot_file)
     put("assignments", list(flags.pop("assignments")))
-    put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [])
+    put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():
         value = flags.pop(name)
-        put(name, [] if value is None else [f"{key}={value}"])
+        put(name, [] if value is None else [f"{key}={toml_value(value)}"], f"--{name}", value)
     return flags.pop("config_file"), (*by_source[False], *by_source[True])
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import source_setting
-from avsreplay.cli.options import check_outputs, pose_options, read_options, source_options
+from avsreplay.cli.options import check_outputs, pose_options, read_options, report_losses, source_options
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss, Source
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from avsreplay.model_size import Advice
     from avsreplay.report.table import Table
 
+DECODED_BYTES = 256 << 20  # of a larger log, info decodes a few scans only
+LISTED = 5  # damaged scans that are listed
 WIDTH = 120  # fixed if the output is not a terminal, so that the text is always the same
 
 
@@ -41,7 +43,8 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     With a model (in the log or --model) it also checks what a run needs: unit of the model, background points, truth,
     transforms and time stamps; each finding names the option to add.
 
-    The exit code is 4 if a part of SOURCE could not be read.
+    The exit code is 4 if a part of SOURCE could not be read, or a scan cannot be decoded. All scans are decoded, unless
+    SOURCE is larger than 256 MiB.
 
     \f
     Raises:
@@ -49,7 +52,6 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
         UnreadableInput: SOURCE cannot be read.
         DataLost: a part of SOURCE could not be read.
     """  # noqa: D301
-    from avsreplay.errors import DataLost
     from avsreplay.log import open_source
 
     options = read_options(reading)
@@ -58,15 +60,17 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
         options = dataclasses.replace(options, model=None)
     with open_source(source, options, inspect=True) as opened:
         info = opened.info()
+        for _ in opened.scans() if info.bytes <= DECODED_BYTES else ():
+            pass  # only whether they can be decoded
         advice = _advice(opened, built)
+    damaged = dict(sorted(opened.damaged.items()))
     if as_json:
         checks = [dataclasses.asdict(a) for a in advice]
-        click.echo(json.dumps({**_document(info), "checks": checks}, indent=2))
+        broken = [{"scan": seq, "why": why} for seq, why in damaged.items()]
+        click.echo(json.dumps({**_document(info), "damaged_scans": broken, "checks": checks}, indent=2))
     else:
-        _print(info, advice)
-    if info.losses:
-        what = f"{len(info.losses)} part(s) could not be read"
-        raise DataLost(what, where=info.path, hint="run avsreplay doctor for details")
+        _print(info, advice, damaged)
+    report_losses(opened)
 
 
 def _advice(opened: Source, built: bool) -> list[Advice]:
@@ -143,7 +147,7 @@ def loss_line(loss: Loss) -> str:
     return shown("".join([*parts, ")"]))
 
 
-def _print(info: LogInfo, advice: list[Advice]) -> None:
+def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str]) -> None:
     from avsreplay.log.bytes_io import shown
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
@@ -157,6 +161,8 @@ def _print(info: LogInfo, advice: list[Advice]) -> None:
         click.echo(f"options to add: {' '.join(dict.fromkeys(options))}")
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
+    for seq, why in list(damaged.items())[:LISTED]:
+        print_line(console, f"lost: scan {seq}: {why}")
 
 
 def _is_placeholder(word: str) -> bool:
@@ -293,15 +299,16 @@ def doctor_command(
 
 
 def _judge(source: Path, findings: list[Finding], strict: bool) -> None:
-    from avsreplay.errors import DataLost, UnreadableInput
+    from avsreplay.errors import DataLost, UnreadableInput, counted
     from avsreplay.log.doctor import Severity
+    from avsreplay.log.mcap_format import is_mcap
 
     errors = [f for f in findings if f.severity is Severity.ERROR]
     if errors:
-        what = f"{len(errors)} error(s), the first: {errors[0].about}: {errors[0].text}"
-        if strict:
-            raise UnreadableInput(what, where=str(source), hint="repair it with --repair OUT")
-        raise DataLost(what, where=str(source), hint="--repair OUT copies the intact records")
+        what = f"{counted(len(errors), 'error')}, the first: {errors[0].about}: {errors[0].text}"
+        repaired = "--repair OUT copies the intact records"
+        hint = repaired if is_mcap(source) else "'avsreplay record' writes a log of the intact scans"
+        raise (UnreadableInput if strict else DataLost)(what, where=str(source), hint=hint)
 
 
 def _damage(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> dict[str, Any]:

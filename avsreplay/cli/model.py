@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, Numbers, check_outputs, check_suffix, read_options, source_options, tracked
+from avsreplay.cli.options import (
+    PATH,
+    Numbers,
+    check_outputs,
+    check_suffix,
+    read_options,
+    report_losses,
+    source_options,
+    tracked,
+)
 from avsreplay.errors import MissingBackend, UsageError
 
 if TYPE_CHECKING:
@@ -64,6 +73,7 @@ def model_command(
     \f
     Raises:
         MissingBackend: a mesh is requested and Open3D is not installed.
+        DataLost: a part of LOG could not be read.
     """  # noqa: D301
     import numpy as np
 
@@ -76,6 +86,8 @@ def model_command(
     for each in (output, mesh):
         if each is not None:
             check_suffix(each, ".ply")
+    if poses is not None:
+        check_suffix(poses, *TUM)
     check_outputs("output", "mesh", "poses", overwrite=overwrite)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
@@ -97,6 +109,7 @@ def model_command(
         with output_path(poses, overwrite=overwrite) as path:
             write_tum(path, made.poses)
     click.echo(json.dumps(said, indent=2) if as_json else _text(said))
+    report_losses(source)
 
 
 def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
@@ -183,6 +196,7 @@ def _table(regions: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+TUM = (".tum", ".txt")  # names of trajectories
 LEAST_POINTS = 50  # a scan with fewer is left out
 LEAST_M, MOST_M = 1e-6, 1e6  # size of a target
 
@@ -194,7 +208,7 @@ Examples:
 
 @click.command("odometry", epilog=ODOMETRY_EPILOG)
 @click.argument("log", type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM).")
+@click.option("-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM: .tum or .txt).")
 @click.option(
     "--size", type=click.FloatRange(LEAST_M, MOST_M), help="Size of the target [m]; default: of the first scan."
 )
@@ -213,7 +227,8 @@ def odometry_command(
     \f
     Raises:
         MissingBackend: kiss-icp is not installed.
-        UsageError: no scan has enough points.
+        DataLost: a part of LOG could not be read.
+        UsageError: no scan has enough points, or the name of the output states another format.
     """  # noqa: D301
     from avsreplay.files import STDOUT
     from avsreplay.geometry import bounding_diagonal
@@ -222,6 +237,7 @@ def odometry_command(
     from avsreplay.register.peers import KissOdometry
     from avsreplay.report.export import write_tum
 
+    check_suffix(output, *TUM)
     check_outputs("output", overwrite=overwrite)
     load_backend("kiss")  # reports where the library is not installed
     odometry, poses = None, []
@@ -240,3 +256,4 @@ def odometry_command(
     if not poses:
         raise UsageError(f"no scan has {LEAST_POINTS} points", where=str(log), hint="check the crop and --topic")
     click.echo(f"{output}: {write_tum(output, poses)} poses", err=output == STDOUT)
+    report_losses(source)

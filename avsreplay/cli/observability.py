@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, read_options, source_options
+from avsreplay.cli.options import PATH, read_options, report_losses, source_options
+from avsreplay.errors import counted
 
 if TYPE_CHECKING:
     from avsreplay.estimate.initialise import PoseFix
@@ -31,7 +32,13 @@ Examples:
 The log is replayed, one motion is fitted to all healthy poses, and the observability Gramian is summed along that
 motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known.
 The columns ogm_rank and ogm_log10_cond of 'run' are the same Gramian along the motion fitted to the poses up to that
-scan, and agree with these once that fit has converged. The keys of the JSON document end in _fitted_motion."""
+scan, and agree with these once that fit has converged. The keys of the JSON document end in _fitted_motion.
+
+\b
+Below the table are the directions that are not observed, each once with its
+axis (of the body for attitude, rate and fixture, of the camera for the centre
+of mass), and the least observed of the others. A direction of several states
+is a combination that the poses do not separate."""
 
 
 @click.command("observability", epilog=EPILOG)
@@ -45,11 +52,16 @@ scan, and agree with these once that fit has converged. The keys of the JSON doc
     type=click.IntRange(0, 20),
     default=3,
     show_default=True,
-    help="Number of weakly observable directions to describe.",
+    help="Number of weakly observed directions to describe.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def observability_command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
-    """Show which states and parameters the measurements of LOG determine."""
+    """Show which states and parameters the measurements of LOG determine.
+
+    \f
+    Raises:
+        DataLost: a part of LOG could not be read.
+    """  # noqa: D301
     from avsreplay.run import Run
 
     with Run(_job(log, flags)) as run:
@@ -58,13 +70,15 @@ def observability_command(log: Path, marks: int, weakest: int, as_json: bool, **
         click.echo(json.dumps(found, indent=2))
     else:
         _print(found)
+    report_losses(run.source)
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Any:
     from avsreplay.run import Job
+    from avsreplay.toml_document import Assignment, toml_value
 
     init, assignments = flags.pop("init"), flags.pop("assignments")
-    more = (f"init={init}",) if init is not None else ()
+    more = (Assignment(f"init={toml_value(init)}", f"--init {init}"),) if init is not None else ()
     return Job(source=log, options=read_options(flags), assignments=(*assignments, *more))
 
 
@@ -87,13 +101,15 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF
-    from avsreplay.monitor import weakest as in_words
+    from avsreplay.monitor import unobserved
+    from avsreplay.monitor import weakest as least
 
     return {
         "log": Path(run.job.source).name,
         "healthy_scans": sum(row.gamma for row in rows),
         "lines": [lines[k] for k in keep],
-        "weakest": {name: list(in_words(end, weakest, BLOCKS_OF[name])) for name, end in ends.items()},
+        "unobserved": {name: list(unobserved(end, BLOCKS_OF[name])) for name, end in ends.items()},
+        "weakest": {name: list(least(end, weakest, BLOCKS_OF[name])) for name, end in ends.items()},
     }
 
 
@@ -147,9 +163,12 @@ def _print(found: dict[str, Any]) -> None:
     console = make_console(plain_width=WIDTH)
     note = "ogm_rank and ogm_log10_cond of 'run' are along the motion fitted to the poses up to that scan"
     print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
-    for name, words in found["weakest"].items():
-        if words:
-            print_line(console, f"weakest, {HEADS[name]}: " + "; ".join(words))
+    for name, head in HEADS.items():
+        lacking, weak = found["unobserved"][name], found["weakest"][name]
+        if lacking:
+            print_line(console, f"{head}, {counted(len(lacking), 'direction')} not observed: " + "; ".join(lacking))
+        if weak:
+            print_line(console, f"{head}, least observed: " + "; ".join(weak))
 
 
 def _cells(found: dict[str, Any]) -> tuple[str, str, str]:

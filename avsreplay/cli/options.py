@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from avsreplay.cli.config import source_setting
-from avsreplay.errors import AvsError, UnreadableInput, UsageError
+from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output, is_stream
 
 if TYPE_CHECKING:
-    from avsreplay.log import GrowingLog, SourceOptions
+    from avsreplay.log import GrowingLog, Source, SourceOptions
     from avsreplay.report.result import Result
     from avsreplay.rows import Row
 
@@ -136,6 +136,22 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         raise UsageError(f"{option} {what}", hint="correct the option") from None
 
 
+def report_losses(source: Source, damaged: int | None = None) -> None:
+    """Raise DataLost if a part of a log or any of the scans that were read could not be used.
+
+    Args:
+        source: the log, after its scans were read.
+        damaged: number of scans that could not be used, if more were read than by ``source``.
+
+    Raises:
+        DataLost: names the number of parts and of scans, and the first of each.
+    """
+    from avsreplay.log.options import lost_text
+
+    if text := lost_text(source.losses, source.damaged, len(source), damaged):
+        raise DataLost(text, where=str(source.path), hint="see 'avsreplay doctor'")
+
+
 def read_result(path: Path) -> Result:
     """Read and verify a saved result; warn on stderr if it could not be verified or its log was damaged."""
     from avsreplay.report.result import load_result
@@ -208,12 +224,16 @@ def check_outputs(*names: str, overwrite: bool = True) -> None:
             inputs.append(output)
 
 
-def check_suffix(path: Path, suffix: str) -> None:
-    """Raise UsageError if the name of an output states another format than ``suffix``; devices may have any name."""
-    if path.suffix.lower() not in ("", suffix) and not is_stream(path):
-        raise UsageError(
-            f"the format is {suffix[1:].upper()}", where=str(path), hint=f"name a file that ends in {suffix}"
-        )
+def check_suffix(path: Path, *suffixes: str) -> None:
+    """Raise UsageError if the name of an output states another format; devices may have any name.
+
+    Args:
+        path: the output.
+        suffixes: those that the name may have, the first one named after the format.
+    """
+    if path.suffix.lower() not in ("", *suffixes) and not is_stream(path):
+        hint = f"name a file that ends in {' or '.join(suffixes)}"
+        raise UsageError(f"the format is {suffixes[0][1:].upper()}", where=str(path), hint=hint)
 
 
 def check_binary_output(output: Path) -> None:

@@ -111,9 +111,8 @@ def record_command(
     done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
     click.echo(text, err=str(output) == "-")
-    if done.losses or done.damaged:
-        lost = f"{len(done.losses)} damaged places, {done.damaged} messages that could not be decoded were left out"
-        raise DataLost(lost, where=str(source), hint="see 'avsreplay doctor'")
+    if done.lost:
+        raise DataLost(done.lost, where=str(source), hint="see 'avsreplay doctor'")
 
 
 def _reading(flags: dict[str, Any]) -> SourceOptions | None:
@@ -140,18 +139,37 @@ def _progress(scans: Iterable[Scan], due: int) -> Iterator[Iterator[Scan]]:
 
 EXPORT_EPILOG = """\b
 Examples:
-  avsreplay export results/ --to csv -o rows.csv
-  avsreplay export results/ --to parquet -o rows.parquet       (needs the extra 'report')
+  avsreplay export results/ -o rows.csv
+  avsreplay export results/ -o rows.parquet              (needs the extra 'report')
+  avsreplay export results/ -o estimate.tum
   avsreplay export results/ --to kitti -o estimate.txt --poses registration"""
 
-POSE_FORMATS = ("tum", "kitti")
+FORMATS = {  # endings that a file may have; all but .txt select the format
+    "csv": (".csv", ".txt"),
+    "parquet": (".parquet", ".pq"),
+    "tum": (".tum", ".txt"),
+    "kitti": (".kitti", ".txt"),
+}
+
+
+def _format_of(output: Path, kind: str | None) -> str:
+    """The format of an export: as requested, or that of the name of the file.
+
+    Raises UsageError if the name states no format and none is requested, or another one than the requested one.
+    """
+    if kind is None:
+        ending = output.suffix.lower().replace(".txt", "")
+        kind = next((name for name, endings in FORMATS.items() if ending in endings), None)
+    if kind is None:
+        known = ", ".join(FORMATS)
+        raise UsageError("the name states no format", where=str(output), hint=f"add --to, one of {known}")
+    check_suffix(output, *FORMATS[kind])
+    return kind
 
 
 @click.command("export", epilog=EXPORT_EPILOG)
 @click.argument("result", type=PATH)
-@click.option(
-    "--to", "kind", type=click.Choice(["csv", "parquet", *POSE_FORMATS]), required=True, help="Format of the file."
-)
+@click.option("--to", "kind", type=click.Choice(list(FORMATS)), help="Format of the file; that of its name by default.")
 @click.option(
     "--poses",
     type=click.Choice(["estimate", "registration", "truth"]),
@@ -161,17 +179,19 @@ POSE_FORMATS = ("tum", "kitti")
 )
 @click.option("-o", "--output", type=PATH, required=True, help="The file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def export_command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) -> None:
+def export_command(result: Path, kind: str | None, poses: str, output: Path, overwrite: bool) -> None:
     """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full precision.
 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
 
     \f
     Raises:
-        UsageError: the output cannot be written, or the result has no poses of the requested kind.
+        UsageError: the output cannot be written, its name states no or another format, or the result has no poses of
+            the requested kind.
         UnreadableInput: RESULT cannot be read.
         MissingBackend: pyarrow is needed and not installed.
     """  # noqa: D301
+    kind = _format_of(output, kind)
     check_outputs("output", overwrite=overwrite)
     found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):

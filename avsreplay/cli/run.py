@@ -12,9 +12,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import run_settings, take_run_settings
-from avsreplay.cli.options import PATH, StartMode, check_outputs, given_paths, log_file, pose_options, read_options
+from avsreplay.cli.options import (
+    PATH,
+    StartMode,
+    check_outputs,
+    given_paths,
+    log_file,
+    pose_options,
+    read_options,
+    report_losses,
+)
 from avsreplay.cli.options import run_source_options as source_options
-from avsreplay.errors import CheckFailed, DataLost, UsageError, value_class
+from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -110,7 +119,7 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
         click.echo(f"verdict {done.verdict.line}", err=True)
         _gate(wanted, done)
-        _report_losses(run)
+        report_losses(run.source, done.summary.status.get("damaged", 0))
 
 
 @value_class(kw_only=True, eq=True)
@@ -337,9 +346,3 @@ def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: 
     console = make_console(sys.stderr if to_stderr else sys.stdout)
     print_line(console, "settings that differ from their defaults: " + ("; ".join(verdict.changed) or "none"))
     print_table(console, golden_table(result))
-
-
-def _report_losses(run: Run) -> None:
-    if losses := run.source.losses:
-        what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"
-        raise DataLost(what, where=str(run.job.source), hint="see 'avsreplay doctor'")

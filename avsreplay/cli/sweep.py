@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from avsreplay.cli.options import PATH
-from avsreplay.errors import DataLost, UsageError
+from avsreplay.errors import DataLost, UsageError, counted
 from avsreplay.files import check_output
 
 if TYPE_CHECKING:
@@ -109,8 +109,13 @@ def sweep_command(
         if retry_failed:
             journal.forget(("failed", "crashed"))
         waiting = list(islice(_waiting(plan, journal), limit))
-        for result in _tracked(run_tasks(waiting, workers, scheduler, dashboard), len(waiting)):
-            journal.add(result)
+        try:
+            for result in _tracked(run_tasks(waiting, workers, scheduler, dashboard), len(waiting)):
+                journal.add(result)
+        except KeyboardInterrupt:
+            done = counted(len(journal.status), "run")
+            click.echo(f"avsreplay: the results of {done} are saved; the same command continues", err=True)
+            raise
         summary = write_results(plan, journal, output)
     if as_json:
         click.echo(json.dumps(summary.document(), indent=1, allow_nan=False))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, counted
 from avsreplay.geometry import Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
@@ -138,7 +138,8 @@ def _no_clouds(recording: Recording, path: Path, what: str) -> UnreadableInput:
     elif what == "PointCloud2" and any("packet" in t.type.lower() for t in topics):
         advice = "these are raw sensor packets: convert them with the sensor's own driver first; "
     elif recording.losses:
-        advice = f"{len(recording.losses)} part(s) of it could not be read, 'avsreplay doctor' lists them; "
+        parts = counted(len(recording.losses), "part")
+        advice = f"{parts} of it could not be read, 'avsreplay doctor' lists them; "
     hint = f"{advice}topics here: {_named(topics) or 'none'}"
     return UnreadableInput(f"no {what} topic with a message", where=shown(path), hint=hint)
 

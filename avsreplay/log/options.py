@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
-from avsreplay.errors import value_class
+from avsreplay.errors import counted, value_class
 from avsreplay.settings import Settings, setting
 
 ASSUMED_HZ = 1.0  # rate of scans or poses without times
@@ -127,7 +128,9 @@ class SourceOptions(Settings):
         low=1e-4,
         high=1e6,
     )
-    strict: bool = setting(False, "Treat any loss of data as an error (exit code 3).")
+    strict: bool = setting(
+        False, "Treat any loss of data, also a scan that cannot be decoded, as an error (exit code 3)."
+    )
     max_message_mib: int = setting(
         128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096
     )
@@ -241,6 +244,24 @@ class ClockSummary:
     def placed(self) -> int:
         """Return the number of scans whose own stamp was not used."""
         return self.unset + self.jumps + self.equal + self.back
+
+
+def lost_text(losses: Sequence[Loss], damaged: Mapping[int, str], scans: int, count: int | None = None) -> str:
+    """Return in words what of a log could not be read, "" if everything could.
+
+    Args:
+        losses: parts of its files.
+        damaged: number of each scan that cannot be used, with the reason.
+        scans: number of selected scans.
+        count: number of scans that cannot be used, if ``damaged`` does not have all of them.
+    """
+    count, found = len(damaged) if count is None else count, []
+    if losses:
+        found.append(f"{counted(len(losses), 'damaged place')} left out, the first: {losses[0].what}")
+    if count:
+        first = f", the first: scan {min(damaged)}: {damaged[min(damaged)]}" if damaged else ""
+        found.append(f"{count} of {counted(scans, 'scan')} cannot be used{first}")
+    return "; ".join(found)
 
 
 @value_class(eq=True)

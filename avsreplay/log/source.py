@@ -19,7 +19,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions
+from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, lost_text
 from avsreplay.log.point_cloud2 import Cloud, at_stamp, selected
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
@@ -34,6 +34,7 @@ class Source:
         path: the log or folder.
         header: the header of the log, with the requested model in place of its own.
         options: how the source is read.
+        damaged: why scans that were read so far could not be decoded, by their number among the selected ones.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Source:
         self._clouds, self._ground_truth, self._files = clouds, ground_truth, tuple(files)
         self._extra = extra or {}
         self._placed, self._clock = place(clouds.log_ns, clouds.publish_ns, clouds.header_ns, options.clock)
-        self._lost = losses
+        self._lost, self.damaged = losses, dict[int, str]()
 
     def __enter__(self) -> Source:
         return self
@@ -148,6 +149,7 @@ class Source:
 
         Raises:
             IndexError: there is no such scan.
+            UnreadableInput: it cannot be decoded, and the source was opened with ``strict``.
         """
         return self._scan(seq, self._selected[seq])
 
@@ -178,7 +180,7 @@ class Source:
             why, gap = ("", False) if track is None or not scans else track.uncovered([scan.t_ns for scan in scans])
             stamps = why and not gap and options.truth_file is None and options.clock is ClockChoice.HEADER
             option = "--truth-gap SECONDS" if gap else "--clock log" if stamps else ""
-            return (f"none of the {len(scans)} examined scans has a true pose{why}", option) if scans else None
+            return (f"no examined scan of {len(scans)} has a true pose{why}", option) if scans else None
         at = "" if track is None or options.truth_file or options.sensor_topic else track.frame.lstrip("/")
         clouds, frames = (options.fixed_frame or scans[0].frame).lstrip("/"), self._ground_truth.frames
         transforms = any(topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics())
@@ -262,7 +264,10 @@ class Source:
         try:
             cloud = self._taken(self._clouds.load(place), placed.t_ns)
         except BadMessage as error:
-            return self._finish(seq, place, None, shown(error))
+            self.damaged[seq] = shown(error)
+            if self.options.strict:
+                refuse_losses(self)
+            return self._finish(seq, place, None, self.damaged[seq])
         return self._finish(seq, place, cloud, placed.note)
 
     def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
@@ -339,7 +344,6 @@ def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:
 
 
 def refuse_losses(source: Source) -> None:
-    """Raise UnreadableInput if any part was lost (``--strict``)."""
-    if source.losses:
-        what = f"{len(source.losses)} losses, the first: {source.losses[0].what} (byte {source.losses[0].offset})"
-        raise UnreadableInput(what, where=shown(source.path), hint="leave out --strict to use the intact part")
+    """Raise UnreadableInput if any part, or a scan that was read, was lost (``--strict``)."""
+    if text := lost_text(source.losses, source.damaged, len(source)):
+        raise UnreadableInput(text, where=shown(source.path), hint="leave out --strict to use the intact part")

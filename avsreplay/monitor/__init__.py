@@ -136,23 +136,70 @@ def _log10_cond(singular: NDArray[Any]) -> float | None:
     return 2.0 * math.log10(singular[0] / singular[-1]) if singular[-1] > 0.0 else None
 
 
+def unobserved(state: Gramian, blocks: Mapping[str, slice] = BLOCKS) -> tuple[str, ...]:
+    """Return in words the directions about which the poses give less information than the prior, each once.
+
+    Args:
+        state: the Gramian.
+        blocks: names of the states.
+
+    Returns:
+        One text for each of the ``size - rank`` directions of ``measure``.
+    """
+    told, directions = _directions(state)
+    return _in_words(directions[told <= 1.0], blocks)
+
+
 def weakest(state: Gramian, count: int = 3, blocks: Mapping[str, slice] = BLOCKS) -> tuple[str, ...]:
-    """Return the least observed directions of the scaled Gramian in words, weakest first.
+    """Return in words the directions with the least information among those that the poses do determine, each once.
 
     Args:
         state: the Gramian.
         count: number of directions.
         blocks: names of the states.
     """
-    _, _, rows = np.linalg.svd(state.root * state.scale)
-    return tuple(_in_words(row, blocks) for row in rows[::-1][:count])
+    told, directions = _directions(state)
+    return _in_words(directions[told > 1.0][::-1][:count], blocks)
 
 
-def _in_words(direction: Array, blocks: Mapping[str, slice]) -> str:
-    """The blocks that hold most of a unit direction, with their shares."""
-    shares = {name: float(np.sum(direction[where] ** 2)) for name, where in blocks.items()}
-    named = sorted(shares.items(), key=lambda item: (-item[1], item[0]))
-    return " with ".join(f"{_WORDS.get(name, name)} ({share:.0%})" for name, share in named if share >= 0.1)
+def _directions(state: Gramian) -> tuple[Array, Array]:
+    """Singular values (n,) of the whitened and scaled root, largest first, and its directions (n, n) as rows."""
+    _, told, rows = np.linalg.svd(state.white * state.scale)
+    return told, rows
+
+
+def _in_words(directions: Array, blocks: Mapping[str, slice]) -> tuple[str, ...]:
+    """A text for each of k orthonormal directions (k, n): its states, each with its block and axis.
+
+    The directions are replaced by others that span the same space and each of which alone contains one of k states,
+    because the axes within a space of equal information are arbitrary.
+    """
+    if not len(directions):
+        return ()
+    own, rest = list[int](), directions.copy()
+    for _ in directions:  # QR decomposition with column pivoting
+        own.append(int(np.argmax(np.sum(rest**2, axis=0))))
+        q = rest[:, own[-1]] / np.linalg.norm(rest[:, own[-1]])
+        rest -= np.outer(q, q @ rest)
+    own.sort()
+    basis = np.linalg.solve(directions[:, own], directions)
+    shares = basis**2 / np.sum(basis**2, axis=1, keepdims=True)
+    return tuple(_text_of(share, state, blocks) for share, state in zip(shares, own, strict=True))
+
+
+def _text_of(share: Array, own: int, blocks: Mapping[str, slice]) -> str:
+    """The state ``own`` and those with at least a tenth of a direction, by block, with shares unless one is all."""
+    place = {i: (name, i - where.start) for name, where in blocks.items() for i in range(where.start, where.stop)}
+    named = sorted({own, *map(int, np.flatnonzero(share >= 0.1))}, key=lambda i: (i != own, -share[i], i))
+    together = dict.fromkeys(place[i][0] for i in named)
+    texts = []
+    for name in together:
+        axes = ", ".join(
+            "123"[place[i][1]] if name == "sigma" else "xyz"[place[i][1]] for i in named if place[i][0] == name
+        )
+        held = float(np.sum(share[blocks[name]]))
+        texts.append(f"{_WORDS.get(name, name)} {axes}" + ("" if len(together) == 1 else f" ({held:.0%})"))
+    return " with ".join(texts)
 
 
 class Policy(Enum):

@@ -165,6 +165,31 @@ def changed_settings(*tables: Any) -> list[str]:
     return found
 
 
+def different_logs(base: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return the names of the logs of two runs, with the first digits of their SHA-256 if the names are equal.
+
+    Args:
+        base: ``run.json`` of the baseline.
+        other: of the run that is compared with it.
+
+    Returns:
+        The names; None if the logs are the same, or one of the two does not state its log.
+    """
+    logs = [header.get("log") or {} for header in (base, other)]
+    sums = [log.get("sha256") for log in logs]
+    if sums[0] == sums[1] or not all(sums):
+        return None
+    return _names(logs[0], logs[1])
+
+
+def _names(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[str, str]:
+    """Names of two different files; of equal names the first digits of the SHA-256 distinguish them."""
+    names = [str(given.get("name", "unknown")) for given in (first, second)]
+    if names[0] == names[1]:
+        names = [f"{names[0]} {str(given.get('sha256'))[:8]}" for given in (first, second)]
+    return names[0], names[1]
+
+
 def different_inputs(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Log, model, reading options and settings that differ, each as ``key = value (baseline ...)``.
 
@@ -176,9 +201,7 @@ def different_inputs(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[
     for part in ("log", "model"):
         ours, theirs = (header.get(part) or {} for header in (other, base))
         if ours.get("sha256") != theirs.get("sha256"):
-            names = [str(given.get("name", "unknown")) for given in (ours, theirs)]
-            if names[0] == names[1]:  # then the first digits of their SHA-256 distinguish them
-                names = [f"{names[0]} {str(given.get('sha256'))[:8]}" for given in (ours, theirs)]
+            names = _names(ours, theirs)
             found.append(f"{part} = {names[0]} (baseline {names[1]})")
     for part in ("selection", "config"):
         ours, theirs = (header.get(part) for header in (other, base))

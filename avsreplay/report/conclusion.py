@@ -4,7 +4,8 @@ A value that is missing in one run counts as worse; it is never skipped. A diffe
 95 % interval excludes zero. For two runs, means over scans (RMSE, shares) get an interval by a paired bootstrap over
 blocks of consecutive scans, because successive errors are correlated. For groups of at least five runs, paired by name,
 every metric gets the interval of its mean paired difference. Counts of events need no interval; any other figure
-without one is reported as changed.
+without one is reported as changed. Scans of different logs cannot be paired: every difference of such runs is reported
+as changed, and the sentence begins with the names of the logs.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.report import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.charts import values
-from avsreplay.report.compare import METRICS, different_inputs, metrics
+from avsreplay.report.compare import METRICS, different_inputs, different_logs, metrics
 from avsreplay.report.golden import GoldenResult, compare_rows
 from avsreplay.report.intervals import interval_of_mean, interval_of_roots
 from avsreplay.report.table import Table, TableCell, facts_table, number
@@ -99,7 +100,7 @@ class Change:
         base, other: values; means over the runs of a group that have one; None where none has.
         low, high: 95 % interval of the difference other - base; None without enough pairs.
         word: "better", "worse", "no evidence" (the interval contains 0, or there are too few pairs), "equal", or
-            "changed" for a metric without a direction or without an interval.
+            "changed" for a metric without a direction or without an interval, and for runs of different logs.
         note: "lost" or "new" where one side has no value.
     """
 
@@ -123,7 +124,7 @@ class Conclusion:
         changes: of every metric that one of them has.
         settings: log, model, reading options and settings that differ, as ``key = value (baseline ...)``.
         pairs: number of paired runs.
-        divergence: of the rows of a single pair; None for several pairs.
+        divergence: of the rows of a single pair; None for several pairs or different logs.
     """
 
     name: str
@@ -146,18 +147,30 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
         The conclusion; the same runs give the same result (the bootstrap has a fixed seed).
     """
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
-    changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs)) is not None)
+    apart = [named for base, other in pairs if (named := different_logs(base.header, other.header))]
+    paired = not apart or len(pairs) >= _LEAST_RUNS
+    changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None)
     settings = dict.fromkeys(text for base, other in pairs for text in different_inputs(base.header, other.header))
     found = [compare_rows(base.rows, other.rows, first=1) for base, other in pairs]
     word, sentence = _overall(changes, same=all(f.ok for f in found), rows=sum(len(other.rows) for _, other in pairs))
-    divergence = found[0] if len(found) == 1 else None
+    divergence = found[0] if len(found) == 1 and not apart else None
+    if apart:
+        sentence = f"{_apart(apart, len(pairs), comparable=paired or word == 'same')}{sentence}"
     return Conclusion(name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs), divergence)
+
+
+def _apart(apart: Sequence[tuple[str, str]], pairs: int, *, comparable: bool) -> str:
+    """The words before the conclusion where the logs of runs differ."""
+    which = "the logs differ" if pairs == 1 else f"the logs of {len(apart)} of {pairs} pairs differ"
+    names = f"{which} ('{apart[0][1]}', baseline '{apart[0][0]}')"
+    return f"{names}: " if comparable else f"{names}, so that a comparison scan by scan does not apply: "
 
 
 def _change(
     name: str,
     figures: Sequence[tuple[Mapping[str, float | None], Mapping[str, float | None]]],
     pairs: Sequence[tuple[ComparedRun, ComparedRun]],
+    paired: bool,
 ) -> Change | None:
     values = [(base[name], other[name]) for base, other in figures]
     if all(base is None and other is None for base, other in values):
@@ -166,8 +179,11 @@ def _change(
     lost = sum(a is not None and b is None for a, b in values)
     new = sum(a is None and b is not None for a, b in values)
     if lost or new:
-        return Change(name, base, other, None, None, _word_of_loss(name, lost - new), "lost" if lost else "new")
+        word = _word_of_loss(name, lost - new) if paired else "changed"
+        return Change(name, base, other, None, None, word, "lost" if lost else "new")
     differences = [b - a for a, b in values if a is not None and b is not None]
+    if not paired:
+        return Change(name, base, other, None, None, "changed" if any(differences) else "equal")
     interval = _interval(name, pairs, differences) if any(differences) else None
     low, high = interval or (None, None)
     return Change(name, base, other, low, high, _word(name, differences, interval))

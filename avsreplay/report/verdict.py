@@ -139,7 +139,8 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Scans that updated the filter; those with a harmful fault are not expected to."""
     common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
     if not summary.healthy:
-        yield Concern(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {plain(common)})")
+        none = "the only scan was not" if summary.scans == 1 else f"none of the {summary.scans} scans was"
+        yield Concern(Grade.FAIL, f"{none} used ({'' if summary.scans == 1 else 'mostly '}{plain(common)})")
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
@@ -263,7 +264,11 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 
 def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterator[Concern]:
-    """Errors of the back end, losses, and clock problems of the log that the checks before the run did not name."""
+    """Damaged scans, errors of the back end, losses, and clock problems that the checks before the run did not name."""
+    damaged = [row for row in rows if row.status == "damaged"]
+    if damaged:
+        text = f"{len(damaged)} of {len(rows)} scans cannot be used, the first at {damaged[0].t_s:.1f} s"
+        yield Concern(Grade.CHECK, f"{text}: {damaged[0].message}" if damaged[0].message else text)
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK

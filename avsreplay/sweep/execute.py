@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import importlib
 import json
+import logging
+import signal
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -23,6 +25,7 @@ from avsreplay import __version__, settings, toml_document
 from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
 from avsreplay.files import output_text
 from avsreplay.log import SourceOptions
+from avsreplay.log.options import lost_text
 from avsreplay.plan.arm import with_arm
 from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Belief, Label, Scan
@@ -79,12 +82,11 @@ def _replayed(task: Task, log: Path) -> RunResult:
         last = None
         for row in run.rows(listeners):
             last = row
-        summary, losses = run.summary(), run.source.losses
+        summary = run.summary()
         metrics = flat_metrics(summary, last) | (_flown(task, run, known) if task.flights else {})
         found = metrics, tuple(lines), episode_lines(summary.faults.episodes), len(lines)
-        if losses:
-            what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"
-            return RunResult(task.id, "lossy", what, *found)
+        if text := lost_text(run.source.losses, run.source.damaged, len(run)):
+            return RunResult(task.id, "lossy", text, *found)
         return RunResult(task.id, "ok", None, *found)
 
 
@@ -192,12 +194,31 @@ def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any
             what = f"the scheduler does not answer: {str(error).splitlines()[0]}"
             raise UnreadableInput(what, where=scheduler, hint="check the address") from None
         return
-    options = {"threads_per_worker": 1, "processes": True, "memory_limit": None}
-    with (
-        dask.LocalCluster(n_workers=workers, host="127.0.0.1", dashboard_address=dashboard, **options) as cluster,
-        dask.Client(cluster) as client,
-    ):
+    options = {"threads_per_worker": 1, "processes": True, "memory_limit": None, "silence_logs": logging.CRITICAL}
+    with ExitStack() as stack:
+        with _no_interrupt():
+            cluster = dask.LocalCluster(n_workers=workers, host="127.0.0.1", dashboard_address=dashboard, **options)
+            client = stack.enter_context(dask.Client(stack.enter_context(cluster)))
         yield client
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Delay SIGINT; threads and processes started meanwhile never receive it.
+
+    A terminal sends Ctrl-C to all processes of a command. Only this one handles it; it then ends its workers.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its start enables SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
