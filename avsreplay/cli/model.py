@@ -86,9 +86,9 @@ def model_command(
     for each in (output, mesh):
         if each is not None:
             check_suffix(each, ".ply")
+    check_outputs("output", "mesh", "poses", overwrite=overwrite)
     if poses is not None:
         check_suffix(poses, *TUM)
-    check_outputs("output", "mesh", "poses", overwrite=overwrite)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
         raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
@@ -237,8 +237,8 @@ def odometry_command(
     from avsreplay.register.peers import KissOdometry
     from avsreplay.report.export import write_tum
 
-    check_suffix(output, *TUM)
     check_outputs("output", overwrite=overwrite)
+    check_suffix(output, *TUM)
     load_backend("kiss")  # reports where the library is not installed
     odometry, poses = None, []
     with open_source(log, read_options(reading)) as source:

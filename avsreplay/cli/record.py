@@ -191,8 +191,8 @@ def export_command(result: Path, kind: str | None, poses: str, output: Path, ove
         UnreadableInput: RESULT cannot be read.
         MissingBackend: pyarrow is needed and not installed.
     """  # noqa: D301
-    kind = _format_of(output, kind)
     check_outputs("output", overwrite=overwrite)
+    kind = _format_of(output, kind)
     found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):
         (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)

@@ -85,8 +85,8 @@ def _replayed(task: Task, log: Path) -> RunResult:
         summary = run.summary()
         metrics = flat_metrics(summary, last) | (_flown(task, run, known) if task.flights else {})
         found = metrics, tuple(lines), episode_lines(summary.faults.episodes), len(lines)
-        if text := lost_text(run.source.losses, run.source.damaged, len(run)):
-            return RunResult(task.id, "lossy", text, *found)
+        if what := lost_text(run.source.losses, run.source.damaged, len(run)):
+            return RunResult(task.id, "lossy", what, *found)
         return RunResult(task.id, "ok", None, *found)
 
 
