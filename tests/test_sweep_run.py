@@ -214,7 +214,7 @@ def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     campaign.write_text(text)
     done = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert isinstance(done.exception, DataLost)
-    assert "2 of 6 runs were not ok (2 failed)" in str(done.exception)
+    assert "2 of 6 runs not ok (2 failed)" in str(done.exception)
     assert "6 of 6 runs done (2 failed, 4 ok)" in done.output
     again = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert isinstance(again.exception, DataLost)
@@ -278,8 +278,8 @@ def test_a_cut_log_is_lossy_and_exit_4_as_in_run(cli, tmp_path):
     assert cli("run", tmp_path / "cut.mcap", "--json").code == DataLost.exit_code
     done = sweep(tmp_path / "c.toml", tmp_path / "out", "--workers", "0", "--json")
     assert isinstance(done.exception, DataLost)
-    assert "1 of 1 runs were not ok (1 lossy)" in str(done.exception)
-    assert "damaged places were left out" in str(done.exception)
+    assert "1 of 1 run not ok (1 lossy)" in str(done.exception)
+    assert "damaged place" in str(done.exception)
     said = json.loads(done.output)
     assert said["status"] == {"lossy": 1}
     (worst,) = said["worst"]

@@ -141,10 +141,8 @@ def _report_failures(summary: SweepSummary, journal: Journal, output: Path) -> N
         worst = next(
             run_id for status in ("crashed", "failed", "lossy") for run_id, s in journal.status.items() if s == status
         )
-        parts = [f"{count} {status}" for status, count in summary.status.items() if status != "ok"]
-        what = (
-            f"{bad} of {summary.done} runs were not ok ({', '.join(parts)}), for example: {journal.result(worst).error}"
-        )
+        parts = ", ".join(f"{count} {status}" for status, count in summary.status.items() if status != "ok")
+        what = f"{bad} of {counted(summary.done, 'run')} not ok ({parts}), for example: {journal.result(worst).error}"
         raise DataLost(what, where=str(output), hint="see the columns 'status' and 'error' of results.parquet")
 
 
