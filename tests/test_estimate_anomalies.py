@@ -230,6 +230,20 @@ def test_three_poses_that_agree_replace_the_first_ones() -> None:
     assert max(error for error, _ in result.error[after + 2 :]) < 0.02
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_disturbances_that_the_end_of_a_bias_feigns_are_estimated_again(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Poses of 0.1 mm: the end of the bias looks like a driven target, with a fit of fewer poses than an estimate."""
+    monkeypatch.setattr(surprises, "POS_M", 1e-4)
+    monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
+    case = surprises.Case("bias", at_s=0.0, until_s=10.0, bias=0.15, hz=5.0, speed=0.4, seconds=30.0)
+    result = surprises.run(case, seed)
+    assert result.track is not None
+    assert result.track.levels.torque < 1e-5  # rad/s^1.5; the target is free
+    assert result.converged[-1]
+
+
 @pytest.mark.parametrize("seed", [0, 2, 4])
 def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, seed: int

@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ _LEAST_EXCESS = 1e-6  # least variance of a belief over that of a pose, less 1, 
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 _NOT_BY_CHANCE = {3: 21.1, 6: 27.9}  # 99.99 % point of chi-square with so many degrees of freedom
+_LEAST_NIS = 1.6  # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
@@ -107,10 +109,12 @@ class DisturbanceSchedule:
         if not self.batch.checked_poses or last is None or track.testing is not None:
             return track
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        if count >= FEWEST and known is None and late > (0 if track.since else _LATEST):
-            start = self._start(track, last, track.fixes[0].t_ns)
-            poses = track.fixes, last, start, self.params, track.levels, _positions(track, start)
-            if len(track.fixes) < FEWEST_TO_SPREAD:
+        # Disturbances that are too large shorten the fit to fewer poses than are needed to estimate them again.
+        fixes = track.fixes if count >= FEWEST or not _overestimated(track) else _all_poses(track).fixes[-FEWEST:]
+        if pose_count(fixes) >= FEWEST and known is None and late > (0 if track.since else _LATEST):
+            start = self._start(track, last, fixes[0].t_ns)
+            poses = fixes, last, start, self.params, track.levels, _positions(track, start)
+            if len(fixes) < FEWEST_TO_SPREAD:
                 return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
             return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
         if track.untested <= FEWEST_TO_TEST or track.since == 0:
@@ -199,6 +203,11 @@ class DisturbanceSchedule:
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
+
+
+def _overestimated(track: Track) -> bool:
+    """Return whether the last accepted scans agree with their predictions much better than the covariance claims."""
+    return len(track.nis) >= FEWEST and median(track.nis[-FEWEST:]) < _LEAST_NIS
 
 
 def _significant(fitted: DrivenBelief) -> bool:
