@@ -70,17 +70,17 @@ def normalise(q: ArrayLike) -> Array:
     """
     unit: Array = np.asarray(q, dtype=np.float64)
     if unit.ndim == 1 and any(parts := unit.tolist()):
-        return _normalised(*parts)
+        return np.array(_unit(*parts))
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     wxyz = np.roll(unit, 1, axis=-1)
     lead = np.take_along_axis(wxyz, np.argmax(wxyz != 0.0, axis=-1)[..., None], axis=-1)
     return np.asarray(np.where(lead < 0.0, -unit, unit), dtype=np.float64)
 
 
-def _normalised(x: float, y: float, z: float, w: float) -> Array:
+def _unit(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
     n = math.sqrt(x * x + y * y + z * z + w * w)
     n = -n if (w or x or y or z) < 0.0 else n
-    return np.array((x / n, y / n, z / n, w / n))
+    return x / n, y / n, z / n, w / n
 
 
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
@@ -113,14 +113,7 @@ def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: 
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
-    """Return the conjugate ``q_ba``.
-
-    Args:
-        q_ab: (..., 4) quaternions ``[x y z w]``.
-
-    Returns:
-        (..., 4) quaternions; for unit quaternions the inverse rotation.
-    """
+    """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4): the inverse rotations of unit quaternions."""
     return np.asarray(q_ab, dtype=np.float64) * _CONJUGATE
 
 
@@ -180,7 +173,7 @@ def quaternion(R_ab: ArrayLike) -> Array:
     """
     R = np.asarray(R_ab, dtype=np.float64)
     if R.ndim == 2:
-        return _quaternion(*R.ravel().tolist())
+        return np.array(_unit(*_multiple(*R.ravel().tolist())))
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
     four_q_qT[..., 0, 0], four_q_qT[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
@@ -198,12 +191,13 @@ def quaternion(R_ab: ArrayLike) -> Array:
     return normalise(np.take_along_axis(four_q_qT, best[..., None, None], axis=-2)[..., 0, :])
 
 
-def _quaternion(*R: float) -> Array:
+def _multiple(*R: float) -> tuple[float, ...]:
+    """The quaternion of a rotation matrix, given row by row, times a number."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R
     squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
     a, b, c, d, e, f = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
     rows = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))
-    return normalise(rows[squares.index(max(squares))])
+    return rows[squares.index(max(squares))]
 
 
 def exp(rotvec: ArrayLike) -> Array:
@@ -236,14 +230,7 @@ def log(q: ArrayLike) -> Array:
 
 
 def angle(q: ArrayLike) -> Array:
-    """Return the rotation angle of a quaternion.
-
-    Args:
-        q: (..., 4) quaternions ``[x y z w]``; their length does not matter.
-
-    Returns:
-        (...) angles in [0, pi] [rad].
-    """
+    """Return the rotation angles (...) in [0, pi] [rad] of quaternions (..., 4); their length does not matter."""
     a: Array = np.asarray(q, dtype=np.float64)
     if a.ndim == 1:
         x, y, z, w = a.tolist()
@@ -288,7 +275,19 @@ class Pose:
     t: Array
 
     def __post_init__(self) -> None:
-        self.q, self.t = frozen(normalise(self.q), 4), frozen(self.t, 3)  # type: ignore[misc]
+        q, t = normalise(self.q), np.array(self.t, np.float64)
+        if q.shape != (4,) or t.shape != (3,):
+            raise ValueError(f"expected shapes (4,) and (3,), got {q.shape} and {t.shape}")
+        q.flags.writeable = t.flags.writeable = False
+        self.q, self.t = q, t  # type: ignore[misc]
+
+    @classmethod
+    def _of(cls, q: tuple[float, ...], t: list[float]) -> Pose:
+        """The pose of a quaternion that is not zero and of a position: as the constructor, in half the time."""
+        pose, pose_q, pose_t = cls.__new__(cls), np.array(_unit(*q)), np.array(t)
+        pose_q.flags.writeable = pose_t.flags.writeable = False
+        pose.q, pose.t = pose_q, pose_t  # type: ignore[misc]
+        return pose
 
     @classmethod
     def identity(cls) -> Pose:
@@ -302,8 +301,8 @@ class Pose:
         Args:
             T_ab: (4, 4) homogeneous matrix, translation in [m].
         """
-        T = np.asarray(T_ab, dtype=np.float64)
-        return cls(quaternion(T[:3, :3]), T[:3, 3])
+        a, b, c, _ = np.asarray(T_ab, dtype=np.float64).tolist()
+        return cls._of(_unit(*_multiple(*a[:3], *b[:3], *c[:3])), [a[3], b[3], c[3]])
 
     @property
     def R(self) -> Array:
@@ -319,11 +318,13 @@ class Pose:
     def inverse(self) -> Pose:
         """Return the inverse T_ba."""
         (x, y, z, w), (u, v, s) = self.q.tolist(), self.t.tolist()
-        return Pose(np.array((-x, -y, -z, w)), np.array([-(a * u + b * v + c * s) for a, b, c in _rows(-x, -y, -z, w)]))
+        return self._of((-x, -y, -z, w), [-(a * u + b * v + c * s) for a, b, c in _rows(-x, -y, -z, w)])
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: T_ab @ T_bc = T_ac."""
-        return Pose(multiply(self.q, other.q), rotate(self.R, other.t) + self.t)
+        q, (x, y, z), t = self.q.tolist(), other.t.tolist(), self.t.tolist()
+        moved = [a * x + b * y + c * z + o for (a, b, c), o in zip(_rows(*q), t, strict=True)]
+        return self._of(_product(*q, *other.q.tolist()), moved)
 
     def apply(self, points_b: ArrayLike) -> Array:
         """Transform points from b to a.

@@ -57,7 +57,7 @@ def mean_vector(x: State) -> Array:
     Args:
         x: the mean of a belief.
     """
-    return np.concatenate([getattr(x, name) for name, _ in _BLOCKS])
+    return x.flat
 
 
 def read_beliefs(path: Path) -> list[Belief]:

@@ -17,6 +17,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.records import Label, State
 
+_U32, _STAMP = struct.Struct("<I"), struct.Struct("<iI")
 _CDR_LITTLE = {0x0001: "<", 0x0000: ">"}  # plain CDR; parameter lists (0x0002, 0x0003) do not occur in ROS
 
 
@@ -130,7 +131,8 @@ class Packer:
         self.out = bytearray(b"\x00\x01\x00\x00")
 
     def _align(self, size: int) -> None:
-        self.out += b"\x00" * (-(len(self.out) - 4) % size)
+        if missing := (4 - len(self.out)) % size:
+            self.out += bytes(missing)
 
     def u8(self, value: int) -> Packer:
         """Append an octet."""
@@ -140,7 +142,7 @@ class Packer:
     def u32(self, value: int) -> Packer:
         """Append an unsigned 32-bit number."""
         self._align(4)
-        self.out += struct.pack("<I", value)
+        self.out += _U32.pack(value)
         return self
 
     def i32(self, value: int) -> Packer:
@@ -169,7 +171,7 @@ class Packer:
 
     def pose(self, pose: Pose) -> Packer:
         """Append a geometry_msgs Pose."""
-        return self.f64s(*pose.t, *pose.q)
+        return self.f64s(*pose.t.tolist(), *pose.q.tolist())
 
     def string(self, text: str) -> Packer:
         """Append a string with its closing NUL."""
@@ -189,7 +191,9 @@ class Packer:
         seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
         if not -(2**31) <= seconds < 2**31:
             raise ValueError(f"stamp {t_ns} ns does not fit a ROS 2 time")
-        return self.i32(seconds).u32(nanoseconds).string(frame)
+        self._align(4)
+        self.out += _STAMP.pack(seconds, nanoseconds)
+        return self.string(frame)
 
     def bytes(self) -> bytes:
         """Return the bytes written so far."""
@@ -219,22 +223,18 @@ def point_cloud2(
         intensities: (n,), the field ``intensity``; None: no such field.
         residuals: (n,) [m], the field ``residual``; None: no such field.
     """
-    names = ["x", "y", "z"]
-    formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
     fields = (("t", times_s), ("intensity", intensities), ("residual", residuals))
     besides = [(name, values) for name, values in fields if values is not None]
-    names, formats = [*names, *(name for name, _ in besides)], [*formats, *("<f4" for _ in besides)]
-    table = np.empty(len(points), dtype={"names": names, "formats": formats})
-    for axis, name in enumerate("xyz"):
-        table[name] = points[:, axis]
-    for name, values in besides:
-        table[name] = values
+    names, size = ["x", "y", "z", *(name for name, _ in besides)], 4 if point_type == "float32" else 8
+    step = 3 * size + 4 * len(besides)
+    table = np.empty((len(points), step // 4), "<f4")
+    table[:, : 3 * size // 4].view(f"<f{size}")[:] = points
+    for k, (_, values) in enumerate(besides):
+        table[:, 3 * size // 4 + k] = values
     packer = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(names))
-    for name in names:
-        offset = int(table.dtype.fields[name][1]) if table.dtype.fields else 0
-        kind = 7 if name not in ("x", "y", "z") else _DATATYPE[point_type]
-        packer.string(name).u32(offset).u8(kind).u32(1)
-    step = table.dtype.itemsize
+    for k, name in enumerate(names):
+        kind = 7 if k > 2 else _DATATYPE[point_type]
+        packer.string(name).u32(min(k, 3) * size + 4 * max(k - 3, 0)).u8(kind).u32(1)
     return packer.u8(0).u32(step).u32(step * len(points)).octets(table.tobytes()).u8(1).bytes()
 
 

@@ -16,6 +16,7 @@ Scans are ordered by log time, then by file order. The rules for ``ClockChoice.H
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -43,7 +44,7 @@ def place(
     log_ns: Sequence[int], publish_ns: Sequence[int], header_ns: Sequence[int], choice: ClockChoice
 ) -> tuple[list[Placed], ClockSummary]:
     """Return the times of all scans, given in the order of the recorder, and a summary of the corrections."""
-    period = int(np.median(np.diff(log_ns))) if len(log_ns) > 1 else 0
+    period = int(statistics.median(np.diff(log_ns).tolist())) if len(log_ns) > 1 else 0  # np.median loads numpy.ma
     offsets = [h - r for h, r in zip(header_ns, log_ns, strict=True)]
     summary = ClockSummary(choice.value, len(log_ns), _median(offsets) * 1e-9, period * 1e-9)
     if choice is not ClockChoice.HEADER:

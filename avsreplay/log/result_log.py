@@ -135,7 +135,7 @@ class ResultLog:
                 self._append("/plan/cone", t, _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m))
         self._count += 1
         self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
-        pose = Packer().header(t, CAMERA).pose(frame.estimate).f64s(*frame.covariance.ravel())
+        pose = Packer().header(t, CAMERA).pose(frame.estimate).doubles(frame.covariance)
         self._append("/estimate/pose", t, pose.bytes())
         for topic, known in (("/registration/pose", frame.registration), ("/truth/pose", frame.truth)):
             if known is not None:

@@ -124,11 +124,14 @@ def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
 
 def measure(state: Gramian) -> Observability:
     """Return the rank and the condition numbers."""
-    told = np.linalg.svd(state.white * state.scale, compute_uv=False)
-    rank, n = int(np.sum(told > 1.0)), state.scale.size
-    if rank < n:
+    n = state.scale.size
+    roots = np.empty((3, n, n))
+    np.multiply(state.white, state.scale, out=roots[0])
+    np.multiply(state.root, state.scale, out=roots[2])
+    roots[1] = state.root
+    told, raw, scaled = np.linalg.svd(roots, compute_uv=False)
+    if (rank := int(np.count_nonzero(told > 1.0))) < n:
         return Observability(rank, n, None, None)
-    raw, scaled = np.linalg.svd(np.stack([state.root, state.root * state.scale]), compute_uv=False)
     return Observability(rank, n, _log10_cond(raw), _log10_cond(scaled))
 
 
