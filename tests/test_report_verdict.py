@@ -155,6 +155,16 @@ def test_each_problem_is_a_reason(make_rows, changes, grade, text):
     assert any(text in reason.text for reason in found.reasons), found.reasons
 
 
+def test_convergence_that_is_withdrawn_for_the_last_scans_is_a_reason(make_rows):
+    """A single doubtful scan at the end is none."""
+    rows = _good(make_rows, converged=True)
+    for lapse, reasons in ((1, 0), (30, 1)):
+        ended = [dataclasses.replace(r, converged=r.seq < len(rows) - lapse) for r in rows]
+        texts = [reason.text for reason in _judged(ended).reasons if "convergence" in reason.text]
+        assert len(texts) == reasons
+    assert texts == [f"convergence, reached at 0.0 s, does not hold after {rows[-31].t_s:.1f} s"]
+
+
 def test_losses_and_an_interruption_are_reasons(make_rows):
     rows = _good(make_rows)
     found = _judged(rows, counts={"losses": 2}, header={**HEADER, "interrupted_after": 100})

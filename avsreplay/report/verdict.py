@@ -25,12 +25,10 @@ INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
 FALSE_ALARMS = 0.05  # share of the scans without a fault
 ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
-GROWTH, GROWTH_SCANS = (
-    3.0,
-    30,
-)  # ratio of the median errors of the last and the first third of the used scans, and scans
+GROWTH, GROWTH_SCANS = 3.0, 30  # ratio of the median errors of the last and the first third of the used scans; scans
 GROWN_LEAST, TURNED_LEAST = 0.001, 0.25  # smallest median of the last third, over the extent, and [deg]
 SAME_ERROR = 0.02  # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
+SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -259,8 +257,8 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     if rows and t1.t1_s is None:
         blocks = f" (not converged: {rows[-1].unconverged_blocks})" if rows[-1].unconverged_blocks else ""
         yield Concern(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
-    elif rows and not t1.at_end:
-        yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
+    elif rows and rows[-1].t_s - (held := max(row.t_s for row in rows if row.converged)) > SHORT_LAPSE_S:
+        yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold after {held:.1f} s")
 
 
 def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterator[Concern]:
