@@ -159,7 +159,10 @@ def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
     if R.ndim == 2 and v.ndim == 1:
         x, y, z = v.tolist()
         return np.array([a * x + b * y + c * z for a, b, c in R.tolist()])
-    return np.asarray(R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:])
+    (x, y, z), out = np.moveaxis(v, -1, 0), np.empty(np.broadcast_shapes(R.shape[:-1], v.shape))
+    for k in range(3):  # numpy is slow along rows of three
+        out[..., k] = R[..., k, 0] * x + R[..., k, 1] * y + R[..., k, 2] * z
+    return out
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
@@ -201,14 +204,7 @@ def _multiple(*R: float) -> tuple[float, ...]:
 
 
 def exp(rotvec: ArrayLike) -> Array:
-    """Return the quaternion of a rotation vector.
-
-    Args:
-        rotvec: (..., 3) rotation vectors (full angle) [rad].
-
-    Returns:
-        (..., 4) unit quaternions ``[x y z w]``.
-    """
+    """Return the unit quaternions (..., 4) ``[x y z w]`` of rotation vectors (..., 3) (full angle) [rad]."""
     v = np.asarray(rotvec, dtype=np.float64)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)

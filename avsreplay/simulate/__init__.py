@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
+from itertools import repeat
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,6 +36,7 @@ EPOCH_NS = (
     1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
 )
 NS = 1_000_000_000
+T = TypeVar("T")
 _NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", "plume", "limb"
 _STREAMS = {name: k for k, name in enumerate(_NAMES)}
 
@@ -140,17 +143,18 @@ class Simulation:
 
     def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
         """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
-        noise, wrong, t_s = self._rng("noise", k), self._rng("fault", k), (log_ns - EPOCH_NS) / NS
+        noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
         bodies = [body for body in self._bodies if body.params.present(t_s)]
-        plume_rng, limb_rng = self._rng("plume", k), self._rng("limb", k)
-        plumes = [(each, plume_rng) for each in self._scenario.params.plume if each.present(t_s)]
-        limbs = [(each, limb_rng) for each in self._scenario.params.limb if each.present(t_s)]
-        returns = self._scanner.cast(t_s, bodies, plumes, limbs)
+        plumes = [each for each in params.plume if each.present(t_s)]
+        limbs = [each for each in params.limb if each.present(t_s)]
+        lights = self._with_rng("plume", k, plumes), self._with_rng("limb", k, limbs)
+        returns = self._scanner.cast(t_s, bodies, *lights)
+        wrong = self._rng("fault", k) if now else noise  # not used without a fault; to create it takes 25 us
         for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
             if kind in now:
                 returns = faults.occlude(returns, faults.strength(now[kind]), self._side(now[kind]), wrong)
         factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
-        factor *= self._scanner.glare(t_s, [limb for limb, _ in limbs])
+        factor *= self._scanner.glare(t_s, limbs)
         returns = self._scanner.disturb(returns, noise, factor)
         if Kind.RANGE_BIAS in now:
             returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
@@ -164,6 +168,10 @@ class Simulation:
     def _side(self, fault: InjectedFault) -> float:
         """Direction in the image from which the plate of a fault enters, the same for all its scans [rad]."""
         return float(self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi))
+
+    def _with_rng(self, stream: str, k: int, present: list[T]) -> list[tuple[T, np.random.Generator]]:
+        """Each of what is present with the generator of their stream, which is created if there is any."""
+        return list(zip(present, repeat(self._rng(stream, k)), strict=False)) if present else []
 
     def _rng(self, stream: str, k: int) -> np.random.Generator:
         return _generator(self._scenario.params.seed, stream, k)

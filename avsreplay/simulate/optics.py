@@ -18,7 +18,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array
@@ -164,6 +163,8 @@ def face_groups(surface: Surface) -> list[frozenset[str]]:
                     names.append(frozenset().union(*now.values()))
     if not centres:
         return [frozenset()] * len(surface.faces)
+    from scipy.spatial import cKDTree  # takes 0.2 s to import
+
     _, nearest = cKDTree(np.array(centres)).query(surface.vertices[surface.faces].mean(axis=1))
     return [names[int(k)] for k in np.asarray(nearest)]
 
@@ -290,6 +291,8 @@ def bloomed(rays: Array, saturated: Array, angle_rad: float) -> tuple[NDArray[np
     if not len(saturated):
         none = np.zeros(0, dtype=np.intp)
         return none, none
+    from scipy.spatial import cKDTree  # takes 0.2 s to import
+
     chord, nearest = cKDTree(saturated).query(rays)
     ray = np.flatnonzero(chord <= 2.0 * math.sin(0.5 * angle_rad))
     return ray, np.asarray(nearest)[ray]

@@ -135,10 +135,10 @@ class RayCaster:
         origins = np.broadcast_to(origins, directions.shape)
         hit = np.flatnonzero(face >= 0)
         normal = self._normals[face[hit]]
-        cosine = _dot(normal, directions[hit])
+        cosine = dot(normal, directions[hit])
         ranges, cosines, faces = np.full(len(face), np.inf), np.zeros(len(face)), np.full(len(face), -1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = _dot(normal, self._corners[face[hit], 0] - origins[hit]) / cosine
+            depth = dot(normal, self._corners[face[hit], 0] - origins[hit]) / cosine
         good = np.isfinite(depth) & (depth > 0.0)
         ranges[hit[good]], cosines[hit[good]] = depth[good], np.abs(cosine[good])
         faces[hit[good]] = self._index[face[hit[good]]]
@@ -197,15 +197,16 @@ def _nearest(origins: Array, directions: Array, a: Array, e1: Array, e2: Array) 
     s = origins - a
     q, rays = np.cross(s, e1), directions[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / _dot(rays, np.cross(e2, e1))
-        u, v, t = _dot(rays, np.cross(e2, s)) * scale, _dot(rays, q) * scale, _dot(q, e2) * scale
+        scale = 1.0 / dot(rays, np.cross(e2, e1))
+        u, v, t = dot(rays, np.cross(e2, s)) * scale, dot(rays, q) * scale, dot(q, e2) * scale
         inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
     t = np.where(inside, t, np.inf)
     best = np.argmin(t, axis=1)
     return np.where(np.isfinite(t[np.arange(len(t)), best]), best, -1)
 
 
-def _dot(u: Array, v: Array) -> Array:
+def dot(u: Array, v: Array) -> Array:
+    """Return the scalar products (...) of vectors (..., 3); numpy is slow along rows of three."""
     return np.asarray(u[..., 0] * v[..., 0] + u[..., 1] * v[..., 1] + u[..., 2] * v[..., 2])
 
 

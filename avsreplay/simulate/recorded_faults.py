@@ -19,7 +19,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
@@ -282,6 +281,8 @@ def range_noise(returns: Returns, rng: np.random.Generator) -> float:
     if count <= _NEIGHBOURS:
         return 0.0
     chosen = np.sort(rng.choice(count, min(_NOISE_SAMPLES, count), replace=False))
+    from scipy.spatial import cKDTree  # takes 0.2 s to import
+
     _, near = cKDTree(known.directions).query(known.directions[chosen], _NEIGHBOURS)
     ranges, directions = known.ranges[near], known.directions[near]
     inverse = (1.0 / ranges)[:, :, None]

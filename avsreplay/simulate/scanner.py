@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen, rotate
@@ -30,7 +29,7 @@ from avsreplay.simulate.optics import (
     kept_returns,
     part_of,
 )
-from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, ray_grid
+from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, dot, ray_grid
 from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
 
 
@@ -56,7 +55,8 @@ class Returns:
 
     def keep(self, chosen: NDArray[Any]) -> Returns:
         """The returns selected by a mask (n,) or by indices."""
-        return Returns(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+        return Returns(*(getattr(self, field.name).take(index, axis=0) for field in fields(self)))
 
     def joined(self, other: Returns) -> Returns:
         """These returns, then the others."""
@@ -199,6 +199,8 @@ class Scanner:
             strong = returns.keep(returns.intensities >= p.saturation)
             ray, source = bloomed(self._rays[0], strong.directions, math.radians(p.bloom_deg))
             if len(ray):
+                from scipy.spatial import cKDTree  # takes 0.2 s to import
+
                 inside = np.asarray(cKDTree(self._rays[0][ray]).query(returns.directions)[0]) < 1e-9
                 bloom = replace(strong.keep(source), directions=self._rays[0][ray], times_s=self._times[ray])
                 returns = returns.keep(~inside).joined(bloom)
@@ -220,10 +222,11 @@ class Scanner:
         else:
             groups = kept_returns(ranges, intensities, self.params.merge_m, self.params.returns)
         found = None
+        directions = self._rays[0].take(near, axis=0)
         for mean, intensity, weights in groups:
             cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
             dropouts = (weights * np.stack([r.dropouts for r in rays])).sum(axis=0)
-            each = Returns(self._rays[0][near], mean, self._times[near], cosines, intensity, dropouts)
+            each = Returns(directions, mean, self._times[near], cosines, intensity, dropouts)
             found = each if found is None else found.joined(each.keep(np.isfinite(mean)))
         assert found is not None
         return found
@@ -241,14 +244,15 @@ class Scanner:
         R_inverse = np.swapaxes(R[near] if len(R) > 1 else R, -1, -2)
         origins = rotate(R_inverse, -(t[near] if len(t) > 1 else t))
         p = self.params
-        ranges, cosines, faces = caster.ranges(origins, rotate(R_inverse, rays[near]))
+        directions = rotate(R_inverse, rays.take(near, axis=0))
+        ranges, cosines, faces = caster.ranges(origins, directions)
         seen = (ranges >= p.range_min_m) & (ranges <= p.range_max_m)
         seen &= cosines >= math.cos(math.radians(p.max_incidence_deg))
         traced = TracedRays.empty(len(rays))
         traced.ranges[near], traced.cosines[near] = ranges, cosines
         if p.sun_a is not None:
             sun = np.broadcast_to(rotate(R_inverse, np.array(p.sun_a)), (len(near), 3))
-            seen &= ~optics.glint(np.maximum(faces, 0), rotate(R_inverse, rays[near]), sun)
+            seen &= ~optics.glint(np.maximum(faces, 0), directions, sun)
         back = near[seen]
         traced.returned[back] = ranges[seen]
         traced.intensities[back] = optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
@@ -279,8 +283,7 @@ class Scanner:
     def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
         """The rays that pass through the bounding sphere of the target."""
         centre = rotate(R_ac, self.centre_c) + t_ac
-        directions = self._rays[0]
-        along = np.sum(directions * centre, axis=1)
-        aside = np.sum(centre * centre, axis=1) - along * along
+        along = dot(self._rays[0], centre)
+        aside = dot(centre, centre) - along * along
         spread = 1e-3 * self.params.divergence_mrad * np.maximum(along, 0.0)
         return np.flatnonzero(aside <= (1.001 * self._reach_m + spread) ** 2)
