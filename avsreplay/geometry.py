@@ -69,8 +69,8 @@ def normalise(q: ArrayLike) -> Array:
         (..., 4) unit quaternions of the same rotation.
     """
     unit: Array = np.asarray(q, dtype=np.float64)
-    if unit.ndim == 1 and any(parts := unit.tolist()):
-        return np.array(_unit(*parts))
+    if unit.size == 4 and any(parts := unit.ravel().tolist()):
+        return np.array(_unit(*parts)).reshape(unit.shape)
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     wxyz = np.roll(unit, 1, axis=-1)
     lead = np.take_along_axis(wxyz, np.argmax(wxyz != 0.0, axis=-1)[..., None], axis=-1)
@@ -127,8 +127,8 @@ def matrix(q_ab: ArrayLike) -> Array:
         (..., 3, 3) rotation matrices.
     """
     q: Array = np.asarray(q_ab, dtype=np.float64)
-    if q.ndim == 1:
-        return np.array(_rows(*q.tolist()))
+    if q.size == 4:
+        return np.array(_rows(*q.ravel().tolist())).reshape(*q.shape[:-1], 3, 3)
     R = np.empty((*q.shape[:-1], 3, 3))
     for k, row in enumerate(_rows(*np.moveaxis(q, -1, 0))):
         R[..., k, 0], R[..., k, 1], R[..., k, 2] = row

@@ -118,8 +118,7 @@ class Simulation:
         now = self._faults(log_ns)
         if Kind.DROPPED in now:
             return None
-        body_now = self.truth(log_ns)
-        returns = self._returns(k, log_ns, now, body_now)
+        returns = self._returns(k, log_ns, now)
         timed = self._scenario.params.scanner.pattern is not Pattern.FLASH
         jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
         scan = Scan(
@@ -141,7 +140,7 @@ class Simulation:
             )
         return scan
 
-    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
+    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault]) -> Returns:
         """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
         noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
         bodies = [body for body in self._bodies if body.params.present(t_s)]
@@ -159,7 +158,7 @@ class Simulation:
         if Kind.RANGE_BIAS in now:
             returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
         if Kind.CLUTTER in now:
-            ratio, centre = faults.strength(now[Kind.CLUTTER]), state.T_ac.apply(self._scanner.centre_c)
+            ratio, centre = faults.strength(now[Kind.CLUTTER]), self.truth(log_ns).T_ac.apply(self._scanner.centre_c)
             if self._camera is not None:
                 centre = self._camera.pose(t_s).inverse().apply(centre)
             returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)

@@ -108,7 +108,7 @@ class Motion:
         tau = (times - self._starts[step])[:, None]
         value = np.zeros((len(times), 13))
         for term in range(ORDER, -1, -1):
-            value = value * tau + self._coefficients[step, term]
+            value = value * tau + self._coefficients[:, term].take(step, axis=0)
         return geometry.normalise(value[:, :4]), value[:, 4:7], value[:, 7:10], value[:, 10:]
 
     def poses(self, times_s: ArrayLike) -> tuple[Array, Array]:
