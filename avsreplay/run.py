@@ -344,7 +344,7 @@ class Run:
         return replace(truth, pose=pose, state=None)
 
     def _model(self) -> Surface:
-        surface = self.header.surface
-        if surface is None:
-            raise UsageError("the log holds no model", where=str(self.job.source), hint="name one with --model FILE")
+        if (surface := self.header.surface) is None:
+            hint = "name one with --model FILE, or build it with --model auto"
+            raise UsageError("the log holds no model", where=str(self.job.source), hint=hint)
         return surface

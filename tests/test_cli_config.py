@@ -6,13 +6,16 @@ import tomllib
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from avsreplay import settings, toml_document
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.cli.config import SECTIONS, SettingOption, declared, reference_page
-from avsreplay.config import RunConfig, load_config
+from avsreplay.config import PAPER, RunConfig, load_config
+from avsreplay.monitor import pose_limit
+from avsreplay.records import Innovation
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -162,3 +165,14 @@ def test_an_error_names_the_option_that_was_given(words, env, begins):
 def test_an_initial_pose_of_another_command_is_named_as_given(fixtures_folder):
     words = ["observability", str(fixtures_folder / "tumble.mcap"), "--init", "1,2,3"]
     assert str(CliRunner().invoke(group, words).exception).startswith("--init 1,2,3: init is '1,2,3'")
+
+
+def test_the_method_of_the_paper_has_none_of_the_additions():
+    found = load_config(None, {}, PAPER)
+    assert found.estimator.start.value == "paper"
+    assert found.estimator.adapt.value == "matrix"
+    assert not found.estimator.robust
+    assert found.convergence.criterion.value == "covariance"
+    seen = Innovation(np.full(6, 0.1), np.eye(6), np.eye(6), 1.0, 1.0, 0.1, 0.1)
+    assert pose_limit(seen, 0.05, 1.0, found.faults.sigmas) == 0.05  # constant, whatever the covariance S
+    assert pose_limit(seen, 0.05, 1.0, RunConfig().faults.sigmas) > 1.0

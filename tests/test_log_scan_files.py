@@ -139,6 +139,9 @@ def test_a_malformed_conf_file(tmp_path: Path, line: str) -> None:
 def test_folders_that_are_not_a_source(tmp_path: Path) -> None:
     with pytest.raises(UnreadableInput, match="no scans in this folder"):
         open_source(tmp_path)
+    (tmp_path / "a.bag").touch()
+    with pytest.raises(UnreadableInput, match=r"it holds logs, name one of them: a\.bag"):
+        open_source(tmp_path)
     np.save(tmp_path / "0.npy", POINTS)
     with pytest.raises(UsageError, match="no topics"):
         open_source(tmp_path, SourceOptions(topic="/points"))
@@ -146,6 +149,8 @@ def test_folders_that_are_not_a_source(tmp_path: Path) -> None:
     (tmp_path / "b.conf").write_text("bmesh 0.npy 0 0 0 0 0 0 1\n")
     with pytest.raises(UsageError, match="several pose files"):
         open_source(tmp_path)
+    with pytest.raises(UnreadableInput, match="need --backend poses"):
+        open_source(tmp_path / "a.tum")
     with pytest.raises(UnreadableInput, match="single scan, not a log"):
         open_source(tmp_path / "0.npy")
 

@@ -82,6 +82,14 @@ def test_an_inconsistent_filter_is_not_converged() -> None:
     assert not fold(convergence, steps).converged
 
 
+def test_the_test_of_the_paper_looks_at_the_covariance_only() -> None:
+    """Consistency of the innovations and a possible change of the motion are additions to the printed method."""
+    convergence = Convergence(PAPER, 8.0)
+    track = fold(convergence, [(belief(t), ahead(), False, ahead(1e9)) for t in range(9)])
+    assert track.converged
+    assert track.t1_ns == 0
+
+
 def test_not_a_number_is_not_converged() -> None:
     P = np.full((20, 20), np.nan)
     nothing = Belief(0, X, P)

@@ -15,7 +15,7 @@ from avsreplay.cli.compare import compare_command
 from avsreplay.errors import UsageError
 from avsreplay.report import Summary
 from avsreplay.report.compare import METRICS
-from avsreplay.report.conclusion import HEADLINES, changes_table, conclude
+from avsreplay.report.conclusion import HEADLINES, changes_table, conclude, settings_table
 from avsreplay.report.intervals import interval_of_roots
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.table import make_console, print_table
@@ -155,6 +155,13 @@ def test_four_percent_on_35_scans_are_no_evidence(make_rows):
         ]
         words.append(_changes(conclude("b", [tuple(runs)]))["all_pos_rmse_m"].word)
     assert words.count("no evidence") >= 18
+
+
+def test_a_title_is_longer_than_its_table(make_rows):
+    found = conclude("a_long_name_of_a_run", [(Saved("a", make_rows(60)), Saved("b", make_rows(60)))])
+    stream = io.StringIO()
+    print_table(make_console(stream, plain_width=80), settings_table(found))
+    assert stream.getvalue().splitlines()[0].strip() == "Settings of a_long_name_of_a_run that differ"
 
 
 def test_metric_names_are_not_broken_at_80_columns(make_rows):

@@ -34,6 +34,12 @@ def _good(make_rows, n=100, **changes):
     return make_rows(n, seed=3, **changes)
 
 
+def _scattered(rows, metres):
+    """Rows with position errors that scatter about a value."""
+    factors = np.random.default_rng(2).uniform(0.5, 1.5, len(rows))
+    return [dataclasses.replace(row, pos_err_m=metres * float(f)) for row, f in zip(rows, factors, strict=True)]
+
+
 def test_a_good_run_passes(make_rows):
     found = _judged(_good(make_rows))
     assert (found.grade, found.reasons) == (Grade.PASS, ())
@@ -100,6 +106,29 @@ def test_errors_that_are_the_same_in_all_scans_are_those_of_another_frame(make_r
     assert found.reasons[0].text.startswith("the errors are the same in all used scans") == said
     small = [dataclasses.replace(row, pos_err_m=0.01, rot_err_deg=0.5) for row in rows]
     assert not any("the same in all" in reason.text for reason in _judged(small).reasons)
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "said"), [(1.0, 0.0, True), (0.0, 30.0, True), (1.0, 30.0, True), (0.1, 1.0, False)]
+)
+def test_a_displaced_or_a_turned_frame_is_found(make_rows, metres, degrees, said):
+    """Only one of both may be there: the other errors are then those of the estimate, which scatter."""
+    rng, rows = np.random.default_rng(4), make_rows(100, seed=3)
+    noise = np.abs(rng.normal(size=(100, 2))) * (0.02, 0.5)
+    moved = [
+        dataclasses.replace(row, pos_err_m=float(np.hypot(metres, a)), rot_err_deg=float(np.hypot(degrees, b)))
+        for row, (a, b) in zip(rows, noise, strict=True)
+    ]
+    assert any("the same in all used scans" in reason.text for reason in _judged(moved).reasons) == said
+
+
+def test_a_large_error_that_scatters_is_not_that_of_another_frame(make_rows):
+    rng, rows = np.random.default_rng(5), make_rows(100, seed=3)
+    rows = [dataclasses.replace(r, pos_err_m=2.0 * float(e), rot_err_deg=1.0) for r, e in
+            zip(rows, 1.0 + 0.15 * rng.normal(size=100), strict=True)]  # fmt: skip
+    reasons = [reason.text for reason in _judged(rows).reasons]
+    assert not any("the same in all used scans" in text for text in reasons)
+    assert any("median position error" in text for text in reasons)
 
 
 def test_an_injected_blackout_is_no_reason(make_rows):
@@ -174,7 +203,7 @@ def test_losses_and_an_interruption_are_reasons(make_rows):
 
 
 def test_the_worst_reason_is_first_and_at_most_three_are_in_the_line(make_rows):
-    found = _judged(_good(make_rows, rms_m=0.3, nees=100.0, nis=40.0, reinitialised=1, pos_err_m=1.0))
+    found = _judged(_scattered(_good(make_rows, rms_m=0.3, nees=100.0, nis=40.0, reinitialised=1), 1.0))
     assert found.line.startswith("FAIL: the median position error")
     assert found.line.count(";") == 4  # three reasons, one of them with a semicolon, and the count of the others
     assert re.search(r"(1 more reason|[2-9] more reasons)\.$", found.line)
@@ -255,7 +284,7 @@ def test_a_wrong_unit_stands_before_the_failures_that_it_explains(make_rows):
     advice = [{"grade": "fail", "text": "the model seems to be in inches; add --model-unit inch"}]
     good = _judged(_good(make_rows), header={**HEADER, "preflight": advice})
     assert good.line.startswith("CHECK: the model seems to be in inches")
-    bad = _judged(_good(make_rows, pos_err_m=1.0), header={**HEADER, "preflight": advice})
+    bad = _judged(_scattered(_good(make_rows), 1.0), header={**HEADER, "preflight": advice})
     assert bad.line.startswith("FAIL: the model seems to be in inches; add --model-unit inch; the median position")
 
 

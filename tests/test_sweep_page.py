@@ -73,7 +73,7 @@ def test_text_from_the_campaign_is_escaped(summary):
 def test_figures_are_placed_at_their_values(summary):
     page = build_sweep_page(summary)
     (dot, *_) = re.findall(r'class="dot" cx="([\d.]+)"', page)
-    ends = re.findall(r'<text x="([\d.]+)" y="32" text-anchor="middle">([\d.]+)<', page)
+    ends = re.findall(r'<text x="([\d.]+)" y="52" text-anchor="middle">([\d.]+)<', page)
     (x0, low), (x1, high) = ends[0], ends[-1]
     expected = float(x0) + (2.5 - float(low)) / (float(high) - float(low)) * (float(x1) - float(x0))
     assert abs(float(dot) - expected) < 0.2

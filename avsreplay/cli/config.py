@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 CONFIG = "avsreplay.config:RunConfig"
+METHOD = {"no_deskew", "config_file", "robot_file", "assignments", "starts", "paper", "init"}  # names of parameters
 ASSIGNED = {
     "backend": "register.backend",
     "policy": "faults.policy",
@@ -73,6 +74,28 @@ class SettingOption(click.Option):
         notes = [setting.unit and f"[{setting.unit}]", setting.automatic and f"(default: {setting.automatic})"]
         self.help = " ".join(part for part in (setting.doc.removesuffix("."), *notes) if part) + "."
         return super().get_help_record(ctx)
+
+
+class SectionedCommand(click.Command):
+    """A command whose help lists the settings of a run, and those of the input, apart from its other options."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, each under the heading of its section."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(_section(param), []).append(record)
+        for title, records in sections.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+
+def _section(param: click.Parameter) -> str:
+    if isinstance(param, SettingOption) and param.owner != CONFIG:
+        return "Input"
+    method = isinstance(param, SettingOption) or param.name in METHOD
+    return "Method" if method else "Options"
 
 
 def setting_option(*names: str, **more: Any) -> Callable[[F], F]:
@@ -195,7 +218,7 @@ SECTIONS = (
 )
 
 
-@click.command("config", epilog=EPILOG)
+@click.command("config", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path), required=False)
 @run_settings
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")

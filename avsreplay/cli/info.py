@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import source_setting
+from avsreplay.cli.config import SectionedCommand, source_setting
 from avsreplay.cli.options import check_outputs, pose_options, read_options, report_losses, source_options
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ Examples:
   avsreplay info drive.bag --json"""
 
 
-@click.command(name="info", epilog=EPILOG)
+@click.command(name="info", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @source_options
 @pose_options

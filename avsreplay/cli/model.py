@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import SectionedCommand
 from avsreplay.cli.options import (
     PATH,
     Numbers,
@@ -34,7 +35,7 @@ Examples:
   avsreplay run tumble.mcap --model auto                        build the model and replay against it"""
 
 
-@click.command("model", epilog=EPILOG)
+@click.command("model", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="The model to write (.ply): points with normals.")
 @click.option("--against", type=PATH, help="CAD model to compare the result with; the points are coloured by distance.")
@@ -206,7 +207,7 @@ Examples:
   avsreplay run poses.tum --backend poses --extent 1.5        estimate the motion from these poses"""
 
 
-@click.command("odometry", epilog=ODOMETRY_EPILOG)
+@click.command("odometry", cls=SectionedCommand, epilog=ODOMETRY_EPILOG)
 @click.argument("log", type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM: .tum or .txt).")
 @click.option(

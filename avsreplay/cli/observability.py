@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import SectionedCommand
 from avsreplay.cli.options import PATH, read_options, report_losses, source_options
 from avsreplay.errors import counted
 
@@ -41,7 +42,7 @@ of mass), and the least observed of the others. A direction of several states
 is a combination that the poses do not separate."""
 
 
-@click.command("observability", epilog=EPILOG)
+@click.command("observability", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
 @click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="Change one setting; may be repeated.")

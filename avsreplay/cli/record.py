@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import SectionedCommand
 from avsreplay.cli.options import (
     PATH,
     check_binary_output,
@@ -59,7 +60,7 @@ class _Fault(click.ParamType["RecordedFault"]):
             self.fail(str(error), param, ctx)
 
 
-@click.command("record", epilog=EPILOG)
+@click.command("record", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output.")
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of a simulation or of the faults.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import run_settings, take_run_settings
+from avsreplay.cli.config import SectionedCommand, run_settings, take_run_settings
 from avsreplay.cli.options import (
     PATH,
     StartMode,
@@ -51,7 +51,7 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
             2 usage, 3 unreadable input, 4 finished but data was lost, 130 interrupted."""
 
 
-@click.command("run", epilog=EPILOG)
+@click.command("run", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(

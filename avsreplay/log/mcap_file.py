@@ -104,6 +104,8 @@ class McapFile(Recording):
             raise UnreadableInput("the file is empty", where=shown(self.path), hint="record it again")
         if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
             hint = "give an MCAP, a ROS bag or a folder of scans"
+            if self.path.suffix.lower() in (".csv", ".tum", ".txt"):
+                hint += "; measured poses in a file need --backend poses (info: --poses)"
             raise UnreadableInput("not an MCAP file", where=shown(self.path), hint=hint)
         summary = self.summary = read_summary(self._file, self._limit)
         self._adopt(summary)

@@ -90,7 +90,7 @@ class SourceOptions(Settings):
     )
     start_s: float | None = setting(None, "Begin at this time after the first scan.", unit="s")
     end_s: float | None = setting(None, "End before this time after the first scan.", unit="s", unset="the last scan")
-    duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
+    duration_s: float | None = setting(None, "Length of the part that is used.", unit="s", unset="up to the end")
     n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")
     every: int = setting(1, "Take every n-th scan, each at its own time.", low=1)
     crop_box: tuple[float, float, float, float, float, float] | None = setting(

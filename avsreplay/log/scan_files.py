@@ -99,6 +99,7 @@ _READERS: dict[str, Callable[[bytes, int], NDArray[Any]]] = {
     ".laz": _las,
 }
 SCAN_FORMATS = tuple(_READERS)
+LOG_FORMATS, LISTED = (".mcap", ".bag", ".db3"), 3
 
 
 _NUMBER = re.compile(r"\d+")
@@ -129,7 +130,11 @@ def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = Non
     if model is not None and model.exists():
         found = [p for p in found if not p.samefile(model)]
     if not found:
+        logs = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in LOG_FORMATS)
         hint = f"scans are {', '.join(SCAN_FORMATS)} files; a log is an MCAP or a ROS bag"
+        if logs:
+            more = ", ..." if len(logs) > LISTED else ""
+            hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
         raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
     counts = {s: sum(p.suffix.lower() == s for p in found) for s in SCAN_FORMATS}
     common = max(SCAN_FORMATS, key=lambda s: counts[s])

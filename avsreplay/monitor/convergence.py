@@ -71,8 +71,8 @@ class ConvergenceParams(Settings):
 
     criterion: Criterion = setting(
         Criterion.PREDICTIVE,
-        "Test that decides: the covariance of every block, as in the paper (covariance), or the predicted 1 sigma of"
-        " the grasp point over the horizon (predictive).",
+        "Test that decides: the covariance of every block alone, as in the paper (covariance), or the predicted 1 sigma"
+        " of the grasp point over the horizon and the consistency of the innovations (predictive).",
     )
     dwell_s: float = setting(
         2.0,
@@ -312,7 +312,7 @@ class Convergence:
         consistent: bool = True,
         possible: Forecast | None = None,
     ) -> ConvergenceTrack:
-        """Return the state after one more scan. An inconsistent estimate is not converged.
+        """Return the state after one more scan. By the predictive criterion an inconsistent estimate is not converged.
 
         Args:
             track: the state so far.
@@ -325,11 +325,12 @@ class Convergence:
         one_sigma = block_1s(belief.P)
         unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
         predictive = forecast is not None and self._predicted(forecast)
-        holds = predictive if self.params.criterion is Criterion.PREDICTIVE else not unknown
-        if not (holds and consistent):
+        printed = self.params.criterion is Criterion.COVARIANCE  # the paper's test looks at the covariance only
+        holds = not unknown if printed else predictive and consistent
+        if not holds:
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
         since = belief.t_ns if track.since_ns is None else track.since_ns
-        excluded = possible is None or self.params.criterion is Criterion.COVARIANCE or self._predicted(possible)
+        excluded = possible is None or printed or self._predicted(possible)
         converged = excluded and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)

@@ -152,7 +152,8 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None)
     settings = dict.fromkeys(text for base, other in pairs for text in different_inputs(base.header, other.header))
     found = [compare_rows(base.rows, other.rows, first=1) for base, other in pairs]
-    word, sentence = _overall(changes, same=all(f.ok for f in found), rows=sum(len(other.rows) for _, other in pairs))
+    rows = sum(len(other.rows) for _, other in pairs)
+    word, sentence = _overall(changes, same=all(f.ok for f in found), rows=rows, paired=paired)
     divergence = found[0] if len(found) == 1 and not apart else None
     if apart:
         sentence = f"{_apart(apart, len(pairs), comparable=paired or word == 'same')}{sentence}"
@@ -248,14 +249,17 @@ def _blocks(
     return base, other
 
 
-def _overall(changes: Sequence[Change], *, same: bool, rows: int) -> tuple[str, str]:
+def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) -> tuple[str, str]:
     if same:
         return "same", f"no difference; all {rows} rows agree within the tolerances of their columns"
     found = {word: [c for c in changes if c.word == word and c.metric in HEADLINES] for word in ("worse", "better")}
     said = [f"{word} in {', '.join(map(_said, listed))}" for word, listed in found.items() if listed]
     word = ("mixed" if len(said) == 2 else "worse" if found["worse"] else "better") if said else "no evidence"
-    said = said or ["no evidence of a difference in the main metrics"]
     changed = [c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)]
+    if not paired:
+        differ = ", ".join(map(_said, changed))
+        return word, f"the main metrics differ in {differ}" if differ else "the main metrics differ by less than 10 %"
+    said = said or ["no evidence of a difference in the main metrics"]
     if changed:
         said.append(f"changed, without an interval: {', '.join(map(_said, changed))}")
     return word, "; ".join(said)

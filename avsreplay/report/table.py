@@ -20,8 +20,7 @@ from rich.text import Text
 from avsreplay.errors import value_class
 from avsreplay.rows import Column, Row, columns
 
-PLAIN_WIDTH = 80
-_WRAPPED = 12  # least width of a column of wrapped text, with its margin
+PLAIN_WIDTH, _WRAPPED = 80, 12  # the latter: least width of a column of wrapped text, with its margin
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
@@ -130,6 +129,7 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
     drawn = RichTable(
         title=Text(table.title, style="bold"),
         title_justify="left",
+        min_width=min(cell_len(table.title), console.width),  # of a short table
         caption=Text(table.note, style="dim") if table.note else None,
         caption_justify="left",
         box=box.ASCII2 if ascii_only(console) else box.SIMPLE_HEAD,

@@ -27,7 +27,7 @@ ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's e
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
 GROWTH, GROWTH_SCANS = 3.0, 30  # ratio of the median errors of the last and the first third of the used scans; scans
 GROWN_LEAST, TURNED_LEAST = 0.001, 0.25  # smallest median of the last third, over the extent, and [deg]
-SAME_ERROR = 0.02  # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
+SAME_ERROR = 0.2  # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
@@ -156,7 +156,9 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     position, turn = median_of(values(rows, "pos_err_m")), median_of(values(rows, "rot_err_deg"))
     share = position / extent_m if position is not None and extent_m else 0.0
     if share > ERROR_CHECK or (turn or 0.0) > TURN_CHECK:
-        yield from _frame(rows, Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK)
+        yield from _frame(
+            rows, extent_m, Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK
+        )
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
@@ -171,21 +173,23 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
 
 
-def _frame(rows: Sequence[Row], grade: Grade) -> Iterator[Concern]:
-    """Large errors that all used scans share: a constant displacement and rotation between two frames of the body.
+def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterator[Concern]:
+    """Large errors that all used scans share: a constant displacement or rotation between two frames of the body.
 
-    With T_true = T X and a constant X the distance |R t_X| and the angle of X are the same at every attitude.
+    With T_true = T X and a constant X the distance |R t_X| and the angle of X are the same at every attitude. An
+    equivalent pose of a symmetric body has such an X, too. Either of the two may be small.
     """
     used = [row for row in rows if row.gamma == 1 and row.pos_err_m is not None and row.rot_err_deg is not None]
     if len(used) < GROWTH_SCANS:
         return
-    found = []
-    for column in ("pos_err_m", "rot_err_deg"):
+    same, small = list[bool](), list[bool]()
+    for column, limit in (("pos_err_m", ERROR_CHECK * (extent_m or 0.0)), ("rot_err_deg", TURN_CHECK)):
         low, middle, high = np.quantile(values(used, column), (0.05, 0.5, 0.95))
-        found.append(high - low < SAME_ERROR * middle)
-    if all(found):
+        same.append(bool(middle > limit and high - low < SAME_ERROR * middle))
+        small.append(bool(middle <= limit))
+    if any(same) and all(a or b for a, b in zip(same, small, strict=True)):
         text = "the errors are the same in all used scans: the model has another frame than the true poses"
-        yield Concern(grade, f"{text}; move the model into that frame")
+        yield Concern(grade, f"{text}, or the target is symmetric; move the model into that frame")
 
 
 def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:

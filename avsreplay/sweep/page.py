@@ -17,9 +17,9 @@ from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, Wor
 
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its own
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
-_LEFT, _WIDTH, _ROW = 260, 760, 26
+_LEFT, _WIDTH, _ROW = 50, 460, 26  # fits a telephone without scrolling
 _FALSE_MIN = 1e-4  # left end of the ROC's logarithmic axis
-_X0, _Y0, _SIZE = 60, 20, 420
+_X0, _Y0, _SIZE = 60, 20, 380
 _KIND_HEADS = (
     *("fault", "no.", "strength,\nlength", "scans\nflagged", "windows\nfound", "delay,\nworst", "recovery,\nworst"),
     *("lost", "worst\nflagged", "worst\nused", "worst\nafter"),
@@ -158,7 +158,7 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
         return None
     low = min(0.0, *(q.q05 for _, q in known)) if len(known) > 1 else min(0.0, known[0][1].q05)
     high = max(max(q.q95, q.median_high or q.q95) for _, q in known)
-    scale = (_WIDTH - _LEFT - 20) / (high - low or 1.0)
+    scale = (_WIDTH - _LEFT - 30) / (high - low or 1.0)
 
     def x(value: float) -> str:
         return f"{_LEFT + (value - low) * scale:.1f}"
@@ -167,7 +167,7 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
         {
             "label": number,
             "title": f"{number}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count} runs",
-            "y": _ROW * (k + 2),
+            "y": _ROW * (k + 3),
             "x": {
                 **{name: x(getattr(q, name)) for name in ("q05", "q95", "median")},
                 "median_low": x(q.median if q.median_low is None else q.median_low),
@@ -179,11 +179,12 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
     return render(
         "spans.svg",
         title=title,
-        width=_WIDTH + 40,
-        height=_ROW * (len(known) + 2),
-        head_y=_ROW + 6,
+        width=_WIDTH,
+        height=_ROW * (len(known) + 3),
+        title_y=_ROW - 8,
+        head_y=2 * _ROW,
         label_x=_LEFT - 20,
-        ticks=[(x(v), f"{v:.4g}") for v in (low, 0.5 * (low + high), high)],
+        ticks=[(x(v), f"{v:.3g}") for v in dict.fromkeys((low, 0.5 * (low + high), high))],
         lines=lines,
     )
 
@@ -198,7 +199,7 @@ def _roc(detector: Detector) -> Markup:
     rule = None
     if detector.detected is not None and detector.false is not None:
         rule = [f"{v:.1f}" for v in _place(detector.false.share, detector.detected.share)]
-    ticks = [(f"{_place(v, 0.0)[0]:.1f}", f"{v:.2%}") for v in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
+    ticks = [(f"{_place(v, 0.0)[0]:.1f}", f"{100 * v:g} %") for v in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
     return render("roc.svg", x0=_X0, y0=_Y0, size=_SIZE, width=_WIDTH, ticks=ticks, curves=curves, rule=rule)
 
 

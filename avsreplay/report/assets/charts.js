@@ -15,7 +15,7 @@ const Charts = (() => {
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   let theme = {};
   function readTheme() {
-    theme = { ink: css("--ink"), faint: css("--faint"), line: css("--line"), flag: css("--flag"), colours: [] };
+    theme = { ink: css("--ink"), faint: css("--faint"), line: css("--line"), card: css("--card"), flag: css("--flag"), colours: [] };
     for (let k = 0; k < 6; k++) theme.colours.push(css("--c" + k));
   }
   const colour = (k) => theme.colours[k % theme.colours.length];
@@ -105,6 +105,13 @@ const Charts = (() => {
     };
   }
 
+  /* Text that stays readable over lines, hatching and points: its outline has the colour of the card. */
+  function written(ctx, text, x, y) {
+    ctx.save();
+    ctx.setLineDash([]); ctx.lineJoin = "round"; ctx.lineWidth = 4 * devicePixelRatio; ctx.strokeStyle = theme.card;
+    ctx.strokeText(text, x, y); ctx.fillText(text, x, y);
+    ctx.restore();
+  }
   function background(shared) {
     return (u) => {
       const { ctx, bbox } = u;
@@ -130,14 +137,14 @@ const Charts = (() => {
         ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke();
         const below = y - 14 * px < bbox.top;
         ctx.textAlign = "right"; ctx.textBaseline = below ? "top" : "bottom";
-        ctx.fillText(level.label, bbox.left + bbox.width - 4 * px, below ? y + 2 * px : y - 1);
+        written(ctx, level.label, bbox.left + bbox.width - 4 * px, below ? y + 2 * px : y - 1);
       }
       ctx.strokeStyle = ctx.fillStyle = theme.ink;
       for (const mark of shared.marks) {
         const x = Math.round(u.valToPos(mark.t, "x", true));
         ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
         ctx.textAlign = "left"; ctx.textBaseline = "top";
-        ctx.fillText(mark.label, x + 3 * px, bbox.top + 2 * px);
+        written(ctx, mark.label, x + 3 * px, bbox.top + 2 * px);
       }
       ctx.restore();
     };
@@ -248,7 +255,7 @@ const Charts = (() => {
         ctx.strokeStyle = colour(k); ctx.lineWidth = px; ctx.strokeRect(x0, top, wide, tall - 4 * px);
         const text = s.word.replaceAll("_", " ");
         const left = Math.max(x0, bbox.left), seen = Math.min(x0 + wide, bbox.left + bbox.width) - left;
-        if (ctx.measureText(text).width < seen - 6 * px) { ctx.fillStyle = theme.ink; ctx.fillText(text, left + 4 * px, top + tall / 2 - 2 * px); }
+        if (ctx.measureText(text).width < seen - 6 * px) { ctx.fillStyle = theme.ink; written(ctx, text, left + 4 * px, top + tall / 2 - 2 * px); }
       }
       ctx.restore();
     };
