@@ -60,3 +60,10 @@ def test_a_missing_library_is_said_before_anything_runs(monkeypatch: pytest.Monk
     monkeypatch.setattr("avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),))
     with pytest.raises(MissingBackend):
         benchmark_backends(["kiss"], boxes(), _scans(1))
+
+
+def test_an_unknown_back_end_names_the_option_of_this_command(fixtures_folder: Path) -> None:
+    words = [str(fixtures_folder / "tumble.mcap"), "--backends", "horn,nope", "--n-scans", "1"]
+    done = CliRunner().invoke(bench_command, words)
+    assert isinstance(done.exception, UsageError)
+    assert str(done.exception).startswith("--backends: no registration back end is called 'nope'")

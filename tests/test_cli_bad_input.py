@@ -244,3 +244,7 @@ def test_a_scenario_and_a_result_are_no_logs(cli, tmp_path, fixtures_folder):
     assert cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "-o", tmp_path / "r").code == 0
     result = cli("info", tmp_path / "r")
     assert (result.code, "is the result of a run, not a log" in result.err) == (3, True)
+
+
+def test_a_rate_for_a_log_with_times_is_refused(cli, log):
+    check_one_line(cli("run", log, "--rate", 10), 2, "times of their own", "--every-scan")

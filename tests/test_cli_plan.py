@@ -238,9 +238,9 @@ def test_there_is_no_page_without_a_plan(result, tmp_path):
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (("--a-max", 0), "a_max_mps2 is 0"),
-        (("--cone-deg", 120), "cone_deg is 120"),
-        (("--horizon", 0), "horizon_s is 0"),
+        (("--a-max", 0), "--a-max is 0"),
+        (("--cone-deg", 120), "--cone-deg is 120"),
+        (("--horizon", 0), "--horizon is 0"),
         (("--at", 500), "outside the result"),
         (("--every", 0), "not in the range"),
         (("--keepout", 3.0), "keepout_m is 3.0"),

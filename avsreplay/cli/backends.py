@@ -198,11 +198,16 @@ def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]
     Raises UsageError or MissingBackend for a name that cannot be built, before anything is timed.
     """
     from avsreplay.cli.options import tracked
+    from avsreplay.errors import UsageError
 
     tallies, registrars = [], []
     for name in names:
         begun = time.perf_counter()
-        registrars.append(_registrar(name, surface))
+        try:
+            registrars.append(_registrar(name, surface))
+        except UsageError as error:  # it names the option of a run
+            error.where = "--backends"
+            raise
         tallies.append(Tally(name, build_s=time.perf_counter() - begun))
     usable = [scan for scan in scans if len(scan[0])]
     last: list[Pose | None] = [None] * len(names)

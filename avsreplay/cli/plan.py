@@ -176,6 +176,10 @@ def _usable(action: Any) -> Any:
     try:
         return action()
     except ValueError as error:
+        context, name = click.get_current_context(), getattr(error, "name", "")
+        if context.params.get(name) is not None:  # the option that the user gave
+            option = next(param.opts[0] for param in context.command.params if param.name == name)
+            raise UsageError(str(error).replace(name, option, 1), hint="correct the option") from None
         raise UsageError(str(error), hint="correct the option, or the setting in run.json") from None
 
 

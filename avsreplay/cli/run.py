@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
 
+GRADES = click.Choice(["pass", "check"], case_sensitive=False)
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
@@ -68,9 +69,7 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
 @click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
 @click.option("--follow", is_flag=True, help="LOG is still being written: replay each scan as soon as it is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@click.option(
-    "--require", "least", type=click.Choice(["pass", "check"]), help="Exit with code 1 if the verdict is worse."
-)
+@click.option("--require", "least", type=GRADES, help="Exit with code 1 if the verdict is worse.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")

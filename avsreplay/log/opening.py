@@ -71,6 +71,9 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
 
 def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None, stated: str = "") -> Source:
     """Open a log of messages; ``stated``: the fixed frame of its header, used where the options name none."""
+    if options.rate_hz is not None:
+        hint = "leave out --rate; --every-scan N takes every N-th scan"
+        raise UsageError("the messages of a log have times of their own", where=shown(path), hint=hint)
     collector = streams.TruthCollector(options)
     recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto)
     try:

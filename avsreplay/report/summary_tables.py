@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Console
 
+from avsreplay.errors import counted
 from avsreplay.records import BLOCKS
 from avsreplay.report import Errors, Summary
 from avsreplay.report.episodes import Episode
@@ -281,7 +282,7 @@ def _counted(counts: Mapping[str, int]) -> str:
 def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     faults = summary.faults
     if not faults.known:
-        yield "flagged", f"{faults.false_alarms} scans; the log does not state the injected faults"
+        yield "flagged", f"{counted(faults.false_alarms, 'scan')}; the log does not state the injected faults"
         return
     events = f"{faults.injected} injected, {faults.detected} detected, {faults.missed} missed"
     scans = f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans flagged"
@@ -339,4 +340,4 @@ def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
         turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
         yield "gripper", f"closed {length_text(capture.miss.position_m)}{speed}{turn} from the true grasp point"
     if capture.actions:
-        yield "actions", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())
+        yield "actions", ", ".join(f"{action} {counted(count, 'scan')}" for action, count in capture.actions.items())
