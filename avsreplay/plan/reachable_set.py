@@ -19,6 +19,7 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
+from avsreplay.plan import _cone
 
 Vector = list[float]
 
@@ -30,6 +31,7 @@ _OF_POSITIVE = np.array([0.36268378337836166, 0.3137066458778869, 0.222381034453
 _NODES, _WEIGHTS = np.r_[-_POSITIVE[::-1], _POSITIVE], np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE]  # Gauss-Legendre
 _GAUSS_S = 0.5 * (_NODES + 1.0)
 _GAUSS_W = 0.5 * _WEIGHTS
+_GAUSS_NODES = np.stack([_GAUSS_S, _GAUSS_W])
 _GAUSS = tuple(zip(_GAUSS_S.tolist(), _GAUSS_W.tolist(), strict=True))
 _FLOOR = 1e-150
 
@@ -292,35 +294,4 @@ def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
     Returns:
         int w ds (n, 3) and int (1 - s) w ds (n, 3) with w = P/|P|.
     """
-    r0, r1 = np.linalg.norm(P0, axis=1), np.linalg.norm(P1, axis=1)
-    D = P1 - P0
-    length = np.linalg.norm(D, axis=1)
-    still = length < SMALL_TURN * (r0 + r1)
-    safe = np.where(still, 1.0, length)
-    dot, cross = np.sum(P0 * P1, axis=1), _cross(P0, P1)
-    opposed = 2.0 * np.sum(cross * cross, axis=1) / np.maximum(r0 * r1 - dot, _FLOOR)
-    gap = np.maximum(np.where(dot > 0.0, 2.0 * (r0 * r1 + dot), opposed), _FLOOR)
-    j0 = np.log(np.maximum((r0 + r1 + length) ** 2, _FLOOR) / gap) / safe
-    e = D / safe[:, None]
-    u0, u1 = np.sum(P0 * e, axis=1), np.sum(P1 * e, axis=1)
-    across = P0 - u0[:, None] * e
-    log = j0 * safe
-    i1 = r1 - r0
-    i2 = 0.5 * (u1 * r1 - u0 * r0 - np.sum(across * across, axis=1) * log)
-    first = (i1[:, None] * e + log[:, None] * across) / safe[:, None]
-    s_e, s_n = (i2 - u0 * i1) / safe**2, (i1 - u0 * log) / safe**2
-    second = first - (s_e[:, None] * e + s_n[:, None] * across)
-    if still.any():
-        first[still], second[still] = _gauss_integrals(P0[still], P1[still])
-    return first, second
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return a[:, (1, 2, 0)] * b[:, (2, 0, 1)] - a[:, (2, 0, 1)] * b[:, (1, 2, 0)]
-
-
-def _gauss_integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
-    P = P0[:, None, :] + _GAUSS_S[None, :, None] * (P1 - P0)[:, None, :]
-    r = np.linalg.norm(P, axis=2, keepdims=True)
-    w = P / np.where(r > 0.0, r, 1.0) * _GAUSS_W[None, :, None]
-    return w.sum(axis=1), (w * (1.0 - _GAUSS_S)[None, :, None]).sum(axis=1)
+    return _cone.integrals(np.ascontiguousarray(P0), np.ascontiguousarray(P1), _GAUSS_NODES, SMALL_TURN, _FLOOR)

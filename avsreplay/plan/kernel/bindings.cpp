@@ -7,6 +7,7 @@
 
 #include "constraints.hpp"
 #include "interior_point.hpp"
+#include "primer.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -123,6 +124,20 @@ nb::object values(const In<double, 4, -1, -1>& c, const In<double, -1>& x, const
   return nb::cast(nb::ndarray<nb::numpy, double>(out, 2, shape, own));
 }
 
+// Integrals (n, 3), once and twice, of the unit vectors along P from P0 to P1.
+nb::object integrals(const In<double, -1, 3>& P0, const In<double, -1, 3>& P1, const In<double, 2, 8>& nodes, double turn,
+                     double least) {
+  const size_t n = P0.shape(0);
+  if (P1.shape(0) != n) throw nb::value_error("vectors of different numbers");
+  double *first = new double[3 * n], *second = new double[3 * n];
+  primer_integrals(P0.data(), P1.data(), n, reinterpret_cast<const double(*)[8]>(nodes.data()), turn, least, first, second);
+  const auto free = [](void* p) noexcept { delete[] static_cast<double*>(p); };
+  nb::capsule own_first(first, free), own_second(second, free);
+  const size_t shape[2] = {n, 3};
+  return nb::make_tuple(nb::ndarray<nb::numpy, double>(first, 2, shape, own_first),
+                        nb::ndarray<nb::numpy, double>(second, 2, shape, own_second));
+}
+
 }  // namespace
 
 NB_MODULE(_cone, m) {
@@ -132,4 +147,5 @@ NB_MODULE(_cone, m) {
   m.def("motion", &motion);
   m.def("spline", &spline_of);
   m.def("values", &values);
+  m.def("integrals", &integrals);
 }
