@@ -7,14 +7,11 @@ imported when it is called, so that ``avsreplay --help`` is fast.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib
 import io
 import os
 import signal
 import sys
-import tempfile
-import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -293,6 +290,10 @@ def _standard_output() -> _Discarding | None:
 
 def _crash(error: Exception) -> int:
     """Report an unexpected error in one line and write its traceback to a file; return exit code 70."""
+    import hashlib
+    import tempfile
+    import traceback
+
     text = "".join(traceback.format_exception(error))
     name = f"avsreplay-crash-{hashlib.sha256(text.encode('utf-8', 'replace')).hexdigest()[:12]}.txt"
     report, where = Path(tempfile.gettempdir()) / name, "no report could be written"
