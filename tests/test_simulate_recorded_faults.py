@@ -193,3 +193,21 @@ def test_a_fault_after_the_end_is_said(fixtures_folder, tmp_path):
     faults = (RecordedFault.parse("empty:900:1"),)
     done = record(fixtures_folder / "tumble.mcap", tmp_path / "o.mcap", options=RecordOptions(faults=faults))
     assert done.note == "faults outside of the recording are left out: empty"
+
+
+def test_a_shortened_scenario_lists_its_own_faults_only(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        "duration_s = 10.0\nrate_hz = 2.0\n[scanner]\nrays = [16, 16]\n"
+        '[[fault]]\nkind = "empty"\nstart_s = 1.0\nduration_s = 9.0\n'
+        '[[fault]]\nkind = "frozen"\nstart_s = 3.9\nduration_s = 2.0\n',
+        encoding="utf-8",
+    )
+    whole = record(tmp_path / "s.toml", tmp_path / "whole.mcap")
+    assert [fault[0] for fault in whole.faults] == ["empty", "frozen"]
+    cut = record(tmp_path / "s.toml", tmp_path / "cut.mcap", reading=SourceOptions(duration_s=4.0))  # last scan: 3.5 s
+    assert [fault[0] for fault in cut.faults] == ["empty"]
+    assert cut.note == "faults outside of the recording are left out: frozen"
+    with open_source(tmp_path / "cut.mcap") as source:
+        assert [label.kind for label in source.header.labels] == ["empty"]
+    again = record(tmp_path / "whole.mcap", tmp_path / "part.mcap", reading=SourceOptions(end_s=3.0))
+    assert [fault[0] for fault in again.faults] == ["empty"]
