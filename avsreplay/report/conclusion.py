@@ -293,12 +293,12 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
     rows = tuple(
         (
             change.metric,
-            *((meaning[change.metric],) if show_all else ()),
             number(change.base, ".4g"),
             number(change.other, ".4g"),
             change.note or _relative(change),
             _interval_text(change),
             TableCell(change.word, _MARKS.get(change.word, "")),
+            *((meaning[change.metric],) if show_all else ()),
         )
         for change in shown
     )
@@ -306,10 +306,11 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
     left_out = len(conclusion.changes) - len(shown)
     return Table(
         f"{conclusion.name} against {baseline}{runs}",
-        ("metric", *(("meaning",) if show_all else ()), "baseline", "this", "change", "95 % interval", "conclusion"),
+        ("metric", "baseline", "this", "change", "95 % interval", "conclusion", *(("meaning",) if show_all else ())),
         rows,
-        align="nlrrrrn" if show_all else "nrrrrn",
+        align="nrrrrnl" if show_all else "nrrrrn",
         note=f"{left_out} equal metrics are not shown" if left_out else "",
+        wide=True,
     )
 
 
