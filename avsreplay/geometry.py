@@ -318,9 +318,14 @@ class Pose:
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: T_ab @ T_bc = T_ac."""
-        q, (x, y, z), t = self.q.tolist(), other.t.tolist(), self.t.tolist()
+        return self.composed(self.q, self.t, other.q, other.t)
+
+    @classmethod
+    def composed(cls, q_ab: Array, t_ab: Array, q_bc: Array, t_bc: Array) -> Pose:
+        """Return T_ac of unit quaternions (4,) and origins (3,) [m]: of b in a and of c in b."""
+        q, (x, y, z), t = q_ab.tolist(), t_bc.tolist(), t_ab.tolist()
         moved = [a * x + b * y + c * z + o for (a, b, c), o in zip(_rows(*q), t, strict=True)]
-        return self._of(_product(*q, *other.q.tolist()), moved)
+        return cls._of(_product(*q, *q_bc.tolist()), moved)
 
     def apply(self, points_b: ArrayLike) -> Array:
         """Transform points from b to a.

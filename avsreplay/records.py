@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array, MeasuredPose, Pose, bounding_diagonal, frozen, matrix, multiply, rotate
+from avsreplay.geometry import Array, MeasuredPose, Pose, bounding_diagonal, frozen, matrix, rotate
 
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -133,7 +133,7 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho; it is computed once."""
-        pose = self._T_ac or Pose(multiply(self.q_ab, self.q_bc), self.r_a + rotate(matrix(self.q_ab), self.c_b))
+        pose = self._T_ac or Pose.composed(self.q_ab, self.r_a, self.q_bc, self.c_b)
         object.__setattr__(self, "_T_ac", pose)
         return pose
 
