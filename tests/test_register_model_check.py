@@ -131,9 +131,9 @@ def test_points_that_are_measured_one_after_the_other_are_noticed(duration_s: fl
         found = registrar.register(scan.points, T_ac)
         check.add(scan, found)
         timed.add(replace(scan, places=None, times_s=scan.places), found)
-    mean, sigma, period = check._duration()
+    mean, sigma = check._durations.result(registrar.index)
     assert mean == pytest.approx(duration_s, abs=max(4.0 * sigma, 0.01))
-    assert period == pytest.approx(0.5)
+    assert [seen.period_s for seen, _ in check._durations.measured] == pytest.approx([0.5] * 17)
     assert f"--scan-duration {mean:.3g}" in " ".join(check.notes())
     assert "--scan-duration" not in " ".join(timed.notes())
 
@@ -158,7 +158,7 @@ def test_points_of_one_instant_raise_no_note_though_the_target_moves() -> None:
     check = ModelCheck(registrar, model)
     for scan, T_ac in moving_scans(model, 0.0, 20):
         check.add(scan, registrar.register(scan.points, T_ac))
-    assert len(check._durations) >= 8
+    assert len(check._durations.measured) >= 8
     assert check.notes() == ()
 
 

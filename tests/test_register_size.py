@@ -55,14 +55,14 @@ def test_the_step_of_the_extension_is_that_of_the_rows(known: bool) -> None:
     index = SurfaceIndex.build(model, 0.15 * model.extent)
     points, T_ac = scan_of(model, 4, 0.002)
     p, camera_c = 1.02 * T_ac.inverse().apply(points[::4]), T_ac.inverse().t if known else None
-    rows, d, centre = size_module._step(index, p, camera_c)
-    delta, moved = size_module._joined(0.0, Pose.identity(), rows.delta, d, centre)
+    rows, d, centre = size_module.least_squares(index, p, camera_c)
+    delta, moved = size_module.joined(0.0, Pose.identity(), rows.delta, d, centre)
     other, step = size_module._rounds(index, p, camera_c, 1)
     assert other == pytest.approx(delta, abs=1e-12)
     np.testing.assert_allclose(step.matrix, moved.matrix, atol=1e-11)
     assert abs(delta) > 0.01
     far = p + 10.0 * model.extent
-    assert size_module._rounds(index, far, camera_c, 1) is size_module._step(index, far, camera_c) is None
+    assert size_module._rounds(index, far, camera_c, 1) is size_module.least_squares(index, far, camera_c) is None
 
 
 def test_faces_in_coordinate_planes_do_not_enlarge_the_standard_error() -> None:

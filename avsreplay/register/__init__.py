@@ -11,15 +11,16 @@ fit a box of any size, at a place that changes with it. The size follows from th
 of a free target moves uniformly, and the error of the place changes with the side that is seen.
 
 Times: points without times are taken as measured at one instant. The motion between two scans and the order of the
-points give the duration of a scan by least squares; a significant one is reported.
+points give the duration of a scan by least squares together with the size (``duration``); a significant one is
+reported.
 
-Shape: if no scan was registered, the global search is repeated with the mirrored model. The unit of the model is
-checked before a run (``preflight``).
+Shape: the mirror image of the model is compared with it on a few accepted scans (``mirror``). If no scan was
+registered, the global search is repeated with a reflected scan. The unit of the model is checked before a run
+(``preflight``).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
 from avsreplay.register.budget import Effort, effort_after
+from avsreplay.register.duration import Durations, OrderedScan
+from avsreplay.register.mirror import SeenScan, from_another_side, mirror_image_fits, reflected, wanted
 from avsreplay.register.neighbourhood import POSTPONED
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
@@ -39,7 +42,6 @@ from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.size import (
     MOST_OF_MODEL,
     SIGMAS,
-    fitted_duration,
     fitted_size,
     matched_points,
     noise_bias,
@@ -60,12 +62,14 @@ ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that woul
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
+_MIRRORED = (
+    "so that an axis of the model or of the points is inverted: change the sign of one coordinate in the model file"
+)
+_SEEN_POINTS, _DURATION_POINTS = 2000, 800  # of a scan: compared with the mirror image, and for its duration
 _PLACE_EVERY, _LEAST_PLACES = 2, 12  # scans of which one gives a place, and places that give the size
 _PLACE_POINTS, _BLOCKS = 500, 6  # points of each, and blocks of consecutive places, for the jackknife
 _LEAST_EXPLAINED = 0.5  # least share, explained by the size, of what a uniform motion leaves of the places
-_DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
-_DURATION_POINTS = 800
-_LEAST_OF_PERIOD, _NOTED = 0.02, 0.5  # duration of a scan over the period, share of systematic errors: least reported
+_NOTED = 0.5  # least share of systematic errors that is reported
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
@@ -97,7 +101,7 @@ class ModelCheck:
         self._registrar, self._surface = registrar, surface
         self._aligned, self._matched, self._ambiguous, self._several = 0, False, "", 0  # several less no poses of scans
         self._systematic = 0.0  # sum of the shares of systematic errors
-        self._size_open = self._duration_open = True  # whether the scans so far do not exclude a value to report
+        self._size_open = True  # whether the scans so far do not exclude an error of the size to report
         self._deltas: list[float] = []
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
@@ -105,7 +109,8 @@ class ModelCheck:
         self._placed, self._stride = 0, _PLACE_EVERY  # scans that may give a place; one of ``_stride`` does
         self._unmatched: Scan | None = None
         self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
-        self._durations: list[tuple[float, float, float]] = []  # duration, its standard error, period [s]
+        self._durations = Durations()
+        self._seen: list[SeenScan] = []  # accepted scans of different sides, to compare the mirror image
 
     def add(self, scan: Scan, found: Alignment | None) -> None:
         """Use one scan.
@@ -134,8 +139,9 @@ class ModelCheck:
             self._systematic += float(np.trace(np.linalg.solve(found.covariance, found.systematic))) / 6.0
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
             self._measure(scan, found.T_ac)
-        if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open:
+        if scan.places is not None and self._durations.wanted():
             self._measure_duration(scan, scan.places, found.T_ac)
+        self._keep(scan, found.T_ac)
         self._last = scan.t_ns, found.T_ac
 
     def scale(self) -> tuple[float, float] | None:
@@ -192,10 +198,12 @@ class ModelCheck:
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
         if self._aligned:
-            found = [note for note in (self._size(), self._duration_note()) if note is not None]
-            return (
-                (max(found)[1],) if found else ()
-            )  # each error makes the other one appear, with fewer standard errors
+            if mirror_image_fits(self._registrar, self._surface, self._seen):
+                return (f"the mirror image of the model explains the scans better than the model, {_MIRRORED}",)
+            size, duration = self._size(), self._duration_note()
+            if size and duration and size[0] <= duration[0]:
+                size = None  # motion during the scans makes an error of the size appear
+            return tuple(note[1] for note in (size, duration) if note)
         if self._ambiguous and self._several >= 0:
             return (f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init",)
         unmatched = None if self._matched and not self._ambiguous else self._unmatched
@@ -264,50 +272,43 @@ class ModelCheck:
         kept, T_ca = _some(scan.points, _DURATION_POINTS), T_ac.inverse()
         p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
-        measured = fitted_duration(self._registrar.index, p, self._camera(scan, T_ca), motion)
-        if measured is not None and measured[1] > 0.0:
-            self._durations.append((*measured, period))
-            if (count := len(self._durations)) >= _LEAST_DURATIONS:
-                mean, spread, typical = self._duration()
-                most = abs(mean) + SIGMAS * spread
-                self._duration_open = count < _MOST_DURATIONS and most > _LEAST_OF_PERIOD * typical
-
-    def _duration(self) -> tuple[float, float, float]:
-        """The mean duration of a scan weighted by its variance, its standard error (jackknife), the period [s]."""
-        duration, sigma, period = np.array(self._durations).T
-        mean, spread, _ = _jackknife(duration, 1.0 / sigma**2)
-        return mean, spread, float(np.median(period))
+        self._durations.add(self._registrar.index, OrderedScan(p, motion, self._camera(scan, T_ca), period))
 
     def _duration_note(self) -> tuple[float, str] | None:
         """The duration of a scan in its standard errors, and the text; None if it is not significant."""
-        if len(self._durations) < _LEAST_DURATIONS:
+        if (found := self._durations.result(self._registrar.index)) is None:
             return None
-        mean, spread, period = self._duration()
-        if abs(mean) < max(_LEAST_OF_PERIOD * period, SIGMAS * spread):
-            return None
+        duration, sigma = found
         return (
-            abs(mean) / max(spread, np.finfo(float).tiny),
+            abs(duration) / max(sigma, np.finfo(float).tiny),
             f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
-            f"{abs(mean):.3g} +- {spread:.1g} s: record the time of each point (field 't'); less exactly, "
-            f"--scan-duration {mean:.3g} gives times by the order of the points",
+            f"{abs(duration):.3g} +- {sigma:.1g} s: record the time of each point (field 't'); less exactly, "
+            f"--scan-duration {duration:.3g} gives times by the order of the points",
         )
+
+    def _keep(self, scan: Scan, T_ac: Pose) -> None:
+        """Keep a scan of another side of the target, for the comparison with the mirror image."""
+        if not wanted(self._seen) or (p := self._on_model(scan, T_ac, _SEEN_POINTS)) is None:
+            return
+        T_cs = T_ac.inverse() if scan.sensor is None else T_ac.inverse() @ scan.sensor
+        seen = SeenScan(T_cs.inverse().apply(p).astype(np.float32), T_cs)
+        self._seen += [seen] if from_another_side(seen, self._seen) else []
 
     def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""
         finite = np.isfinite(scan.points).all(axis=1)
         points = without_scattered_points(np.asarray(scan.points[finite], dtype=np.float64))
-        mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
-        if len(points) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), points, scan.sensor):
-            return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
+        if len(points) and self._fits_mirrored(points, scan.sensor):
+            return f"the scans fit the mirror image of the model, {_MIRRORED}"
         own, seen = diameter(self._surface.vertices, trimmed=False), diameter(points)
         sizes = f"the first of them measures {seen:.3g} m, the model {own:.3g} m"
         cause = "is background left around the target, and is it" if seen > MOST_OF_MODEL * own else "is it"
         return f"no pose of the model explains the scans ({sizes}): {cause} the right model, in metres?"
 
-    def _fits(self, surface: Surface, points: Array, sensor: Pose | None) -> bool:
-        """Whether nearly all of a scan is on a model, in one pose only and with its size."""
-        params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
-        found = SensorFrame(Registrar(surface, params), sensor).acquire(points)
+    def _fits_mirrored(self, points: Array, sensor: Pose | None) -> bool:
+        """Whether nearly all of a scan (n, 3) in {A} is on the mirrored model, in one pose only and with its size."""
+        seen = points if sensor is None else sensor.inverse().apply(points)
+        found = self._registrar.acquire(reflected(seen))
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
 
 

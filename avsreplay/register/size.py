@@ -1,4 +1,4 @@
-"""Size of the target over that of the model, and duration of a scan, from the residuals of a registered scan.
+"""Size of the target over that of the model from the residuals of a registered scan.
 
 With T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
 n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again a few times,
@@ -8,9 +8,6 @@ Standard error: one part is that of the weighted residuals, which are correlated
 (cluster-robust sandwich). Another is that of slowly varying errors of model and ranges, an anisotropic strain and an
 offset of the surface. Their amplitudes are fitted to what pose and size leave, and their variances enter with the
 change of delta that they cause.
-
-Duration: a target that moves while its points are measured one after the other is deformed. If k is the share of the
-scan before a point, and u the velocity of the target there, the residual is n . (p - c) = J d + T k n . u.
 
 Bias: the closest point is a nonlinear function of the measured one, so that noise makes curved and thin parts appear
 larger. The same fit to the closest points with artificial noise of the same size along the rays, with both signs, gives
@@ -102,18 +99,20 @@ def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: 
 
 
 @value_class
-class _Rows:
+class Rows:
     """The weighted rows of the last round, and the result.
 
     Attributes:
-        p, foot, normal: (k, 3) points used, in the model's size, their closest points and normals, {C} [m].
-        J: (k, 6) Jacobian of the pose about the mean of p.
-        free: (k,) effect of a unit of size that no pose explains.
+        used: (n,) which points are used, k of them.
+        p, foot, normal: (k, 3) these points in the model's size, their closest points and normals, {C} [m].
+        J: (k, 6) Jacobian of the pose about the mean of p; (k, 7) if the size is fitted as a part of the pose.
+        free: (k,) effect of a unit of the parameter that no pose explains.
         left: (k,) residual.
         weight: (k,) square root of the weight.
         noise_m: standard deviation of the residual.
     """
 
+    used: NDArray[np.bool_]
     p: Array
     foot: Array
     normal: Array
@@ -127,6 +126,7 @@ class _Rows:
 
     @property
     def information(self) -> float:
+        """Inverse variance of the parameter for residuals of unit variance."""
         return max(float(self.free @ self.free), np.finfo(float).tiny)
 
 
@@ -144,11 +144,11 @@ def fitted_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> SizeEr
     return None if (rows := _fitted(index, p, camera_c)) is None else _size_of(index, rows)
 
 
-def _size_of(index: SurfaceIndex, rows: _Rows) -> SizeError:
-    sigma = max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
+def _size_of(index: SurfaceIndex, rows: Rows) -> SizeError:
+    sigma = max(clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
     back = rows.moved.inverse()
     shift = np.concatenate([geometry.log(back.q), back.t])
-    return SizeError(rows.delta, float(np.hypot(sigma, _systematic(rows, index.extent_m))), shift)
+    return SizeError(rows.delta, float(np.hypot(sigma, systematic(rows, index.extent_m))), shift)
 
 
 def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
@@ -166,12 +166,20 @@ def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
     return 0.0 if (rows := _fitted(index, p, camera_c)) is None else _bias_of(index, rows, camera_c)
 
 
-def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
+def _bias_of(index: SurfaceIndex, rows: Rows, camera_c: Array | None) -> float:
+    found = [_rounds(index, noisy, camera_c, ROUNDS) for noisy in noisy_points(rows, camera_c)]
+    return float(np.mean([LARGEST_ERROR if each is None else each[0] for each in found]))
+
+
+def noisy_points(rows: Rows, camera_c: Array | None) -> tuple[Array, Array]:
+    """Return the closest points (k, 3) of rows with noise of the size of their residuals along the rays, of both signs.
+
+    ``camera_c``: (3,) camera position in {C} [m]; None: the noise is along the normals.
+    """
     rays = rows.normal if camera_c is None else rows.foot - np.asarray(camera_c)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     moved = noise_along(rays, rows.normal, np.sqrt(CAUCHY_VARIANCE) * rows.left, rows.weight)[:, None] * rays
-    found = [_rounds(index, rows.foot + sign * moved, camera_c, ROUNDS) for sign in (1.0, -1.0)]
-    return float(np.mean([LARGEST_ERROR if each is None else each[0] for each in found]))
+    return rows.foot + moved, rows.foot - moved
 
 
 def normal_jacobian(p: Array, n: Array) -> Array:
@@ -183,15 +191,15 @@ def normal_jacobian(p: Array, n: Array) -> Array:
     return np.ascontiguousarray(J.T)
 
 
-def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | None:
+def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> Rows | None:
     """The rows of the last round."""
     if (begun := _rounds(index, p, camera_c, ROUNDS - 1)) is None:
         return None
     delta, moved = begun
-    if (found := _step(index, moved.apply(p) / (1.0 + delta), camera_c)) is None:
+    if (found := least_squares(index, moved.apply(p) / (1.0 + delta), camera_c)) is None:
         return None
     rows, d, centre = found
-    delta, moved = _joined(delta, moved, rows.delta, d, centre)
+    delta, moved = joined(delta, moved, rows.delta, d, centre)
     return None if abs(delta) > LARGEST_ERROR else replace(rows, delta=delta, moved=moved)
 
 
@@ -202,42 +210,17 @@ def _rounds(index: SurfaceIndex, p: Array, camera_c: Array | None, count: int) -
     for _ in range(count):
         if (step := index.size_step(moved.apply(p) / (1.0 + delta), camera_c, *rule)) is None:
             return None
-        delta, moved = _joined(delta, moved, *step)
+        delta, moved = joined(delta, moved, *step)
         if abs(delta) > LARGEST_ERROR:
             return None
     return delta, moved
 
 
-def _joined(delta: float, moved: Pose, step: float, d: Array, centre: Array) -> tuple[float, Pose]:
-    """Size and motion after one more step."""
+def joined(delta: float, moved: Pose, step: float, d: Array, centre: Array) -> tuple[float, Pose]:
+    """Return size and motion after a step of the size, and one d (6,) of the pose about a centre (3,)."""
     back = _undone(d, centre)
     moved = Pose(back.q, (1.0 + delta) * (back.t + step * centre)) @ moved
     return (1.0 + delta) * (1.0 + step) - 1.0, moved
-
-
-def fitted_duration(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float] | None:
-    """Fit pose and duration of a scan whose points were measured one after the other while the target moved.
-
-    Args:
-        index: of the model.
-        p: (n, 3) points in {C} [m], at the registered pose.
-        camera_c: (3,) camera position in {C} [m], or None: both sides of a face are matched.
-        motion: (n, 3) velocity of the target at each point [m/s], in {C}, times the share of the scan before the point.
-
-    Returns:
-        Duration and standard error [s]; negative if the last point is measured first. None as for ``fitted_size``.
-    """
-    duration, moved, rows = 0.0, Pose.identity(), None
-    for _ in range(ROUNDS):
-        found = _step(index, moved.apply(p - duration * motion), camera_c, motion)
-        if found is None:
-            return None
-        rows, d, centre = found
-        moved = _undone(d, centre) @ moved
-        duration += rows.delta
-    if rows is None:
-        return None
-    return duration, max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
 
 
 def _undone(d: Array, centre: Array) -> Pose:
@@ -246,26 +229,36 @@ def _undone(d: Array, centre: Array) -> Pose:
     return Pose(turn.q, centre - turn.R @ centre - d[3:])
 
 
-def _step(
+def least_squares(
     index: SurfaceIndex, q: Array, camera_c: Array | None, motion: Array | None = None
-) -> tuple[_Rows, Array, Array] | None:
-    """One least-squares step: the rows with the step of the parameter, the pose (6,), and the centre it refers to.
+) -> tuple[Rows, Array, Array] | None:
+    """Return one least-squares step.
 
-    ``motion``: (n, 3) displacement of the points by a unit of the parameter; None: the parameter is the size.
+    Args:
+        index: of the model.
+        q: (n, 3) points in {C} [m], in the model's size.
+        camera_c: as of :func:`fitted_size`.
+        motion: (n, 3) displacement of the points by a unit of the parameter; the size is then a seventh component of
+            the pose. None: the parameter is the size.
+
+    Returns:
+        The rows with the step of the parameter, the pose (6,) or (7,), and the centre (3,) to which it refers; None as
+        for :func:`fitted_size`.
     """
     if (matched := matched_points(index, q, camera_c)) is None:
         return None
     near, n, foot, e, weight, noise = matched
     q, centre = q[near], q[near].mean(axis=0)
-    moving = q - centre if motion is None else motion[near]
-    J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, moving)
+    J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, q - centre)
+    if motion is not None:
+        J, a = np.column_stack([J, a]), weight * np.einsum("ij,ij->i", n, motion[near])
     of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
     free = a - J @ of_a
     if free @ free <= LEAST_INFORMATION * (a @ a):
         return None
     step = float(free @ (weight * e)) / max(float(free @ free), np.finfo(float).tiny)
     left = weight * e - J @ of_e - step * free
-    return _Rows(q, foot, n, J, free, left, weight, noise, step, Pose.identity()), of_e - step * of_a, centre
+    return Rows(near, q, foot, n, J, free, left, weight, noise, step, Pose.identity()), of_e - step * of_a, centre
 
 
 def matched_points(
@@ -285,8 +278,10 @@ def matched_points(
     return near, n, foot, e, 1.0 / np.sqrt(1.0 + (e / (CAUCHY * noise)) ** 2), noise
 
 
-def _clustered(rows: _Rows, side_m: float) -> float:
-    """Standard error of delta from the sums over patches, each enlarged by its leverage.
+def clustered(rows: Rows, side_m: float) -> float:
+    """Return the standard error of the parameter from the sums over patches, each enlarged by its leverage.
+
+    ``side_m``: of a patch [m].
 
     A point belongs to the patch in which its projection onto its face lies, so that noise does not divide a face. The
     boundaries of the patches are not at the coordinate planes, so that rounding does not divide a face in one of them.
@@ -301,8 +296,8 @@ def _clustered(rows: _Rows, side_m: float) -> float:
     return float(np.sqrt(score @ score)) / rows.information
 
 
-def _systematic(rows: _Rows, extent_m: float) -> float:
-    """Standard deviation of delta from an anisotropic strain and from an offset of the surface, see the module."""
+def systematic(rows: Rows, extent_m: float) -> float:
+    """Return the standard deviation of the parameter from an anisotropic strain and an offset of the surface."""
     q, n = (rows.p - rows.p.mean(axis=0)) / extent_m, rows.normal
     xx, yy, zz = (n * q).T
     shears = [n[:, i] * q[:, j] + n[:, j] * q[:, i] for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -311,7 +306,7 @@ def _systematic(rows: _Rows, extent_m: float) -> float:
     return float(np.hypot(of_strain, of_offset))
 
 
-def _effect(rows: _Rows, B: Array) -> float:
+def _effect(rows: Rows, B: Array) -> float:
     """Standard deviation of delta from amplitudes of B (k, m) that are draws of one normal distribution."""
     change = rows.free @ B / rows.information
     own = B - np.outer(rows.free, change)

@@ -1,0 +1,220 @@
+"""Whether the mirror image of a model explains the accepted scans of a run better than the model itself.
+
+A mirrored model of a nearly mirror-symmetric object is accepted on many scans, because only its marks are on the wrong
+side. The mirror image needs no index of its own: a scan that is reflected in the frame of the sensor is one of the
+reflected object.
+
+Reflections: the motions with a mirroring that carry most of the surface onto itself. Planes through its centroid are
+compared by the distances of reflected points, and the best of them are registered. With the pose T_cs of the sensor in
+{C}, the reflection S in the frame of the sensor and one of these motions R, the reflected scan is near R T_cs S.
+
+Decision: the poses of a scan and of its reflection are refined in the same way, and each point has the difference of
+its truncated squared distances, in units of three standard deviations of the noise. The mean over a patch of the model
+and over all scans counts as one observation, because errors of the model are alike within a patch and in every scan.
+The log likelihood ratio of a normal error is 4.5 times this mean. It is limited to log((1 - e) / e), where e is the
+share of the patches that contradict the true shape. The mirror image is better if the sum decides for it, and what is
+against it is a small part of what is for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
+from avsreplay.register.plausibility import robust_noise
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.sampling import directions, sample_evenly
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex
+
+S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
+MOST_SCANS, APART = 6, np.cos(np.radians(30.0))  # scans that are compared, from directions so far apart
+REFINED_POINTS, FEW_POINTS = 600, 300  # of a scan: refined with, and to choose a reflection
+PLANES, PLANE_POINTS, SURFACE_POINTS = 200, 100, 400  # planes, and points of the surface that are reflected
+NEAR_PLANES, PLANES_APART = 16, np.cos(np.radians(12.0))  # planes that are registered, with normals so far apart
+REFLECTIONS, SAME_TRACE = 6, 1.0 + 2.0 * np.cos(np.radians(5.0))  # most reflections, and rotation between them
+WIDTH_OF_EXTENT, ROUGHLY, UNCARRIED = 0.03, 0.5, 0.3  # truncation of distances; largest mean after each stage
+TO_MODEL = ((0.12, 5), (0.05, 5), (0.02, 5))  # rejection distances [extent] and passes of a reflected surface
+TO_SCAN = ((0.03, 4), (0.015, 4), (0.008, 6))  # and of a scan
+TRIED, TRIED_OF_EXTENT = 2, 0.02  # reflections of which a scan is refined, and truncation to choose them
+NOISE, LEAST_OF_EXTENT, MOST_OF_EXTENT = 3.0, 0.003, 0.05  # truncation: noise, least; largest distance measured
+PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = 0.05, 0.381966, 4  # side of a patch, its offset, and fewest points
+CONTRADICTING = 0.1  # share of the patches that contradict the true shape
+LEAST_LIKELIHOOD, MOST_AGAINST = 6.0, 0.25  # log likelihood ratio that decides; patches against over those for it
+ENOUGH = 3  # scans that decide for the model, after which no more are compared
+TESTED_POINTS, LEAST_FACING = 200, 0.4  # points of which so many must be on faces towards the sensor
+
+
+@value_class
+class SeenScan:
+    """Points (n, 3) of a registered scan in the frame of the sensor [m], and the pose of the sensor in {C}."""
+
+    points: NDArray[np.float32]
+    T_cs: Pose
+
+    @property
+    def sight(self) -> Array:
+        """Direction (3,) from the sensor to the points in {C}."""
+        middle = self.points.mean(axis=0, dtype=np.float64)
+        return np.asarray(self.T_cs.R @ middle / max(float(np.linalg.norm(middle)), np.finfo(float).tiny))
+
+
+def from_another_side(scan: SeenScan, kept: Sequence[SeenScan]) -> bool:
+    """Return whether a scan shows another side of the target than those kept."""
+    return all(float(scan.sight @ each.sight) < APART for each in kept)
+
+
+def wanted(kept: Sequence[SeenScan]) -> bool:
+    """Return whether more scans are needed."""
+    return len(kept) < MOST_SCANS
+
+
+def reflected(points: NDArray[Any]) -> NDArray[Any]:
+    """Return the reflection of points (n, 3) in the frame of the sensor."""
+    return np.ascontiguousarray(points * S.diagonal()[:3])
+
+
+def mirror_image_fits(registrar: Registrar, surface: Surface, scans: Sequence[SeenScan]) -> bool:
+    """Return whether the mirror image of a model explains scans better than the model.
+
+    Args:
+        registrar: of the model.
+        surface: the model, vertices in {C} [m].
+        scans: accepted scans; the points of one are at the instant of its pose.
+    """
+    if not scans or not len(motions := reflections(surface, registrar.index)):
+        return False
+    extent, compared, sure, contrary = registrar.index.extent_m, list[tuple[Array, Array]](), list[bool](), 0
+    for scan in scans:
+        compared.append(_compared(registrar, scan, [R @ scan.T_cs.matrix @ S for R in motions]))
+        gain, against = _likelihood(compared[-1:], extent)
+        sure.append(_decides(gain, against))
+        contrary += _decides(against, gain)
+        if contrary == ENOUGH and not any(sure):
+            return False
+    if any(sure):  # the motions may not contain that of another scan, which is searched
+        for k, scan in enumerate(scans):
+            found = None if sure[k] else registrar.acquire(reflected(scan.points))
+            if found is not None and found.measured:
+                again = _compared(registrar, scan, [found.T_ac.inverse().matrix])
+                compared[k] = max(compared[k], again, key=lambda each: float(each[1].sum()))
+    return _decides(*_likelihood(compared, extent))
+
+
+def _likelihood(compared: Sequence[tuple[Array, Array]], extent_m: float) -> tuple[float, float]:
+    """Log likelihood ratios for the mirror image and for the model, of patches that support each."""
+    most = float(np.log((1.0 - CONTRADICTING) / CONTRADICTING))
+    ratio = np.clip(0.5 * NOISE**2 * _by_patch(compared, extent_m), -most, most)
+    return float(ratio[ratio > 0.0].sum()), -float(ratio[ratio < 0.0].sum())
+
+
+def _decides(gain: float, against: float) -> bool:
+    return gain - against > LEAST_LIKELIHOOD and against < MOST_AGAINST * gain
+
+
+def reflections(surface: Surface, index: SurfaceIndex) -> Array:
+    """Return the motions with a mirroring that carry most of a surface onto itself, the best first.
+
+    Args:
+        surface: vertices in {C} [m].
+        index: of the surface.
+
+    Returns:
+        (k, 4, 4) in {C}, all different, with determinants of -1.
+    """
+    points = sample_evenly(surface, SURFACE_POINTS)[0]
+    few, middle = points[:: max(1, len(points) // PLANE_POINTS)], points.mean(axis=0)
+    normals = directions(2 * PLANES)[:PLANES]  # a half of the sphere
+    planes = np.tile(np.eye(4), (PLANES, 1, 1))
+    planes[:, :3, :3] -= 2.0 * normals[:, :, None] * normals[:, None, :]
+    planes[:, :3, 3] = 2.0 * normals * (normals @ middle)[:, None]
+    cost = _uncarried(index, few, planes, 2.0 * WIDTH_OF_EXTENT)
+    chosen = list[int]()
+    for k in np.argsort(cost, kind="stable").tolist():
+        if len(chosen) < NEAR_PLANES and all(abs(normals[k] @ normals[j]) < PLANES_APART for j in chosen):
+            chosen.append(k)
+    moved = planes[chosen]
+    for part, stages, most in ((few, TO_MODEL[:1], ROUGHLY), (points, TO_MODEL[1:], UNCARRIED)):
+        ended = [_refined(index, _moved(part, T), Pose.identity(), stages, False).matrix @ T for T in moved]
+        moved = np.reshape(ended, (-1, 4, 4))
+        cost = _uncarried(index, points, moved, WIDTH_OF_EXTENT)
+        order = np.argsort(cost, kind="stable")
+        moved = _different(moved[order[cost[order] < most]])
+    return moved[:REFLECTIONS]
+
+
+def _different(motions: Array) -> Array:
+    """The motions (k, 4, 4) that differ from all before them by a rotation."""
+    kept = [
+        k for k, T in enumerate(motions) if (np.einsum("kij,ij->k", motions[:k, :3, :3], T[:3, :3]) < SAME_TRACE).all()
+    ]
+    return np.asarray(motions[kept])
+
+
+def _moved(points: Array, T: Array) -> Array:
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _uncarried(index: SurfaceIndex, points: Array, motions: Array, width: float) -> Array:
+    """Mean of min(1, squared distance) of points (n, 3) after each motion (k, 4, 4); ``width`` is over the extent."""
+    width_m = min(width * index.extent_m, index.reach_m)
+    moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
+    distance = index.distances(moved.reshape(-1, 3), Pose.identity(), width_m, False, 1, 0.0)[0]
+    return np.asarray(np.mean((distance.reshape(len(motions), -1) / width_m) ** 2, axis=1))
+
+
+def _refined(index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple[float, int]], sided: bool) -> Pose:
+    """A pose T_cs after passes with falling rejection distances."""
+    small = IcpParams(tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * index.extent_m)
+    for gate, n in stages:
+        facing = sided and index.faces_camera(points, T, TESTED_POINTS, LEAST_FACING)
+        rule = replace(small, n_max=n, n_plane=n, gate_m=gate * index.extent_m, facing=facing)
+        T = Pose.from_matrix(index.icp(points, T, rule).T_ca)
+    return T
+
+
+def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> tuple[Array, Array]:
+    """Points (n, 3) of a scan in {C} [m], and what each has in favour of the mirror image, from -1 to 1.
+
+    ``starts``: poses (4, 4) of the sensor in {C} for the reflected scan.
+    """
+    index, sided = registrar.index, registrar.sided
+    points = scan.points.astype(np.float64)
+    image = reflected(points)
+
+    def distance(part: Array, T: Pose, most: float) -> Array:
+        return index.distances(part, T, most * index.extent_m, sided, TESTED_POINTS, LEAST_FACING)[0]
+
+    def cost(part: Array, T: Pose) -> float:
+        return float(np.mean(distance(part, T, TRIED_OF_EXTENT) ** 2))
+
+    few, some, some_of_image = _some(image, FEW_POINTS), _some(points, REFINED_POINTS), _some(image, REFINED_POINTS)
+    best = sorted(map(Pose.from_matrix, starts), key=lambda T: cost(few, T))[:TRIED]
+    ended = [_refined(index, some_of_image, T, TO_SCAN, sided) for T in best]
+    own = _refined(index, some, scan.T_cs, TO_SCAN, sided)
+    mirrored = min(ended, key=lambda T: cost(some_of_image, T))
+    both = [distance(points, own, MOST_OF_EXTENT), distance(image, mirrored, MOST_OF_EXTENT)]
+    width = max(NOISE * min(map(robust_noise, both)), LEAST_OF_EXTENT * index.extent_m)
+    by_model, by_image = (np.minimum(each / width, 1.0) ** 2 for each in both)
+    return own.apply(points), by_model - by_image
+
+
+def _some(points: Array, count: int) -> Array:
+    return np.ascontiguousarray(points[:: max(1, len(points) // count)])
+
+
+def _by_patch(compared: Sequence[tuple[Array, Array]], extent_m: float) -> Array:
+    """Mean over each patch, of all scans, of what its points have in favour of the mirror image."""
+    points, gain = (np.concatenate(each) for each in zip(*compared, strict=True))
+    cell = np.floor(points / (PATCH_OF_EXTENT * extent_m) + OFF_PLANES).astype(np.int64)
+    cell -= cell.min(axis=0)
+    span = cell.max(axis=0) + 1
+    of = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[1]
+    counts = np.bincount(of)
+    return np.asarray((np.bincount(of, gain) / counts)[counts >= PATCH_POINTS])
