@@ -152,6 +152,29 @@ def test_points_with_times_give_the_size_at_the_instant_of_their_scan() -> None:
     assert np.abs(skewed._deltas).max() > 1e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("factor", "duration_s", "sigma"),
+    [(1.02, 0.0, 0.001), (0.98, 0.0, 0.001), (1.0, 0.0, 0.02), (1.02, 0.3, 0.001), (0.98, -0.3, 0.001)],
+)
+def test_an_error_of_size_and_noise_are_not_taken_for_a_duration(
+    factor: float, duration_s: float, sigma: float
+) -> None:
+    model = boxes()
+    registrar = Registrar(model)
+    check = ModelCheck(registrar, model)
+    target = replace(model, vertices=factor * model.vertices)
+    for scan, T_ac in moving_scans(target, duration_s, 60, sigma):
+        check.add(scan, registrar.register(scan.points, T_ac))
+    assert len(check._durations.measured) >= 8
+    notes = check.notes()
+    assert sum("--model-scale" in note for note in notes) == (factor != 1.0)
+    assert sum("--scan-duration" in note for note in notes) == (duration_s != 0.0)
+    if duration_s:
+        mean, error = check._durations.result(registrar.index)
+        assert mean == pytest.approx(duration_s, abs=max(4.0 * error, 0.03))
+
+
 def test_points_of_one_instant_raise_no_note_though_the_target_moves() -> None:
     model = boxes()
     registrar = Registrar(model)

@@ -62,9 +62,7 @@ ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that woul
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
-_MIRRORED = (
-    "so that an axis of the model or of the points is inverted: change the sign of one coordinate in the model file"
-)
+_MIRRORED = "so that an axis of the model or of the points is inverted: change the sign of one coordinate in its file"
 _SEEN_POINTS, _DURATION_POINTS = 2000, 800  # of a scan: compared with the mirror image, and for its duration
 _PLACE_EVERY, _LEAST_PLACES = 2, 12  # scans of which one gives a place, and places that give the size
 _PLACE_POINTS, _BLOCKS = 500, 6  # points of each, and blocks of consecutive places, for the jackknife
@@ -200,10 +198,8 @@ class ModelCheck:
         if self._aligned:
             if mirror_image_fits(self._registrar, self._surface, self._seen):
                 return (f"the mirror image of the model explains the scans better than the model, {_MIRRORED}",)
-            size, duration = self._size(), self._duration_note()
-            if size and duration and size[0] <= duration[0]:
-                size = None  # motion during the scans makes an error of the size appear
-            return tuple(note[1] for note in (size, duration) if note)
+            duration = self._duration_note()  # motion during the scans makes an error of the size appear
+            return (*_size_note(self._durations.size() if duration else self.scale()), *duration)
         if self._ambiguous and self._several >= 0:
             return (f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init",)
         unmatched = None if self._matched and not self._ambiguous else self._unmatched
@@ -213,19 +209,6 @@ class ModelCheck:
         """Return the share of systematic errors in the covariances of the poses where it is above a half; else ""."""
         share, of = self._systematic / max(self._aligned, 1), "errors of the model or of the ranges, which remain"
         return f"{100.0 * share:.0f} % of the variance of the poses comes from {of}" * (share > _NOTED)
-
-    def _size(self) -> tuple[float, str] | None:
-        """Standard errors by which the size is wrong, and the text; None if it is right."""
-        found = self.scale()
-        if found is None or abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
-            return None
-        error = abs(found[0] - 1.0)
-        small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
-        return (
-            error / max(found[1], np.finfo(float).tiny),
-            f"the model is {100.0 * error:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
-            f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
-        )
 
     def _camera(self, scan: Scan, T_ca: Pose) -> Array | None:
         """Position of the sensor in {C}, where only faces towards it are matched."""
@@ -274,13 +257,12 @@ class ModelCheck:
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
         self._durations.add(self._registrar.index, OrderedScan(p, motion, self._camera(scan, T_ca), period))
 
-    def _duration_note(self) -> tuple[float, str] | None:
-        """The duration of a scan in its standard errors, and the text; None if it is not significant."""
+    def _duration_note(self) -> tuple[str, ...]:
+        """The duration of a scan; empty if it is not significant."""
         if (found := self._durations.result(self._registrar.index)) is None:
-            return None
+            return ()
         duration, sigma = found
         return (
-            abs(duration) / max(sigma, np.finfo(float).tiny),
             f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
             f"{abs(duration):.3g} +- {sigma:.1g} s: record the time of each point (field 't'); less exactly, "
             f"--scan-duration {duration:.3g} gives times by the order of the points",
@@ -310,6 +292,18 @@ class ModelCheck:
         seen = points if sensor is None else sensor.inverse().apply(points)
         found = self._registrar.acquire(reflected(seen))
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
+
+
+def _size_note(found: tuple[float, float] | None) -> tuple[str, ...]:
+    """The text for a size with its standard error; empty if it is right."""
+    if found is None or abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
+        return ()
+    error = abs(found[0] - 1.0)
+    small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
+    return (
+        f"the model is {100.0 * error:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
+        f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
+    )
 
 
 def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:

@@ -40,16 +40,24 @@ from avsreplay.register.surface_index import SurfaceIndex
 
 EVERY, MOST_SCANS, LEAST_SCANS = 2, 24, 8  # aligned scans of which one is measured at first; measured scans
 BIAS_SCANS, BLOCKS = 4, 6  # scans for the bias of the noise, and blocks of the jackknife
+MOST_WEIGHT = 4.0  # largest weight of a scan for the size, in units of the median weight
 LEAST_OF_PERIOD = 0.02  # least duration that is reported, over the period
 
 
 @value_class
 class ScanDuration:
-    """Duration of one scan, and its standard errors by the noise and by slowly varying errors [s]."""
+    """Duration of one scan, its standard errors by the noise and by slowly varying errors [s], and the size.
+
+    Attributes:
+        delta: size of the target over that of the model, less 1, fitted with the duration.
+        weight: inverse variance of delta, without the slowly varying errors.
+    """
 
     duration_s: float
     sigma_s: float
     systematic_s: float
+    delta: float
+    weight: float
 
 
 @value_class
@@ -109,16 +117,27 @@ class Durations:
     def _significant(mean: float, sigma: float, period: float) -> bool:
         return abs(mean) >= max(LEAST_OF_PERIOD * period, SIGMAS * sigma)
 
+    def size(self) -> tuple[float, float]:
+        """Return the size of the target over that of the model, fitted with the durations, and its standard error."""
+        delta, weight = np.array([(found.delta, found.weight) for _, found in self.measured]).T
+        mean, spread = _mean_of(delta, np.minimum(weight, MOST_WEIGHT * np.median(weight)))
+        return 1.0 + mean, spread
+
     def _mean(self) -> tuple[float, float, float]:
         """The mean duration weighted by its variance, its standard error, and the period [s]."""
         values = [(found.duration_s, found.sigma_s, found.systematic_s) for _, found in self.measured]
         duration, sigma, shared = np.array(values).T
         weight = 1.0 / (sigma**2 + shared**2)
-        block = np.arange(len(duration)) * BLOCKS // len(duration)
-        left = [float(weight[block != k] @ duration[block != k] / weight[block != k].sum()) for k in range(BLOCKS)]
-        spread = np.hypot(spread_of(np.array(left)), float(weight @ shared / weight.sum()))
+        mean, spread = _mean_of(duration, weight)
         period = float(np.median([scan.period_s for scan, _ in self.measured]))
-        return float(weight @ duration / weight.sum()), float(spread), period
+        return mean, float(np.hypot(spread, weight @ shared / weight.sum())), period
+
+
+def _mean_of(values: Array, weight: Array) -> tuple[float, float]:
+    """Weighted mean of values (n,), and its standard error by the jackknife over blocks."""
+    block = np.arange(len(values)) * BLOCKS // len(values)
+    without = [float(weight[block != k] @ values[block != k] / weight[block != k].sum()) for k in range(BLOCKS)]
+    return float(weight @ values / weight.sum()), spread_of(np.array(without))
 
 
 def scan_duration(index: SurfaceIndex, scan: OrderedScan) -> ScanDuration | None:
@@ -134,22 +153,25 @@ def scan_duration(index: SurfaceIndex, scan: OrderedScan) -> ScanDuration | None
     """
     if (found := _fitted(index, scan.points, scan.camera_c, scan.motion)) is None:
         return None
-    duration, rows = found
+    duration, delta, rows = found
     sigma = max(clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
-    return ScanDuration(duration, sigma, systematic(rows, index.extent_m))
+    others, of_size = np.column_stack([rows.J[:, :6], rows.free]), rows.J[:, 6]
+    free = of_size - others @ np.linalg.lstsq(others, of_size, rcond=1e-6)[0]
+    weight = float(free @ free) / rows.noise_m**2
+    return ScanDuration(duration, sigma, systematic(rows, index.extent_m), delta, weight)
 
 
 def duration_bias(index: SurfaceIndex, scan: OrderedScan) -> float:
     """Return the duration [s] that the noise of a scan makes one of no duration appear to have; see ``noise_bias``."""
     if (found := _fitted(index, scan.points, scan.camera_c, scan.motion)) is None:
         return 0.0
-    rows = found[1]
+    rows = found[2]
     both = [_fitted(index, noisy, scan.camera_c, scan.motion[rows.used]) for noisy in noisy_points(rows, scan.camera_c)]
     return float(np.mean([found[0] if each is None else each[0] for each in both]))
 
 
-def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, Rows] | None:
-    """Duration and rows of the last round."""
+def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float, Rows] | None:
+    """Duration, size less 1, and rows of the last round."""
     duration, delta, moved, rows = 0.0, 0.0, Pose.identity(), None
     for _ in range(ROUNDS):
         q = moved.apply(p - duration * motion) / (1.0 + delta)
@@ -160,4 +182,4 @@ def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array
         delta, moved = joined(delta, moved, float(d[6]), d[:6], centre)
         if abs(delta) > LARGEST_ERROR:
             return None
-    return None if rows is None else (duration, rows)
+    return None if rows is None else (duration, delta, rows)

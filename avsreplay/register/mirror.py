@@ -35,7 +35,7 @@ from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
 MOST_SCANS, APART = 6, np.cos(np.radians(30.0))  # scans that are compared, from directions so far apart
-REFINED_POINTS, FEW_POINTS = 600, 300  # of a scan: refined with, and to choose a reflection
+REFINED_POINTS = 600  # of a scan, with which the poses are chosen and refined
 PLANES, PLANE_POINTS, SURFACE_POINTS = 200, 100, 400  # planes, and points of the surface that are reflected
 NEAR_PLANES, PLANES_APART = 16, np.cos(np.radians(12.0))  # planes that are registered, with normals so far apart
 REFLECTIONS, SAME_TRACE = 6, 1.0 + 2.0 * np.cos(np.radians(5.0))  # most reflections, and rotation between them
@@ -48,6 +48,7 @@ PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = 0.05, 0.381966, 4  # side of a patch
 CONTRADICTING = 0.1  # share of the patches that contradict the true shape
 LEAST_LIKELIHOOD, MOST_AGAINST = 6.0, 0.25  # log likelihood ratio that decides; patches against over those for it
 ENOUGH = 3  # scans that decide for the model, after which no more are compared
+MOST_OFF = 0.1  # share of the points off the model, above which the mirror image of one scan is searched
 TESTED_POINTS, LEAST_FACING = 200, 0.4  # points of which so many must be on faces towards the sensor
 
 
@@ -63,6 +64,21 @@ class SeenScan:
         """Direction (3,) from the sensor to the points in {C}."""
         middle = self.points.mean(axis=0, dtype=np.float64)
         return np.asarray(self.T_cs.R @ middle / max(float(np.linalg.norm(middle)), np.finfo(float).tiny))
+
+
+@value_class
+class _Compared:
+    """A scan at the poses of the model and of its mirror image.
+
+    Attributes:
+        points: (n, 3) in {C} [m].
+        gain: (n,) what each point has in favour of the mirror image, from -1 to 1.
+        off: share of the points off the model.
+    """
+
+    points: Array
+    gain: Array
+    off: float
 
 
 def from_another_side(scan: SeenScan, kept: Sequence[SeenScan]) -> bool:
@@ -88,33 +104,40 @@ def mirror_image_fits(registrar: Registrar, surface: Surface, scans: Sequence[Se
         surface: the model, vertices in {C} [m].
         scans: accepted scans; the points of one are at the instant of its pose.
     """
-    if not scans or not len(motions := reflections(surface, registrar.index)):
+    if not scans:
         return False
-    extent, compared, sure, contrary = registrar.index.extent_m, list[tuple[Array, Array]](), list[bool](), 0
+    motions, extent, compared = reflections(surface, registrar.index), registrar.index.extent_m, list[_Compared]()
     for scan in scans:
         compared.append(_compared(registrar, scan, [R @ scan.T_cs.matrix @ S for R in motions]))
-        gain, against = _likelihood(compared[-1:], extent)
-        sure.append(_decides(gain, against))
-        contrary += _decides(against, gain)
-        if contrary == ENOUGH and not any(sure):
-            return False
-    if any(sure):  # the motions may not contain that of another scan, which is searched
-        for k, scan in enumerate(scans):
-            found = None if sure[k] else registrar.acquire(reflected(scan.points))
-            if found is not None and found.measured:
-                again = _compared(registrar, scan, [found.T_ac.inverse().matrix])
-                compared[k] = max(compared[k], again, key=lambda each: float(each[1].sum()))
-    return _decides(*_likelihood(compared, extent))
+        if sum(_decide([each], extent, -1.0) for each in compared) == ENOUGH:
+            break
+    sure = [_decide([each], extent) for each in compared]
+    worst = int(np.argmax([each.off for each in compared]))
+    if not any(sure) and compared[worst].off > MOST_OFF:
+        compared[worst] = _searched(registrar, scans[worst], compared[worst])
+        sure[worst] = _decide([compared[worst]], extent)
+    if any(sure):  # the motions may not contain those of the other scans
+        compared += [_compared(registrar, scan, []) for scan in scans[len(compared) :]]
+        sure += [False] * (len(compared) - len(sure))
+        of = zip(scans, compared, sure, strict=True)
+        compared = [each if decided else _searched(registrar, scan, each) for scan, each, decided in of]
+    return _decide(compared, extent)
 
 
-def _likelihood(compared: Sequence[tuple[Array, Array]], extent_m: float) -> tuple[float, float]:
-    """Log likelihood ratios for the mirror image and for the model, of patches that support each."""
+def _searched(registrar: Registrar, scan: SeenScan, before: _Compared) -> _Compared:
+    """The comparison with the mirror image where a search finds it, if that is better for it than ``before``."""
+    found = registrar.acquire(reflected(scan.points))
+    if not found.measured:
+        return before
+    again = _compared(registrar, scan, [found.T_ac.inverse().matrix])
+    return max(before, again, key=lambda each: float(each.gain.sum()))
+
+
+def _decide(compared: Sequence[_Compared], extent_m: float, sign: float = 1.0) -> bool:
+    """Whether scans decide for the mirror image, or with a ``sign`` of -1 for the model."""
     most = float(np.log((1.0 - CONTRADICTING) / CONTRADICTING))
-    ratio = np.clip(0.5 * NOISE**2 * _by_patch(compared, extent_m), -most, most)
-    return float(ratio[ratio > 0.0].sum()), -float(ratio[ratio < 0.0].sum())
-
-
-def _decides(gain: float, against: float) -> bool:
+    ratio = sign * np.clip(0.5 * NOISE**2 * _by_patch(compared, extent_m), -most, most)
+    gain, against = float(ratio[ratio > 0.0].sum()), -float(ratio[ratio < 0.0].sum())
     return gain - against > LEAST_LIKELIHOOD and against < MOST_AGAINST * gain
 
 
@@ -166,7 +189,7 @@ def _uncarried(index: SurfaceIndex, points: Array, motions: Array, width: float)
     width_m = min(width * index.extent_m, index.reach_m)
     moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
     distance = index.distances(moved.reshape(-1, 3), Pose.identity(), width_m, False, 1, 0.0)[0]
-    return np.asarray(np.mean((distance.reshape(len(motions), -1) / width_m) ** 2, axis=1))
+    return np.asarray(np.mean((distance.reshape(len(motions), len(points)) / width_m) ** 2, axis=1))
 
 
 def _refined(index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple[float, int]], sided: bool) -> Pose:
@@ -179,11 +202,8 @@ def _refined(index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple
     return T
 
 
-def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> tuple[Array, Array]:
-    """Points (n, 3) of a scan in {C} [m], and what each has in favour of the mirror image, from -1 to 1.
-
-    ``starts``: poses (4, 4) of the sensor in {C} for the reflected scan.
-    """
+def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> _Compared:
+    """Compare the poses of a scan and of its reflection, from poses (k, 4, 4) of the sensor in {C} for the latter."""
     index, sided = registrar.index, registrar.sided
     points = scan.points.astype(np.float64)
     image = reflected(points)
@@ -191,27 +211,27 @@ def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> 
     def distance(part: Array, T: Pose, most: float) -> Array:
         return index.distances(part, T, most * index.extent_m, sided, TESTED_POINTS, LEAST_FACING)[0]
 
-    def cost(part: Array, T: Pose) -> float:
-        return float(np.mean(distance(part, T, TRIED_OF_EXTENT) ** 2))
+    def of_image(T: Pose) -> float:
+        return float(np.mean(distance(some_of_image, T, TRIED_OF_EXTENT) ** 2))
 
-    few, some, some_of_image = _some(image, FEW_POINTS), _some(points, REFINED_POINTS), _some(image, REFINED_POINTS)
-    best = sorted(map(Pose.from_matrix, starts), key=lambda T: cost(few, T))[:TRIED]
+    some, some_of_image = _some(points, REFINED_POINTS), _some(image, REFINED_POINTS)
+    best = sorted(map(Pose.from_matrix, starts), key=of_image)[:TRIED]
     ended = [_refined(index, some_of_image, T, TO_SCAN, sided) for T in best]
-    own = _refined(index, some, scan.T_cs, TO_SCAN, sided)
-    mirrored = min(ended, key=lambda T: cost(some_of_image, T))
-    both = [distance(points, own, MOST_OF_EXTENT), distance(image, mirrored, MOST_OF_EXTENT)]
-    width = max(NOISE * min(map(robust_noise, both)), LEAST_OF_EXTENT * index.extent_m)
-    by_model, by_image = (np.minimum(each / width, 1.0) ** 2 for each in both)
-    return own.apply(points), by_model - by_image
+    own, mirrored = _refined(index, some, scan.T_cs, TO_SCAN, sided), min(ended, key=of_image, default=None)
+    by_model = distance(points, own, MOST_OF_EXTENT)
+    by_image = np.full_like(by_model, np.inf) if mirrored is None else distance(image, mirrored, MOST_OF_EXTENT)
+    width = max(NOISE * min(map(robust_noise, (by_model, by_image))), LEAST_OF_EXTENT * index.extent_m)
+    by_model, by_image = (np.minimum(each / width, 1.0) ** 2 for each in (by_model, by_image))
+    return _Compared(own.apply(points), by_model - by_image, float(np.mean(by_model == 1.0)))
 
 
 def _some(points: Array, count: int) -> Array:
     return np.ascontiguousarray(points[:: max(1, len(points) // count)])
 
 
-def _by_patch(compared: Sequence[tuple[Array, Array]], extent_m: float) -> Array:
+def _by_patch(compared: Sequence[_Compared], extent_m: float) -> Array:
     """Mean over each patch, of all scans, of what its points have in favour of the mirror image."""
-    points, gain = (np.concatenate(each) for each in zip(*compared, strict=True))
+    points, gain = (np.concatenate([getattr(each, name) for each in compared]) for name in ("points", "gain"))
     cell = np.floor(points / (PATCH_OF_EXTENT * extent_m) + OFF_PLANES).astype(np.int64)
     cell -= cell.min(axis=0)
     span = cell.max(axis=0) + 1
