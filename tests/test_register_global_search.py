@@ -26,9 +26,10 @@ from avsreplay.register.global_search import (
     SearchResult,
     VisibleCentroids,
 )
-from avsreplay.register.params import AcquireParams
+from avsreplay.register.params import AcquireParams, Camera
 from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
+from avsreplay.simulate import builtin_surface
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEED = 5
@@ -344,3 +345,17 @@ def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
 
 def _mesh(body: trimesh.Trimesh) -> Surface:
     return Surface(np.array(body.vertices), np.array(body.faces, dtype=np.int32), "", "")
+
+
+@pytest.mark.parametrize("seed", [36, 52])
+def test_a_panel_is_not_matched_to_its_other_side_where_the_camera_is_not_known(seed: int) -> None:
+    """A minimum 1.1 deg off has 99 % of the points within the gate."""
+    surface = builtin_surface()
+    q = np.random.default_rng(seed).standard_normal(4)
+    T_ac = Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * surface.extent]))
+    points = T_ac.apply(view(surface, 3000, T_ac.inverse().t))
+    found = Registrar(surface, RegisterParams(camera=Camera.NONE)).acquire(points)
+    assert found.status is AlignStatus.ALIGNED
+    step = T_ac.inverse() @ found.T_ac
+    assert float(geometry.angle(step.q)) < 1e-4
+    assert np.linalg.norm(step.t) < 1e-4 * surface.extent

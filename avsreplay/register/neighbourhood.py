@@ -27,7 +27,7 @@ from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.budget import FAR_WORK, MEASURED_WORK, SIZE_WORK, Budget
 from avsreplay.register.covariance import noise_along
 from avsreplay.register.degenerate import scaled_information
-from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
 from avsreplay.register.surface_index import SurfaceIndex
@@ -81,7 +81,7 @@ class Neighbourhood:
         points = self._restarter.part(scan)
         if not (self._test.turned_away(points, T_ca) or (aligned and self._test.partial(points, T_ca))):
             return None, found.status, ""
-        if not budget.allows((1 + 2 * DIRECTIONS) * FAR_WORK * self._restarter.work(self._restarter.narrow_m) * POINTS):
+        if not budget.allows(self._minima_work):
             return None, AlignStatus.BUDGET_EXHAUSTED, NOT_COMPARED
         minima = self._minima(points, T_ca, DIRECTIONS if aligned else 0, budget)
         best, width = self._restarter.least(minima), 3.0 * min(each.noise_m for each in minima)
@@ -89,6 +89,29 @@ class Neighbourhood:
         others = (each for each in minima if not self._restarter.same(best.T_ca, each.T_ca))
         doubt = SEVERAL if aligned and any(_as_good(best, other, width) for other in others) else ""
         return None if best is minima[0] else best, AlignStatus.AMBIGUOUS, doubt
+
+    def of_both_sides(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Restart:
+        """Return the best minimum around the result of a search, where a panel can be matched to its other side.
+
+        Args:
+            points: (n, 3) in {A} [m], part of the scan.
+            T_ca: the result.
+            budget: work that is left.
+
+        Returns:
+            The result itself where only faces towards the camera are matched, where its distances are too large for any
+            pose to be accepted, or where no work is left.
+        """
+        at, target = self._restarter.measure(points, T_ca), self._target
+        known = target.visibility.camera_c(target.index, points, T_ca) is not None
+        if known or at.noise_m > NOISE_OF_EXTENT * self._extent or self._minima_work > budget.left:
+            return at
+        return self._restarter.least(self._minima(points, T_ca, DIRECTIONS, budget))
+
+    @property
+    def _minima_work(self) -> int:
+        """The usual cost of the minima around a pose."""
+        return int((1 + 2 * DIRECTIONS) * FAR_WORK * self._restarter.work(self._restarter.narrow_m) * POINTS)
 
     def _moved(self, T_ca: Pose, guess: Pose) -> bool:
         """Whether a pose differs from the predicted T_ac ``guess``."""

@@ -167,7 +167,7 @@ class Registrar:
 
         Also returned: whether the points off the model are another object's: far away, or the visible side is complete.
         """
-        start = self._restarter.measure(few := self._restarter.part(part), search.best)
+        start = self._neighbourhood.of_both_sides(few := self._restarter.part(part), search.best, budget)
         away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
         sure, p = away or search.inlier_ratio >= self.params.acquire.least_ratio, self.params.acquire
         spread = start.noise_m > restarts.HOPELESS * self.index.extent_m or search.inlier_ratio < p.least_separate
