@@ -131,8 +131,9 @@ def test_points_that_are_measured_one_after_the_other_are_noticed(duration_s: fl
         found = registrar.register(scan.points, T_ac)
         check.add(scan, found)
         timed.add(replace(scan, places=None, times_s=scan.places), found)
-    mean, sigma = check._durations.result(registrar.index)
-    assert mean == pytest.approx(duration_s, abs=max(4.0 * sigma, 0.01))
+    result = check._durations.result(registrar.index)
+    mean = result.duration_s
+    assert mean == pytest.approx(duration_s, abs=max(4.0 * result.sigma_s, 0.01))
     assert [seen.period_s for seen, _ in check._durations.measured] == pytest.approx([0.5] * 17)
     assert f"--scan-duration {mean:.3g}" in " ".join(check.notes())
     assert "--scan-duration" not in " ".join(timed.notes())
@@ -171,8 +172,9 @@ def test_an_error_of_size_and_noise_are_not_taken_for_a_duration(
     assert sum("--model-scale" in note for note in notes) == (factor != 1.0)
     assert sum("--scan-duration" in note for note in notes) == (duration_s != 0.0)
     if duration_s:
-        mean, error = check._durations.result(registrar.index)
-        assert mean == pytest.approx(duration_s, abs=max(4.0 * error, 0.03))
+        result = check._durations.result(registrar.index)
+        assert result.duration_s == pytest.approx(duration_s, abs=max(4.0 * result.sigma_s, 0.03))
+        assert result.size == pytest.approx(factor, abs=max(4.0 * result.size_1s, 0.002))
 
 
 def test_points_of_one_instant_raise_no_note_though_the_target_moves() -> None:

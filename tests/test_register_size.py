@@ -50,7 +50,8 @@ def fits(model: Surface, noise: float, seeds: range) -> list[tuple[SizeError, fl
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_step_of_the_extension_is_that_of_the_rows(known: bool) -> None:
+def test_the_step_of_the_extension_is_that_of_the_rows(monkeypatch, known: bool) -> None:
+    monkeypatch.setattr(size_module, "SMALL_STEP", np.inf)
     model = boxes()
     index = SurfaceIndex.build(model, 0.15 * model.extent)
     points, T_ac = scan_of(model, 4, 0.002)

@@ -32,7 +32,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
 from avsreplay.register.budget import Effort, effort_after
-from avsreplay.register.duration import Durations, OrderedScan
+from avsreplay.register.duration import Duration, Durations, OrderedScan
 from avsreplay.register.mirror import SeenScan, from_another_side, mirror_image_fits, reflected, wanted
 from avsreplay.register.neighbourhood import POSTPONED
 from avsreplay.register.params import RegisterParams, RegistrationLimits
@@ -198,8 +198,11 @@ class ModelCheck:
         if self._aligned:
             if mirror_image_fits(self._registrar, self._surface, self._seen):
                 return (f"the mirror image of the model explains the scans better than the model, {_MIRRORED}",)
-            duration = self._duration_note()  # motion during the scans makes an error of the size appear
-            return (*_size_note(self._durations.size() if duration else self.scale()), *duration)
+            duration = self._durations.result(self._registrar.index)
+            if duration is None:
+                return _size_note(self.scale())
+            # motion during the scans makes an error of the size appear, so that both are fitted together
+            return (*_size_note((duration.size, duration.size_1s)), _duration_note(duration))
         if self._ambiguous and self._several >= 0:
             return (f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init",)
         unmatched = None if self._matched and not self._ambiguous else self._unmatched
@@ -257,17 +260,6 @@ class ModelCheck:
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
         self._durations.add(self._registrar.index, OrderedScan(p, motion, self._camera(scan, T_ca), period))
 
-    def _duration_note(self) -> tuple[str, ...]:
-        """The duration of a scan; empty if it is not significant."""
-        if (found := self._durations.result(self._registrar.index)) is None:
-            return ()
-        duration, sigma = found
-        return (
-            f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
-            f"{abs(duration):.3g} +- {sigma:.1g} s: record the time of each point (field 't'); less exactly, "
-            f"--scan-duration {duration:.3g} gives times by the order of the points",
-        )
-
     def _keep(self, scan: Scan, T_ac: Pose) -> None:
         """Keep a scan of another side of the target, for the comparison with the mirror image."""
         if not wanted(self._seen) or (p := self._on_model(scan, T_ac, _SEEN_POINTS)) is None:
@@ -303,6 +295,14 @@ def _size_note(found: tuple[float, float] | None) -> tuple[str, ...]:
     return (
         f"the model is {100.0 * error:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
         f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
+    )
+
+
+def _duration_note(found: Duration) -> str:
+    return (
+        f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
+        f"{abs(found.duration_s):.3g} +- {found.sigma_s:.1g} s: record the time of each point (field 't'); less "
+        f"exactly, --scan-duration {found.duration_s:.3g} gives times by the order of the points"
     )
 
 

@@ -61,6 +61,16 @@ class ScanDuration:
 
 
 @value_class
+class Duration:
+    """Duration of a scan [s] along a run, the size of the target over that of the model, and their standard errors."""
+
+    duration_s: float
+    sigma_s: float
+    size: float
+    size_1s: float
+
+
+@value_class
 class OrderedScan:
     """Points of a registered scan without times.
 
@@ -103,25 +113,23 @@ class Durations:
         if len(self.measured) == MOST_SCANS:
             self.measured, self.stride = self.measured[::2], 2 * self.stride
 
-    def result(self, index: SurfaceIndex) -> tuple[float, float] | None:
-        """Return the duration and its standard error [s] if it is significant, else None."""
+    def result(self, index: SurfaceIndex) -> Duration | None:
+        """Return the duration if it is significant, with the size that was fitted with it; else None."""
         if len(self.measured) < LEAST_SCANS or not self._significant(*self._mean()):
             return None
-        mean, sigma, period = self._mean()
         tried = np.linspace(0, len(self.measured) - 1, BIAS_SCANS).astype(np.intp)
-        bias = float(np.mean([duration_bias(index, self.measured[k][0]) for k in tried]))
+        bias, of_size = np.mean([noise_biases(index, self.measured[k][0]) for k in tried], axis=0)
+        mean, sigma, period = self._mean()
         mean, sigma = mean - bias, float(np.hypot(sigma, 0.5 * bias))
-        return (mean, sigma) if self._significant(mean, sigma, period) else None
+        if not self._significant(mean, sigma, period):
+            return None
+        delta, weight = np.array([(found.delta, found.weight) for _, found in self.measured]).T
+        size, size_1s = _mean_of(delta, np.minimum(weight, MOST_WEIGHT * np.median(weight)))
+        return Duration(mean, sigma, 1.0 + size - of_size, float(np.hypot(size_1s, 0.5 * of_size)))
 
     @staticmethod
     def _significant(mean: float, sigma: float, period: float) -> bool:
         return abs(mean) >= max(LEAST_OF_PERIOD * period, SIGMAS * sigma)
-
-    def size(self) -> tuple[float, float]:
-        """Return the size of the target over that of the model, fitted with the durations, and its standard error."""
-        delta, weight = np.array([(found.delta, found.weight) for _, found in self.measured]).T
-        mean, spread = _mean_of(delta, np.minimum(weight, MOST_WEIGHT * np.median(weight)))
-        return 1.0 + mean, spread
 
     def _mean(self) -> tuple[float, float, float]:
         """The mean duration weighted by its variance, its standard error, and the period [s]."""
@@ -161,13 +169,17 @@ def scan_duration(index: SurfaceIndex, scan: OrderedScan) -> ScanDuration | None
     return ScanDuration(duration, sigma, systematic(rows, index.extent_m), delta, weight)
 
 
-def duration_bias(index: SurfaceIndex, scan: OrderedScan) -> float:
-    """Return the duration [s] that the noise of a scan makes one of no duration appear to have; see ``noise_bias``."""
+def noise_biases(index: SurfaceIndex, scan: OrderedScan) -> tuple[float, float]:
+    """Return the duration [s] and the size less 1 that the noise of a scan makes a still target appear to have.
+
+    As ``size.noise_bias``, with the arguments of :func:`scan_duration`.
+    """
     if (found := _fitted(index, scan.points, scan.camera_c, scan.motion)) is None:
-        return 0.0
+        return 0.0, 0.0
     rows = found[2]
     both = [_fitted(index, noisy, scan.camera_c, scan.motion[rows.used]) for noisy in noisy_points(rows, scan.camera_c)]
-    return float(np.mean([found[0] if each is None else each[0] for each in both]))
+    duration, size = np.mean([(found if each is None else each)[:2] for each in both], axis=0)
+    return float(duration), float(size)
 
 
 def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float, Rows] | None:

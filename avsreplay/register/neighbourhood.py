@@ -137,7 +137,7 @@ class Neighbourhood:
     def with_size(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
         """Return an alignment with what its scan (n, 3) in {A} says about the size, if that is still to be fitted.
 
-        The covariance is enlarged by the change of the pose that a significant error of the size causes.
+        The covariance is enlarged by the change of the pose that an error of the size of two standard errors causes.
         """
         P, part = found.covariance, found.systematic
         if found.size_1s is None or P is None or part is None:
@@ -145,7 +145,7 @@ class Neighbourhood:
         budget.spend(SIZE_WORK)
         T_ca, target = found.T_ac.inverse(), self._target
         size = size_error(target.index, scan, T_ca, target.visibility.camera_c(target.index, scan, T_ca))
-        if size is not None and size.significant:
+        if size is not None and size.likely:
             P, part = (geometry.frozen(C + np.outer(size.shift, size.shift)) for C in (P, part))
         return replace(found, covariance=P, systematic=part, message=size_remark(size, found.size_1s), size_1s=None)
 

@@ -1,8 +1,8 @@
 """Size of the target over that of the model from the residuals of a registered scan.
 
 With T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
-n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again a few times,
-because the closest points move with both.
+n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again until delta does
+not change, because the closest points move with both.
 
 Standard error: one part is that of the weighted residuals, which are correlated within a patch of the model
 (cluster-robust sandwich). Another is that of slowly varying errors of model and ranges, an anisotropic strain and an
@@ -33,9 +33,11 @@ LEAST_RESIDUALS = 50
 MOST_OF_MODEL = 1.3  # diameter of a scan over that of the model above which more than the target is in view
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
+LIKELY_SIGMAS = 2.0  # from so many standard errors on, the covariance of the pose contains the change with the size
 SIZE_UNSEEN = "the view does not show an error of the size"  # the message of such a view begins with it
 UNSEEN_ERROR = 0.03  # a view in which a larger error would not be significant does not determine the size
-WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used; times that the points are matched
+WIDTH_OF_EXTENT, POINTS = 0.02, 600  # larger residuals are not used
+ROUNDS, MOST_ROUNDS, SMALL_STEP = 3, 20, 2e-4  # times that the points are matched; step of the size that ends them
 LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
 LEAST_INFORMATION = 1e-3  # least share of n . p not explained by the pose: three faces of a box give no size
 PATCHES_OF_EXTENT = (0.05, 0.15)  # sides of the patches; the larger of the two standard errors counts
@@ -63,6 +65,11 @@ class SizeError:
     def significant(self) -> bool:
         """Whether delta is larger than 0.5 % and than four standard errors."""
         return abs(self.delta) > max(LEAST_ERROR, SIGMAS * self.sigma)
+
+    @property
+    def likely(self) -> bool:
+        """Whether delta is larger than 0.5 % and than two standard errors: the pose is then uncertain by its shift."""
+        return abs(self.delta) > max(LEAST_ERROR, LIKELY_SIGMAS * self.sigma)
 
 
 def size_remark(size: SizeError | None, size_1s: float) -> str:
@@ -204,15 +211,17 @@ def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> Rows | Non
 
 
 def _rounds(index: SurfaceIndex, p: Array, camera_c: Array | None, count: int) -> tuple[float, Pose] | None:
-    """Size and motion after so many rounds, whose rows are not needed."""
+    """Size and motion after so many rounds, and more while they change the size; their rows are not needed."""
     delta, moved = 0.0, Pose.identity()
     rule = (WIDTH_OF_EXTENT * index.extent_m, LEAST_RESIDUALS, NORMAL_QUANTILE, CAUCHY, LEAST_INFORMATION)
-    for _ in range(count):
+    for done in range(1, MOST_ROUNDS + 1):
         if (step := index.size_step(moved.apply(p) / (1.0 + delta), camera_c, *rule)) is None:
             return None
         delta, moved = joined(delta, moved, *step)
         if abs(delta) > LARGEST_ERROR:
             return None
+        if done >= count and abs(step[0]) < SMALL_STEP:
+            break
     return delta, moved
 
 

@@ -168,7 +168,7 @@ def duration(asked: argparse.Namespace) -> None:
                 check.add(scan, registrar.register(scan.points, T_ac))
                 taken.append(time_s)
             notes, result = check.notes(), check._durations.result(registrar.index)
-            off = abs(result[0] - np.mean(taken)) / abs(np.mean(taken)) if result and duration_s else 0.0
+            off = abs(result.duration_s - np.mean(taken)) / abs(np.mean(taken)) if result and duration_s else 0.0
             found[case].append((result is not None, any("--model-scale" in note for note in notes), off))
     print("| size | duration of all rays [s] | noise | runs | report a duration | report a size | off |")
     for (size, duration_s, noise), runs in found.items():
