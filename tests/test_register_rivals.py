@@ -10,6 +10,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import Registrar
+from avsreplay.register.budget import Budget
 from avsreplay.register.quality import left_undetermined
 
 
@@ -108,3 +109,15 @@ def test_the_information_left_without_motions_is_that_of_free_motions():
     rest = A - along @ (along.T @ A)
     assert np.allclose(left.info, rest.T @ rest, atol=1e-12)
     assert np.allclose(left.info @ d, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("points", [600, 2000, 2600, 6000])
+def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most_turns(points: int) -> None:
+    """A round of the search that is never allowed would leave every scan of the body without a pose."""
+    handle = trimesh.creation.box((0.3, 0.1, 0.4)).apply_translation((0.5, 0.0, 0.1))
+    mug = trimesh.util.concatenate([trimesh.creation.cylinder(0.4, 0.9, sections=64), handle])
+    symmetry = Registrar(surface_of(mug))._symmetry
+    assert symmetry.marked
+    assert len(symmetry._marks) > 400
+    assert sum(len(motions) for motions in symmetry._kinds) > 100
+    assert symmetry.search_work(points, 0) < 0.9 * Budget(points).left

@@ -50,6 +50,7 @@ NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its 
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 STEPS, LONGEST_STEP = 24, 0.05  # steps from a mark towards the camera; the longest, over the extent
+USUAL_STEPS = 3  # for a mark in the mean: most of them face away, or the steps soon leave the box of the model
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
 
 
@@ -134,7 +135,7 @@ class NearSymmetry:
     def work(self, points: int, others: int = 0) -> int:
         """Return the usual cost of a decision between so many other poses and the turned ones in point searches."""
         motions, finalists = sum(len(motions) for motions in self._kinds), FINALISTS * len(self._kinds)
-        rays = STEPS * len(self._marks)
+        rays = USUAL_STEPS * len(self._marks)
         measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
         return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + rays) + measured
 
