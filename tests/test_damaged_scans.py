@@ -95,3 +95,12 @@ def test_a_log_that_can_be_read_has_exit_code_0(scans: Path, fixtures_folder: Pa
     for words in (("info",), ("doctor",), ("record", "-o", str(tmp_path / "x.mcap"), "--n-scans", "3")):
         done = called(scans, tmp_path, words[0], str(fixtures_folder / "tumble.mcap"), *words[1:])
         assert code_of(done) == 0, done.output
+
+
+def test_info_of_a_large_log_names_the_command_that_decodes_all(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("avsreplay.cli.info.DECODED_BYTES", 1000)
+    done = called(scans, tmp_path, "info", "FOLDER")
+    assert f"{SCANS}; 'avsreplay doctor' tests whether all can be decoded" in done.output
+    assert code_of(done) == 4  # one of the five that were decoded, which are spread over the log, is the truncated one

@@ -186,7 +186,7 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
         ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
         ("size", f"{info.bytes / 1e6:.3g} MB" if info.bytes >= 1e6 else f"{info.bytes} bytes"),
         ("log clock", " ".join(filter(None, (_time(info.start_ns), "for", span))) if span else "-"),
-        ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "")),
+        ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "") + _decoded(info)),
         ("model", _model(info)),
         ("truth", "yes" if info.truth else "no"),
     ]
@@ -195,6 +195,11 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
     if info.clock is not None and info.scans and info.topics:  # a folder of scans has no second clock
         rows.append(("clock", _clock(info.clock)))
     return rows + [(name, value) for name, value in info.notes.items()]
+
+
+def _decoded(info: LogInfo) -> str:
+    """A remark where only a few scans of a large log were decoded."""
+    return "; 'avsreplay doctor' tests whether all can be decoded" if info.bytes > DECODED_BYTES else ""
 
 
 def _time(t_ns: int | None) -> str:
