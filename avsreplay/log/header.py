@@ -248,7 +248,7 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     if data.startswith(b"ply"):
         suffix = "ply"
     if suffix not in _FORMATS:
-        hint = f"give a model as {', '.join(_FORMATS).upper()}"
+        hint = f"give a model as {', '.join(_FORMATS).upper()}; CAD programs export STEP and IGES files as STL"
         raise UnreadableInput(f"'{shown(suffix)}' is not a known model format", where=where, hint=hint)
     try:
         vertices, faces = _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
