@@ -135,13 +135,13 @@ def write_view(path: str | Path, view: View) -> None:
 
 
 def _joined(parts: Sequence[Floats]) -> Floats:
-    return np.concatenate([np.zeros((0, 3), np.float32), *parts]).astype(np.float32)
+    return np.concatenate([np.zeros((0, 3), np.float32), *parts]).astype(np.float32, copy=False)
 
 
 def _each_point(parts: Sequence[tuple[CloudView, Floats | None]]) -> Floats:
     """A value of each point of all clouds, NaN where a cloud has none."""
-    filled = [np.full(len(cloud.points), np.nan) if known is None else known for cloud, known in parts]
-    return np.concatenate([np.zeros(0), *filled]).astype(np.float32)
+    filled = [np.full(len(cloud.points), np.nan, np.float32) if known is None else known for cloud, known in parts]
+    return np.concatenate([np.zeros(0, np.float32), *filled]).astype(np.float32, copy=False)
 
 
 def read_view(path: str | Path) -> View:
