@@ -92,7 +92,7 @@ def _contents(
     if search and surface is not None and finite and found:
         found += find_model(finite, surface, found, source.options)
     if broken:
-        text = f"{len(broken)} of {len(scans)} examined scans cannot be decoded, the first: {broken[0].note}"
+        text = f"{len(broken)} of {len(scans)} examined scans cannot be used, the first: {broken[0].note}"
         found.insert(0, Advice("check" if found else "fail", "scans", text))
     return found
 

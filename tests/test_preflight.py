@@ -172,7 +172,7 @@ def test_clouds_that_cannot_be_decoded_are_named_with_the_reason(surface, bad, g
     found = preflight(Undecodable(_seen(surface, n=5), bad=bad), surface)
     advice = _found(found, "scans")
     assert advice.grade == grade
-    assert advice.text == f"{len(bad)} of 5 examined scans cannot be decoded, the first: no field 'x' among intensity"
+    assert advice.text == f"{len(bad)} of 5 examined scans cannot be used, the first: no field 'x' among intensity"
     assert any(other.about == "size" for other in found) == (grade == "check")
 
 
@@ -366,7 +366,7 @@ def test_a_selection_without_a_scan_is_one_line(cli, fixtures_folder):
 def test_a_crop_that_leaves_no_point_is_named(cli, fixtures_folder):
     done = cli("run", fixtures_folder / "tumble.mcap", "--crop-range", "500,600", "--n-scans", "3", "--json")
     assert "no points are left in the examined scans; widen the crop" in done.err
-    assert "mostly no points" in done.err
+    assert "mostly no usable points" in done.err
 
 
 def test_a_pose_topic_is_offered_as_truth(surface):

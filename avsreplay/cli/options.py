@@ -147,9 +147,12 @@ def report_losses(source: Source, damaged: int | None = None) -> None:
         DataLost: names the number of parts and of scans, and the first of each.
     """
     from avsreplay.log.options import lost_text
+    from avsreplay.log.source import UNKNOWN_SENSOR
 
     if text := lost_text(source.losses, source.damaged, len(source), damaged):
-        raise DataLost(text, where=str(source.path), hint="see 'avsreplay doctor'")
+        uncovered = not source.losses and UNKNOWN_SENSOR in text
+        hint = "see --truth-gap, or choose a part with --start and --end" if uncovered else "see 'avsreplay doctor'"
+        raise DataLost(text, where=str(source.path), hint=hint)
 
 
 def read_result(path: Path) -> Result:

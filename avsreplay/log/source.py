@@ -24,7 +24,7 @@ from avsreplay.log.point_cloud2 import Cloud, at_stamp, selected
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
-_BLOCK = 1 << 20
+_BLOCK, UNKNOWN_SENSOR = 1 << 20, "the pose of the sensor is unknown at the time of the scan"
 
 
 class Source:
@@ -317,7 +317,7 @@ class Source:
         lookup = self._ground_truth.sensor
         pose = Pose.identity() if lookup is None else lookup(t_ns, frame)
         if pose is None:
-            raise BadMessage("the pose of the sensor is unknown at the time of the scan")
+            raise BadMessage(UNKNOWN_SENSOR)
         return pose
 
     def _measured(self, found: MeasuredPose, t_ns: int, frame: str) -> MeasuredPose:

@@ -103,7 +103,7 @@ def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
 
 def plain(name: str) -> str:
     """A status or reason in words."""
-    return "no points" if name == "no_scan" else name.replace("_", " ")
+    return "no usable points" if name == "no_scan" else name.replace("_", " ")
 
 
 def median_of(figures: Array) -> float | None:
