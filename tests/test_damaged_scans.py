@@ -10,9 +10,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from avsreplay.cli import group
-from avsreplay.errors import AvsError
+from avsreplay.cli.options import report_losses
+from avsreplay.errors import AvsError, DataLost
 from avsreplay.log import open_source
 from avsreplay.log.header import surface_bytes
+from avsreplay.log.source import UNKNOWN_SENSOR
 from avsreplay.report.jsonl import read_rows
 
 HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
@@ -104,3 +106,14 @@ def test_info_of_a_large_log_names_the_command_that_decodes_all(
     done = called(scans, tmp_path, "info", "FOLDER")
     assert f"{SCANS}; 'avsreplay doctor' tests whether all can be decoded" in done.output
     assert code_of(done) == 4  # one of the five that were decoded, which are spread over the log, is the truncated one
+
+
+def test_the_hint_is_about_transforms_where_only_these_are_missing(scans: Path) -> None:
+    with open_source(scans / "scans") as source:
+        report_losses(source)  # nothing was read yet
+        source.damaged[3] = UNKNOWN_SENSOR
+        with pytest.raises(DataLost, match=f"1 of {SCANS} scans cannot be used, the first: scan 3.*see --truth-gap"):
+            report_losses(source)
+        source.damaged[2] = "3.ply: cut"
+        with pytest.raises(DataLost, match=r"2 of 12 scans .* the first: scan 2: 3\.ply: cut; see 'avsreplay doctor'"):
+            report_losses(source)
