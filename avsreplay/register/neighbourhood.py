@@ -40,6 +40,7 @@ UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, 
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
+NOT_FOUND = "no pose of the model explains the scan, and no work is left for a longer search"
 NOT_COMPARED = "no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
 BIAS_OF_GATE = 0.2  # with a smaller rms distance, in gates, the bias of the noise is not significant

@@ -49,7 +49,7 @@ LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance
 NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
 NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
-MOST_CONTRADICTED = 0.4  # largest score of a pose that is accepted
+MOST_CONTRADICTED, DOUBTFUL = 0.4, 0.3  # largest score of a pose that is accepted; that ends a search
 CHANCE = 0.01  # share of the points on the model, spread over all directions, that is added to the support
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
 CONTRADICTIONS = ("points beside the model", "rays that pass through it", "surface that is not in the scan")
@@ -88,6 +88,11 @@ class Plausibility:
     contradicted: float
     covered: bool
     reason: str
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a search goes on: of a body with a repeated pattern, a displaced pose can have so high a score."""
+        return self.contradicted > DOUBTFUL
 
 
 class PlausibilityTest:

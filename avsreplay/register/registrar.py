@@ -18,7 +18,7 @@ from avsreplay.register.backend import Target, aligned, create_backend, healthy_
 from avsreplay.register.budget import LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget, Effort
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
-from avsreplay.register.neighbourhood import NOT_COMPARED, POSTPONED, Neighbourhood
+from avsreplay.register.neighbourhood import NOT_COMPARED, NOT_FOUND, POSTPONED, Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.rivals import FAR_RAD, LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
@@ -133,55 +133,55 @@ class Registrar:
         """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(SCATTER_WORK * len(scan))
-        few, results = self._restarter.part(target), list[Alignment]()
+        few, results, doubt = self._restarter.part(target), list[Alignment](), list[bool]()
         none = quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse())
         whole: SearchResult | None = None
         for part, number in islice(attempts(target, self.index.extent_m, lambda: results[0].measured), rounds):
             if not budget.allows(self._symmetry.search_work(len(part), number)):
                 break
-            before = whole if part is target else None
             left = budget.left - self._symmetry.after_search(len(scan))
-            search = self._symmetry.search.search(part, number, before, known, left)
+            search = self._symmetry.search.search(part, number, whole if part is target else None, known, left)
             budget.spend(search.work + TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
-            found, alone = self._acquired(scan, part, search, budget, carried)
+            found, alone, doubtful = self._acquired(scan, part, search, budget, carried)
             results.append(found)
+            doubt.append(doubtful)
             if found.status is AlignStatus.FAILED:
                 return found
             fits = alone and not search.rivals and not self._restarter.misfit(few, found.T_ac.inverse())
             little = search.inlier_ratio >= SURE_RATIO or fits  # little is left to explain
-            if found.measured and little and search.width_m <= self.limits.gate_m:
+            if found.measured and little and not doubtful and search.width_m <= self.limits.gate_m:
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
         width = max(self.limits.gate_m, 3.0 * min((restart.noise_m for _, restart in measured), default=0.0))
         best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else (results or [none])[0]
-        if not budget.exhausted or (measured and not self._restarter.misfit(few, best.T_ac.inverse())):
+        sure = measured and not doubt[results.index(best)] and not self._restarter.misfit(few, best.T_ac.inverse())
+        if sure or not budget.exhausted:
             return best
-        message = "no pose of the model explains the scan, and no work is left for a longer search"
-        return replace(best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
+        return replace(best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND)
 
     def _acquired(
         self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
-    ) -> tuple[Alignment, bool]:
+    ) -> tuple[Alignment, bool, bool]:
         """Register the result of a search of a part on the whole scan, and test it.
 
-        Also returned: whether the points off the model are another object's: far away, or the visible side is complete.
+        Also: whether the points off the model are another object's (far away, or nothing is missing); if doubtful.
         """
         start = self._neighbourhood.of_both_sides(few := self._restarter.part(part), search.best, budget)
         away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
         sure, p = away or search.inlier_ratio >= self.params.acquire.least_ratio, self.params.acquire
         spread = start.noise_m > restarts.HOPELESS * self.index.extent_m or search.inlier_ratio < p.least_separate
         if spread or not (sure or self._test.check(few, search.best, self._restarter.part(scan)).covered):
-            return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False
+            return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False, True
         found = self._regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
-            return found, False
+            return found, False, True
         at = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan))
         alone = away or at.covered
         if search.inlier_ratio < (p.least_separate if alone else p.least_ratio) or not found.measured:
-            return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
+            return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False, True
         if at.reason:
-            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
+            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False, True
         best, rivals = found.T_ac.inverse(), list(search.rivals)
         if self._symmetry.marked:
             budget.spend(self._symmetry.work(len(part), len(rivals)))
@@ -194,7 +194,7 @@ class Registrar:
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         elif self._visibility.sided and not at.covered:
             found = self._neighbourhood.of_one(scan, found, budget)
-        return found, alone
+        return found, alone, at.doubtful
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
