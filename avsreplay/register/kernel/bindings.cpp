@@ -187,7 +187,7 @@ class Index {
     }
     const int64_t part = o.few_passes ? (o.few_passes * few + v.n - 1) / v.n : 0;
     return nb::make_tuple(matrix(o.T), o.passes - o.few_passes + part, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
-                          o.searched, o.work(), nb::cast(std::move(matches)));
+                          o.searched, o.work(), matches.kept.empty() ? nb::none() : nb::cast(std::move(matches)));
   }
 
   nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads, bool facing) const {
@@ -476,8 +476,9 @@ nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, i
   const CoarseRule rule{passes, gate, fall, floor, beyond, facing};
   {
     nb::gil_scoped_release release;
+    const CoarseScan scan(points.data(), (int64_t)points.shape(0));
     Team team(threads);
-    team.each((int64_t)n, [&](int64_t k) { cost[k] = field.refine(code(false), points.data(), (int64_t)points.shape(0), rule, T + 16 * k); });
+    team.each((int64_t)n, [&](int64_t k) { cost[k] = field.refine(code(false), scan, rule, T + 16 * k); });
   }
   return nb::make_tuple(poses, costs);
 }

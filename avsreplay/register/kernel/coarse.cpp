@@ -50,8 +50,6 @@ void turn(const double* d, double* D) {
 
 Field::Field(const double* points, const double* normals, int64_t n, int across)
     : samples_((size_t)n) {
-  for (int64_t k = 0; k < 3 * n; ++k)
-    samples_[(size_t)(k / 3)].p[k % 3] = (float)points[k], samples_[(size_t)(k / 3)].n[k % 3] = (float)normals[k];
   double high[3];
   for (int a = 0; a < 3; ++a) {
     low_[a] = high[a] = points[a];
@@ -67,7 +65,10 @@ Field::Field(const double* points, const double* normals, int64_t n, int across)
   for (int a = 0; a < 3; ++a) {
     low_[a] -= MARGIN * extent;
     size_[a] = (int64_t)std::ceil((high[a] + MARGIN * extent - low_[a]) / cell_);
+    middle_[a] = low_[a] + 0.5 * (double)size_[a] * cell_;
   }
+  for (int64_t k = 0; k < 3 * n; ++k)
+    samples_[(size_t)(k / 3)].p[k % 3] = (float)(points[k] - middle_[k % 3]), samples_[(size_t)(k / 3)].n[k % 3] = (float)normals[k];
   cells_.resize((size_t)(size_[0] * size_[1] * size_[2]));
   for (int64_t k = 0; k < n; ++k) {
     int64_t c[3];
@@ -78,7 +79,8 @@ Field::Field(const double* points, const double* normals, int64_t n, int across)
 }
 
 Vec3 Field::middle(int64_t x, int64_t y, int64_t z) const {
-  return {low_[0] + ((double)x + 0.5) * cell_, low_[1] + ((double)y + 0.5) * cell_, low_[2] + ((double)z + 0.5) * cell_};
+  const double half[3] = {0.5 * (double)size_[0], 0.5 * (double)size_[1], 0.5 * (double)size_[2]};
+  return {((double)x + 0.5 - half[0]) * cell_, ((double)y + 0.5 - half[1]) * cell_, ((double)z + 0.5 - half[2]) * cell_};
 }
 
 double Field::squared(int16_t id, const Vec3& p) const {
@@ -123,19 +125,29 @@ void Field::sweep(int sx, int sy, int sz) {
       }
 }
 
-double Field::refine(const Code& code, const double* points, int64_t m, const CoarseRule& rule, double* T) const {
-  FieldTable table{samples_.data(), cells_.data(), {low_[0], low_[1], low_[2]}, {}, cell_, {size_[0], size_[1], size_[2]}};
-  for (int a = 0; a < 3; ++a) table.middle[a] = 0.5 * (low_[a] + low_[a] + (double)size_[a] * cell_);
-  const double* c = table.middle;
-  const int64_t padded = (m + 3) / 4 * 4;
-  std::vector<double> scan((size_t)(3 * padded));
-  for (int64_t k = 0; k < 3 * m; ++k) scan[(size_t)(k % 3 * padded + k / 3)] = points[k];
+CoarseScan::CoarseScan(const double* from, int64_t n) : points(n), padded((n + 7) / 8 * 8), mean{0, 0, 0} {
+  x.resize((size_t)(3 * padded));
+  for (int64_t k = 0; k < 3 * n; ++k) mean[k % 3] += from[k];
+  for (double& m : mean) m /= (double)std::max<int64_t>(n, 1);
+  for (int64_t k = 0; k < n; ++k)
+    for (int64_t a = 0; a < 3; ++a) x[(size_t)(a * padded + k)] = (float)(from[3 * k + a] - mean[a]);
+}
+
+double Field::refine(const Code& code, const CoarseScan& scan, const CoarseRule& rule, double* T) const {
+  const FieldTable table{samples_.data(), cells_.data(), {(float)(low_[0] - middle_[0]), (float)(low_[1] - middle_[1]), (float)(low_[2] - middle_[2])},
+                         (float)cell_, {(int32_t)size_[0], (int32_t)size_[1], (int32_t)size_[2]}};
+  const double *c = middle_, *q = scan.mean;
   double gate = rule.gate, cost = 1;
   for (int pass = 0; pass <= rule.passes; ++pass) {
     const bool last = pass == rule.passes;  // gives the cost only
+    float moved[12], eye[3];
+    for (int a = 0; a < 3; ++a) {
+      for (int b = 0; b < 3; ++b) moved[4 * a + b] = (float)T[4 * a + b];
+      moved[4 * a + 3] = (float)(dot(T + 4 * a, q) + T[4 * a + 3] - c[a]), eye[a] = (float)(T[4 * a + 3] - c[a]);
+    }
     FieldSums sums;
-    code.field_pass(table, {scan.data(), m, padded, T, gate, rule.beyond, rule.facing, last}, sums);
-    cost = sums.unexplained / (double)std::max<int64_t>(m, 1);
+    code.field_pass(table, {scan.x.data(), scan.points, scan.padded, moved, eye, (float)gate, (float)rule.beyond, rule.facing, last}, sums);
+    cost = sums.unexplained / (double)std::max<int64_t>(scan.points, 1);
     if (last || sums.matched < (double)LEAST_MATCHED) break;
     double H[6][6], *b = sums.gradient;
     for (int i = 0, t = 0; i < 6; ++i)

@@ -15,6 +15,14 @@ struct CoarseRule {
   bool facing;                  // only sampled points that face the origin of the scan
 };
 
+// A scan as the passes read it: (3, padded) relative to its mean.
+struct CoarseScan {
+  CoarseScan(const double* points, int64_t n);
+  std::vector<float> x;
+  int64_t points, padded;
+  double mean[3];
+};
+
 // A grid around the model. Each cell holds the sampled point nearest to its middle, and the nearest of those whose normal
 // is opposite to that one's: with a thin panel these are its two sides. Looking one up replaces a search, and is wrong by
 // at most a cell.
@@ -25,8 +33,8 @@ class Field {
   // n <= MOST points and unit normals. `across`: cells along the diagonal of the points' box.
   Field(const double* points, const double* normals, int64_t n, int across);
 
-  // Refines `T` (rows of [R t]) by point-to-plane passes over m points; returns the mean of min(1, d^2 / beyond^2).
-  double refine(const Code& code, const double* points, int64_t m, const CoarseRule& rule, double* T) const;
+  // Refines `T` (rows of [R t]) by point-to-plane passes; returns the mean of min(1, d^2 / beyond^2).
+  double refine(const Code& code, const CoarseScan& scan, const CoarseRule& rule, double* T) const;
 
  private:
   Vec3 middle(int64_t x, int64_t y, int64_t z) const;
@@ -36,7 +44,7 @@ class Field {
 
   std::vector<FieldSample> samples_;
   std::vector<FieldCell> cells_;
-  double low_[3], cell_;
+  double low_[3], middle_[3], cell_;
   int64_t size_[3];
 };
 

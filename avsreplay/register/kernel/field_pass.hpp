@@ -1,82 +1,101 @@
-// One pass of the coarse registration, four points at a time. Included inside a namespace named after the instruction set.
+// One pass of the coarse registration, eight points at a time. Included inside a namespace named after the instruction set.
+// Single precision suffices: all places are relative to the middle of the grid or of the scan.
 
-// The sampled points of the cells of four moved points; a lane without one has `none` 1. Where only samples that face the
+// The sampled points of the cells of eight moved points; a lane without one has `none` 1. Where only samples that face the
 // eye count, the second of a cell is taken if the first does not.
 struct FieldMatch {
-  D4 s[3], n[3], none;
+  F8 s[3], n[3], none;
 };
 
-static inline const FieldCell& field_cell(const FieldTable& f, const double* place) {
-  int64_t at[3];
-  for (int a = 0; a < 3; ++a) at[a] = place[a] > 0 ? (place[a] < (double)f.size[a] ? (int64_t)place[a] : f.size[a] - 1) : 0;
-  return f.cells[(at[0] * f.size[1] + at[1]) * f.size[2] + at[2]];
+// The number of the cell of each place, in cells from the corner of the grid.
+static inline void field_cells(const FieldTable& f, const F8 (&place)[3], int32_t (&cell)[8]) {
+  F8 at[3];
+  for (int a = 0; a < 3; ++a) at[a] = clamp8(place[a], f8(0.f), f8((float)f.size[a] - 1.f));
+#if AVS_VECTORS && defined(__AVX2__)
+  const __m256i x = _mm256_cvttps_epi32((__m256)at[0].v), y = _mm256_cvttps_epi32((__m256)at[1].v), z = _mm256_cvttps_epi32((__m256)at[2].v);
+  const __m256i row = _mm256_add_epi32(_mm256_mullo_epi32(x, _mm256_set1_epi32(f.size[1])), y);
+  const __m256i number = _mm256_add_epi32(_mm256_mullo_epi32(row, _mm256_set1_epi32(f.size[2])), z);
+  std::memcpy(cell, &number, sizeof number);
+#else
+  float x[8], y[8], z[8];
+  store8(x, at[0]), store8(y, at[1]), store8(z, at[2]);
+  for (int k = 0; k < 8; ++k) cell[k] = ((int32_t)x[k] * f.size[1] + (int32_t)y[k]) * f.size[2] + (int32_t)z[k];
+#endif
 }
 
-static inline FieldMatch field_samples(const FieldTable& f, const int16_t (&id)[4]) {
-  const FieldSample* s[4];
-  double none[4];
-  for (int k = 0; k < 4; ++k) s[k] = f.samples + (id[k] < 0 ? 0 : id[k]), none[k] = id[k] < 0;
+static inline FieldMatch field_samples(const FieldTable& f, const int32_t (&id)[8]) {
   FieldMatch m;
-  for (int a = 0; a < 3; ++a) {
-    m.s[a] = d4(s[0]->p[a], s[1]->p[a], s[2]->p[a], s[3]->p[a]);
-    m.n[a] = d4(s[0]->n[a], s[1]->n[a], s[2]->n[a], s[3]->n[a]);
+  float none[8];
+  int32_t from[8];
+  for (int k = 0; k < 8; ++k) none[k] = id[k] < 0 ? 1.f : 0.f, from[k] = id[k] < 0 ? 0 : id[k];
+  m.none = load8(none);
+#if AVS_VECTORS && defined(__AVX2__)
+  // A transpose of eight rows; a gather is slower.
+  __m256 r[8], t[8];
+  for (int k = 0; k < 8; ++k) r[k] = _mm256_load_ps(f.samples[from[k]].p);
+  for (int k = 0; k < 8; k += 2) t[k] = _mm256_unpacklo_ps(r[k], r[k + 1]), t[k + 1] = _mm256_unpackhi_ps(r[k], r[k + 1]);
+  for (int k = 0; k < 8; k += 4) {
+    r[k] = _mm256_shuffle_ps(t[k], t[k + 2], 0x44), r[k + 1] = _mm256_shuffle_ps(t[k], t[k + 2], 0xee);
+    r[k + 2] = _mm256_shuffle_ps(t[k + 1], t[k + 3], 0x44);
   }
-  m.none = load4(none);
+  // The halves of a row are the place and the normal.
+  for (int a = 0; a < 3; ++a) {
+    m.s[a] = {(F8::Raw)_mm256_permute2f128_ps(r[a], r[4 + a], 0x20)};
+    m.n[a] = {(F8::Raw)_mm256_permute2f128_ps(r[a], r[4 + a], 0x31)};
+  }
+#else
+  float at[6][8];
+  for (int k = 0; k < 8; ++k)
+    for (int a = 0; a < 3; ++a) at[a][k] = f.samples[from[k]].p[a], at[3 + a][k] = f.samples[from[k]].n[a];
+  for (int a = 0; a < 3; ++a) m.s[a] = load8(at[a]), m.n[a] = load8(at[3 + a]);
+#endif
   return m;
 }
 
-static inline D4 dot3(const D4 (&a)[3], const D4 (&b)[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static inline F8 dot3(const F8 (&a)[3], const F8 (&b)[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 // 1 where there is no sampled point, or it does not face the eye.
-static inline D4 field_unseen(const FieldMatch& m, const D4 (&eye)[3]) {
-  const D4 towards[3] = {eye[0] - m.s[0], eye[1] - m.s[1], eye[2] - m.s[2]};
-  return select(d4(0) < dot3(m.n, towards), m.none, d4(1));
+static inline F8 field_unseen(const FieldMatch& m, const F8 (&eye)[3]) {
+  const F8 towards[3] = {eye[0] - m.s[0], eye[1] - m.s[1], eye[2] - m.s[2]};
+  return select(f8(0.f) < dot3(m.n, towards), m.none, f8(1.f));
 }
 
 static void field_pass(const FieldTable& f, const FieldLook& look, FieldSums& out) {
-  const double* T = look.T;
-  const D4 zero = d4(0), one = d4(1), eye[3] = {d4(T[3]), d4(T[7]), d4(T[11])}, per_cell = d4(1 / f.cell);
-  const D4 cell2 = d4(f.cell * f.cell), gate2 = d4(look.gate * look.gate), per_beyond2 = d4(1 / (look.beyond * look.beyond));
-  D4 a[29] = {};
-  for (int64_t i = 0; i < look.m; i += 4) {
-    const D4 x[3] = {load4(look.scan + i), load4(look.scan + look.m + i), load4(look.scan + 2 * look.m + i)};
-    D4 p[3];
-    double place[3][4];
+  const float* T = look.T;
+  const F8 zero = f8(0.f), one = f8(1.f), eye[3] = {f8(look.eye[0]), f8(look.eye[1]), f8(look.eye[2])}, per_cell = f8(1.f / f.cell);
+  const F8 cell2 = f8(f.cell * f.cell), gate2 = f8(look.gate * look.gate), per_beyond2 = f8(1.f / (look.beyond * look.beyond));
+  F8 a[29];
+  for (F8& sum : a) sum = zero;
+  for (int64_t i = 0; i < look.m; i += 8) {
+    const F8 x[3] = {load8(look.scan + i), load8(look.scan + look.m + i), load8(look.scan + 2 * look.m + i)};
+    F8 p[3], place[3];
     for (int k = 0; k < 3; ++k) {
-      p[k] = d4(T[4 * k]) * x[0] + d4(T[4 * k + 1]) * x[1] + d4(T[4 * k + 2]) * x[2] + d4(T[4 * k + 3]);
-      store4(place[k], (p[k] - d4(f.low[k])) * per_cell);
+      p[k] = f8(T[4 * k]) * x[0] + f8(T[4 * k + 1]) * x[1] + f8(T[4 * k + 2]) * x[2] + f8(T[4 * k + 3]);
+      place[k] = (p[k] - f8(f.low[k])) * per_cell;
     }
-    const FieldCell* cell[4];
-    int16_t id[4];
-    for (int k = 0; k < 4; ++k) {
-      const double at[3] = {place[0][k], place[1][k], place[2][k]};
-      cell[k] = &field_cell(f, at), id[k] = i + k < look.points ? cell[k]->front : (int16_t)-1;
-    }
+    int32_t cell[8], id[8];
+    field_cells(f, place, cell);
+    for (int k = 0; k < 8; ++k) id[k] = i + k < look.points ? f.cells[cell[k]].front : -1;
     FieldMatch m = field_samples(f, id);
     if (look.facing) {
-      const D4 unseen = field_unseen(m, eye);
-      if (any(m.none < unseen)) {
-        double other[4];
-        store4(other, unseen - m.none);
-        for (int k = 0; k < 4; ++k)
-          if (other[k] > 0) id[k] = cell[k]->back;
+      const F8 unseen = field_unseen(m, eye);
+      if (unsigned other = bits(m.none < unseen)) {
+        for (; other; other &= other - 1) id[lowest_bit(other)] = f.cells[cell[lowest_bit(other)]].back;
         m = field_samples(f, id);
         m.none = field_unseen(m, eye);
       }
     }
-    const D4 d[3] = {m.s[0] - p[0], m.s[1] - p[1], m.s[2] - p[2]}, e = dot3(m.n, d), e2 = e * e;
-    const D4 rest = dot3(d, d) - e2 - cell2, d2 = e2 + select(zero < rest, rest, zero), cost = d2 * per_beyond2;
-    const D4::Mask found = m.none < one;
-    double share[4];
-    store4(share, select(both(found, cost < one), cost, one));
-    for (int k = 0; k < 4; ++k)
-      if (i + k >= look.points) share[k] = 0;
-    a[0] = a[0] + load4(share);
+    const F8 d[3] = {m.s[0] - p[0], m.s[1] - p[1], m.s[2] - p[2]}, e = dot3(m.n, d), e2 = e * e;
+    const F8 d2 = e2 + max8(dot3(d, d) - e2 - cell2, zero), cost = d2 * per_beyond2;
+    const F8::Mask found = m.none < one;
+    F8 share = select(both(found, cost < one), cost, one);
+    if (i + 8 > look.points) share = select(expand(0xffu >> (8 - (look.points - i))), share, zero);
+    a[0] = a[0] + share;
     if (look.cost_only) continue;
-    const D4::Mask in = both(found, d2 < gate2);
-    D4 n[3], r[3];
-    for (int k = 0; k < 3; ++k) n[k] = select(in, m.n[k], zero), r[k] = p[k] - d4(f.middle[k]);
-    const D4 j[6] = {r[1] * n[2] - r[2] * n[1], r[2] * n[0] - r[0] * n[2], r[0] * n[1] - r[1] * n[0], n[0], n[1], n[2]};
+    const F8::Mask in = both(found, d2 < gate2);
+    F8 n[3];
+    for (int k = 0; k < 3; ++k) n[k] = select(in, m.n[k], zero);
+    const F8 j[6] = {p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0], n[0], n[1], n[2]};
     a[1] = a[1] + select(in, one, zero);
     int t = 2;
     for (int row = 0; row < 6; ++row)

@@ -29,7 +29,7 @@ struct Look {
 
 // Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
 //   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches made, [4..6] sum p,
-//           [50] blocks and nodes of the tree that the searches compared
+//           [50] blocks and nodes of the tree that were compared
 //   point:  [7..9] sum foot, [10..18] sum p foot', row by row
 //   newton: those, [19..39] lower triangle of sum sign J'J with v in the place of n, [40] sum whole, [41..43] sum whole p,
 //           [44..49] lower triangle of sum whole p p'; see Stiffness
@@ -75,9 +75,9 @@ struct Near {
   uint32_t block, steps;
 };
 
-// The points sampled from a model and the grid around it, see `Field`.
-struct FieldSample {
-  float p[3], n[3];
+// The points sampled from a model and the grid around it, see `Field`; all places are relative to its middle.
+struct alignas(32) FieldSample {
+  float p[3], rest = 0, n[3], end = 0;
 };
 struct FieldCell {
   int16_t front = -1, back = -1;
@@ -85,20 +85,21 @@ struct FieldCell {
 struct FieldTable {
   const FieldSample* samples;
   const FieldCell* cells;
-  double low[3], middle[3], cell;
-  int64_t size[3];
+  float low[3], cell;
+  int32_t size[3];
 };
 
-// One pass over m points of a scan, (3, m) with m a multiple of four; those from `points` on are padding.
+// One pass over m points of a scan, (3, m) with m a multiple of eight; those from `points` on are padding.
 struct FieldLook {
-  const double* scan;
+  const float* scan;
   int64_t points, m;
-  const double* T;
-  double gate, beyond;
+  const float* T;    // rows of [R t] to places relative to the middle
+  const float* eye;  // the same
+  float gate, beyond;
   bool facing, cost_only;
 };
 
-// Sum of min(1, d^2 / beyond^2); matched points, lower triangle of J'J and J'e with J = [r x n, n], r from the middle.
+// Sum of min(1, d^2 / beyond^2); matched points, lower triangle of J'J and J'e with J = [p x n, n].
 struct FieldSums {
   double unexplained, matched, info[21], gradient[6];
 };

@@ -247,6 +247,14 @@ static inline double sum_in_order(D4 a) {
   return ((t[0] + t[1]) + t[2]) + t[3];
 }
 
+static inline double sum_in_order(F8 a) {
+  float t[8];
+  store8(t, a);
+  double sum = 0;
+  for (const float x : t) sum += (double)x;
+  return sum;
+}
+
 static inline int lowest_bit(unsigned m) {
 #if defined(__GNUC__)
   return __builtin_ctz(m);
