@@ -215,8 +215,7 @@ class Fit:
 
     Attributes:
         T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.  converged: its own flag.
-        matches: ``IcpResult.matches`` of the last pass, None if there is none; saves time, never changes a result.
-        work: counted in ordinary point searches; 0 if the back end does not count it.
+        matches: of ``IcpResult`` or None.  work: in point searches, 0: unknown.  rough: of a part of the scan only.
     """
 
     T_ca: Pose
@@ -224,6 +223,7 @@ class Fit:
     converged: bool
     matches: Any = None
     work: int = 0
+    rough: bool = False
 
 
 @value_class

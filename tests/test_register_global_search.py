@@ -17,8 +17,7 @@ from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar, global_search
-from avsreplay.register.backend import healthy_work
-from avsreplay.register.budget import HEALTHY_SCANS
+from avsreplay.register.budget import HEALTHY_SCANS, healthy_work
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import (
     Candidate,
@@ -141,7 +140,7 @@ def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypat
     found = registrar.acquire(scan)
     assert not found.measured
     assert found.status is AlignStatus.BUDGET_EXHAUSTED
-    assert sum(spent) <= HEALTHY_SCANS * healthy_work(len(scan))
+    assert sum(spent) <= HEALTHY_SCANS * healthy_work(len(scan), registrar._target.near_work)
 
 
 # --- the parts
@@ -340,7 +339,7 @@ def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
         points = scenes.view(scenes.grown(wedge, bracket.extent / wedge.extent), 2000, seed).points
         found = registrar.acquire(points)
         assert found.inlier_ratio > 0.95
-        assert found.status in (AlignStatus.IMPLAUSIBLE, AlignStatus.BUDGET_EXHAUSTED)
+        assert found.status in (AlignStatus.IMPLAUSIBLE, AlignStatus.AMBIGUOUS, AlignStatus.BUDGET_EXHAUSTED)
 
 
 def _mesh(body: trimesh.Trimesh) -> Surface:
@@ -365,7 +364,7 @@ def test_a_search_ends_only_with_a_pose_that_little_contradicts(monkeypatch: pyt
     """A displaced pose of a plate with holes has 95 % of its points on the model and the score 0.34."""
     surface = boxes()
     T_ac = example_pose()
-    points = T_ac.apply(view(surface, 1500, T_ac.inverse().t))
+    points = T_ac.apply(view(surface, 12_000, T_ac.inverse().t))
     registrar, numbers = Registrar(surface), list[int]()
     searched = GlobalSearch.search
 

@@ -12,8 +12,7 @@ from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Effort, Registrar, effort_after
-from avsreplay.register.backend import healthy_work
-from avsreplay.register.budget import HEALTHY_SCANS, Budget
+from avsreplay.register.budget import END_WORK, HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.sampling import segments, without_scattered_points
@@ -174,13 +173,55 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 
 def test_the_budget_counts_work() -> None:
-    budget = Budget(3000)
-    budget.spend(HEALTHY_SCANS * healthy_work(3000) - 500)
+    budget = Budget(20_000)
+    budget.spend(HEALTHY_SCANS * 20_000 - END_WORK - 500)
     assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
     assert budget.allows(500)
     assert not budget.exhausted
     assert not budget.allows(501)
     assert budget.exhausted
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+@pytest.mark.parametrize("scene", ["clutter", "outliers", "another body", "plane"])
+def test_no_scan_costs_more_than_twenty_ordinary_registrations(
+    registrar: Registrar, surface: Surface, monkeypatch: pytest.MonkeyPatch, scene: str, guessed: bool
+) -> None:
+    """Of the last step, too: it is counted how much each scan takes in all, whatever its result is."""
+    spent, spend, rng, T_ac = [0], Budget.spend, np.random.default_rng(SEED), example_pose()
+
+    def counted(self: Budget, searches: int) -> None:
+        spent[0] += searches
+        spend(self, searches)
+
+    monkeypatch.setattr(Budget, "spend", counted)
+    scan, middle = hidden_view(surface, T_ac, 2500, rng), T_ac.t
+    if scene == "outliers":
+        scan[rng.random(len(scan)) < 0.6] += rng.uniform(-2.0, 2.0, 3)
+    elif scene != "clutter":
+        flat = 0.0 if scene == "plane" else 1.0
+        scan = middle + rng.uniform(-1.5, 1.5, (2500, 3)) * [1.0, 1.0, flat]
+    else:
+        scan = np.vstack([scan, middle + rng.uniform(-2.0, 2.0, (2500, 3)) * [1.0, 0.05, 1.0]])
+    turned = T_ac @ Pose(exp([0.5, 0.3, -0.4]), np.array([0.1, 0.0, 0.05]))
+    registrar.register(scan, turned) if guessed else registrar.acquire(scan)
+    assert 0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(scan), registrar._target.near_work)
+
+
+def test_an_ordinary_registration_costs_about_what_is_assumed(
+    registrar: Registrar, surface: Surface, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spent, spend, T_ac = [0], Budget.spend, example_pose()
+
+    def counted(self: Budget, searches: int) -> None:
+        spent[0] += searches
+        spend(self, searches)
+
+    monkeypatch.setattr(Budget, "spend", counted)
+    scan = hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED))
+    found = registrar.register(scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0])))
+    assert found.status is AlignStatus.ALIGNED
+    assert 0.8 < spent[0] / healthy_work(len(scan), registrar._target.near_work) < 2.0
 
 
 def test_searches_become_rare_where_none_finds_a_pose() -> None:

@@ -10,7 +10,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import Registrar
-from avsreplay.register.budget import Budget
+from avsreplay.register.budget import Budget, healthy_work
 from avsreplay.register.quality import left_undetermined
 
 
@@ -120,4 +120,4 @@ def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most
     assert symmetry.marked
     assert len(symmetry._marks) > 400
     assert sum(len(motions) for motions in symmetry._kinds) > 100
-    assert symmetry.search_work(points, 0) < 0.9 * Budget(points).left
+    assert symmetry.search_work(points, 0) < 0.9 * Budget(healthy_work(points, symmetry._target.near_work)).left

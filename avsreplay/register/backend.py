@@ -36,12 +36,11 @@ CLOUD_PLANE_PASSES = 30  # point-to-plane passes of a second alignment to a mode
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
+SETTLED, RADIUS_OF_EXTENT = 0.05, 0.25  # of the rejection distance over the root of the points; usual rms radius
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
 ROUGH_OF_GATE = 0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-HEALTHY_WORK, HEALTHY_PASSES = 17_000, 2.5  # an ordinary registration: point searches in all, and besides per point
-FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
-ALIGN_WORK, WITHIN_WORK = (40_000, 15), (30_000, 15)  # most work of an alignment (fixed, per point); with a fixed gate
+ALIGN_WORK, WITHIN_WORK = (20_000, 8), (30_000, 15)  # most work of an alignment (fixed, per point); with a fixed gate
 
 
 @value_class
@@ -53,12 +52,14 @@ class Target:
         index: exact closest points on this surface.
         limits: rejection distances and stopping rule.
         visibility: which faces the camera can have measured.
+        near_work: cost of a search near this surface in point searches, see ``budget.near_work``.
     """
 
     surface: Surface
     index: SurfaceIndex
     limits: RegistrationLimits
     visibility: Visibility
+    near_work: float = 1.0
 
 
 class Backend(Protocol):
@@ -157,7 +158,12 @@ class HornBackend:
         rule = self._rules[False]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
         within: dict[str, Any] = {"n_max": most, "n_plane": plane, "few": few, "tighten": 0.0}
-        within.update(gate_m=gate_m, floor_m=gate_m)
+        # A third of the rejection distance is the noise; a small share of the error that it leaves need not be reached.
+        error = SETTLED * gate_m / np.sqrt(max(len(points), 1))
+        limits, rad = self._rules[False], error / (RADIUS_OF_EXTENT * self._index.extent_m)
+        within.update(
+            gate_m=gate_m, floor_m=gate_m, eps_m=max(limits.eps_m or 0.0, error), eps_rad=max(limits.eps_rad, rad)
+        )
         most_work = max(1, min(most_work, _most(WITHIN_WORK, len(points))))
         return self._run(points, guess, lambda facing: replace(self._rules[facing], **within), most_work)
 
@@ -167,14 +173,10 @@ class HornBackend:
 
         def align(start: Pose, facing: bool) -> Fit:
             found = self._index.icp(points, start, rules(facing), most)
-            return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches, found.work)
+            T_ca, rough = Pose.from_matrix(found.T_ca), found.matches is None
+            return Fit(T_ca, found.iterations, found.converged, found.matches, found.work, rough)
 
         return self._visibility.consistent(self._index, points, guess, align)
-
-
-def healthy_work(points: int) -> int:
-    """Return the work of an ordinary registration of a scan of so many points, in point searches."""
-    return HEALTHY_WORK + int(HEALTHY_PASSES * max(points, LEAST_POINTS))
 
 
 def _most(work: tuple[int, int], points: int) -> int:

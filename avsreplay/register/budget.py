@@ -4,16 +4,57 @@ from __future__ import annotations
 
 from enum import Enum
 
-from avsreplay.records import Alignment, Fit
-from avsreplay.register.backend import FIXED_WORK, healthy_work
+import numpy as np
 
+from avsreplay.geometry import Pose
+from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.register.backend import LEAST_POINTS
+from avsreplay.register.sampling import sample
+from avsreplay.register.surface_index import SurfaceIndex
+
+HEALTHY_FIXED, HEALTHY_SEARCHED = (4200, 0.8), (7000, 1.3)  # an ordinary registration: work, and searches (per point)
+GRADE_WORK, POINTS_GRADED = 8000, 2  # the quality of a pose: point searches in all, and points of which each takes one
+NEAR_POINTS, NEAR_OF_EXTENT = 500, 0.002  # points with the noise of an ordinary scan that show the cost of a search
 LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
-SCATTER_WORK = 10  # cost per point of leaving out scattered points
-TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size
-PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
+SCATTER_WORK = 3, 7  # cost per point of finding whether points are scattered, and of leaving them out
+TEST_WORK, SIZE_WORK = 15_000, 15_000  # cost of a test of a pose, and of fitting the size [point searches]
+STRUCTURE_WORK, FREE_WORK = 3000, 8000  # cost of the residuals that neighbours share, and of free directions
+STAGE_WORK, CALL_WORK = 1200, 600  # cost in the interpreter of a stage of a restart, and of measuring a pose
+LAST_WORK = 30_000  # cost of registering a scan once more from its pose, and of the test of the result
+BIAS_WORK = 16_000  # cost of a simulation for the bias of the noise, and of what is measured before or after it
+END_WORK = SIZE_WORK + BIAS_WORK  # cost of what follows the last pose: its size and the bias of its noise
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
+
+
+def healthy_work(points: int, near: float) -> int:
+    """Return the work of an ordinary registration of a scan, in point searches.
+
+    Args:
+        points: of the scan.
+        near: cost of a search near the model, see ``near_work``.
+    """
+    n, (fixed, each), (searches, passes) = max(points, LEAST_POINTS), HEALTHY_FIXED, HEALTHY_SEARCHED
+    return int(fixed + each * n + near * (searches + passes * n))
+
+
+def near_work(surface: Surface, index: SurfaceIndex) -> float:
+    """Return the cost of a search near a surface, in units of an ordinary one: it depends on the size of the faces.
+
+    Args:
+        surface: mesh or cloud.
+        index: of it.
+    """
+    points, normals = sample(surface, NEAR_POINTS)
+    points = points[:: max(1, len(points) // NEAR_POINTS)]
+    near = points + NEAR_OF_EXTENT * index.extent_m * normals[: len(points)]
+    return index.distances(near, Pose.identity(), np.inf, False, 1, 0.0)[1] / len(near)
+
+
+def grade_work(points: int) -> int:
+    """Return the work of the quality of a pose of a scan of so many points, in point searches."""
+    return GRADE_WORK + points // POINTS_GRADED
 
 
 class Effort(Enum):
@@ -45,22 +86,39 @@ def effort_after(failed: int) -> Effort:
 class Budget:
     """Point searches left for one scan: counted work, so that results do not depend on the machine.
 
+    ``END_WORK`` is kept for what follows the last pose.
+
     Args:
-        points: points of the scan.
+        healthy: work of an ordinary registration of the scan.
+
+    Attributes:
+        healthy: as given.
+        left: searches that are left besides what is kept, negative by what follows the last pose.
+        exhausted: a step was not made for want of work.
     """
 
-    def __init__(self, points: int) -> None:
-        self.left = HEALTHY_SCANS * healthy_work(points)
+    def __init__(self, healthy: int) -> None:
+        self.healthy = healthy
+        self.left = HEALTHY_SCANS * healthy - END_WORK
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
         """Subtract work that was done."""
         self.left -= searches
 
-    def registered(self, fit: Fit, found: Alignment) -> None:
-        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated."""
+    def registered(self, fit: Fit, found: Alignment, graded: int) -> None:
+        """Subtract the work of an alignment, estimated if not counted, and of its quality by ``graded`` points."""
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK)
+        free = FREE_WORK + found.points if found.status is AlignStatus.DEGENERATE else 0
+        self.spend((fit.work or fit.iterations * found.points * share) + grade_work(graded) + free)
+
+    def for_alignment(self, points: int) -> int:
+        """Return the searches that an alignment may take, so that its pose can be graded and tested."""
+        return max(1, self.left - grade_work(points) - TEST_WORK)
+
+    def allows_at_the_end(self, searches: int) -> bool:
+        """Return whether this much work is left for what follows the last pose."""
+        return searches <= self.left + END_WORK
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""

@@ -44,10 +44,10 @@ REFINED_POINTS = 500  # fine points with which the last poses are registered
 STOP_RAD, STOP_OF_EXTENT = 1e-4, 1e-4  # a pass that moves the pose by less ends a registration, as poses are compared
 FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS, ROUND_WORK = 4, 35_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
+LOOK_UPS, ROUND_WORK = 6, 28_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
 SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
-REGISTERED_SHARE, FAR = 0.7, 1.5  # of the work left, for the last poses; time of a search at wrong poses over others
-APART, REGISTERED_WORK = 0.6, 40  # usual share of different starts; usual cost of the last poses for each fine point
+REGISTERED_SHARE, REGISTERED_WORK = 0.8, 10  # of the work left, for the last poses; usual cost for each fine point
+APART = 0.6  # usual share of different starts
 CELL_OF_EXTENT, LEAST_COSINE = 0.02, 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
 
@@ -247,8 +247,8 @@ class GlobalSearch:
         order = [k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER]
         last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
         ended = [self._ended(self._refine, part, found[k].T_ca, width_m, True) for k in last]
-        others = [found[k].T_ca for k in order if k not in last]
-        return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
+        best, others = [self._measured(fine, T_ca) for T_ca in ended], (found[k].T_ca for k in order if k not in last)
+        return best + [self._measured(fine, T_ca) for T_ca in others if self._spent < self._most], least
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different ones, not the identity."""
@@ -264,15 +264,15 @@ class GlobalSearch:
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
         distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)
-        self._spent += int(FAR * work)
+        self._spent += work
         return Candidate(T_ca, distance)
 
     def _ended(self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False) -> Pose:
         """The pose registered to the model; the pose itself where the work of the round is spent."""
         if self._spent >= self._most:
             return T_ca
-        fit = horn.align_within(points, T_ca, width_m, near)
-        self._spent += int(FAR * fit.work)
+        fit = horn.align_within(points, T_ca, width_m, near, most_work=self._most - self._spent)
+        self._spent += fit.work
         return fit.T_ca
 
     def _verdict(self, found: Sequence[Candidate]) -> SearchResult:

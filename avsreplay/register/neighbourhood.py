@@ -20,20 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
-from avsreplay.register.backend import HornBackend, Target
-from avsreplay.register.budget import FAR_WORK, MEASURED_WORK, SIZE_WORK, Budget
-from avsreplay.register.covariance import noise_along
+from avsreplay.register.backend import Target
+from avsreplay.register.budget import FAR_WORK, LAST_WORK, SIZE_WORK, Budget
 from avsreplay.register.degenerate import scaled_information
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
+from avsreplay.register.noise_bias import BIAS_POINTS, UNCERTAIN_CHI2, NoiseBias
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
-from avsreplay.register.surface_index import SurfaceIndex
 
 VALLEY_STEPS, VALLEY_POINTS = 8, 250  # steps of half a gate each way along the two least certain directions; points
-VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
+VALLEY_WORK = 16_000  # cost of the search along the valley
 POINTS, DIRECTIONS = 300, 3  # points that are registered from displaced poses; directions, each both ways
 DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, is not compared; usual rms radius
@@ -44,11 +42,6 @@ NOT_FOUND = "no pose of the model explains the scan, and no work is left for a l
 NOT_COMPARED = "no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
 BIAS_OF_GATE = 0.2  # with a smaller rms distance, in gates, the bias of the noise is not significant
-BIAS_POINTS = 1000  # points of the simulated scan that gives the bias of the noise
-LEAST_FOR_BIAS = 30  # with fewer rays that meet the model no scan is simulated
-UNCERTAIN_CHI2 = 4.0  # 6 unknowns less 2: the part of an estimated bias that chance explains
-CREDIBLE = 3.0  # standard deviations beyond which a point is not one of the model with noise
-BIAS_ROUNDS, SMALL_STEP = 2, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
 
 
@@ -57,7 +50,7 @@ class Neighbourhood:
 
     def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter) -> None:
         self._target, self._test, self._restarter = target, test, restarter
-        self._extent, self._horn = target.surface.extent, HornBackend(target)
+        self._extent, self._noise = target.surface.extent, NoiseBias(target, restarter)
 
     def best(
         self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
@@ -103,9 +96,9 @@ class Neighbourhood:
             The result itself where only faces towards the camera are matched, where its distances are too large for any
             pose to be accepted, or where no work is left.
         """
-        at, target = self._restarter.measure(points, T_ca), self._target
+        at, target = self._restarter.measure(points, T_ca, budget), self._target
         known = target.visibility.camera_c(target.index, points, T_ca) is not None
-        if known or at.noise_m > NOISE_OF_EXTENT * self._extent or self._minima_work > budget.left:
+        if known or at.noise_m > NOISE_OF_EXTENT * self._extent or self._minima_work + LAST_WORK > budget.left:
             return at
         return self._restarter.least(self._minima(points, T_ca, DIRECTIONS, budget))
 
@@ -123,7 +116,7 @@ class Neighbourhood:
     def _minima(self, points: NDArray[Any], T_ca: Pose, count: int, budget: Budget) -> list[Restart]:
         """The pose, and those registered from poses displaced towards the camera and along ``count`` directions."""
         few = points[:: max(1, len(points) // POINTS)]
-        found, weak = [self._restarter.measure(points, T_ca)], self._weak(few, T_ca, count)
+        found, weak = [self._restarter.measure(points, T_ca, budget)], self._weak(few, T_ca, count, budget)
         if weak is None:
             return found
         centre, radius, directions = weak[:3]
@@ -131,8 +124,7 @@ class Neighbourhood:
         for x in DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions]):
             start = _displaced(T_ca, centre, radius, x)
             ended = self._restarter.graduated(few, start, self._restarter.narrow_m, budget)
-            found.append(self._restarter.measure(points, ended.T_ca))
-            budget.spend(MEASURED_WORK * len(points))
+            found.append(self._restarter.measure(points, ended.T_ca, budget))
         return found
 
     def with_size(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
@@ -180,7 +172,7 @@ class Neighbourhood:
         if P is None or found.rms_m <= BIAS_OF_GATE * self._target.limits.gate_m:
             return found
         few = scan[:: max(1, len(scan) // BIAS_POINTS)]
-        b, better = self._bias(few, found.T_ac.inverse(), P, budget)
+        b, better = self._noise.bias(few, found.T_ac.inverse(), P, budget)
         x = max(float(b @ np.linalg.solve(P, b)), 1.0)
         s = max(0.0, 1.0 - UNCERTAIN_CHI2 / x) if better else 0.0
         wider = P + ((1.0 - s) ** 2 * (1.0 - 1.0 / x) + (0.5 * s) ** 2) * np.outer(b, b)
@@ -194,51 +186,6 @@ class Neighbourhood:
             found, message=f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma) only"
         )
 
-    def _bias(self, few: NDArray[Any], T_ca: Pose, P: Array, budget: Budget) -> tuple[Array, bool]:
-        """The mean error (6,) of a pose that the noise of its scan causes; whether the ranges fit better without it.
-
-        Sought is the true pose for which simulated scans are registered at this pose (indirect inference, as in
-        ``size.py``). A simulated scan has the points at which the rays meet the model at the true pose of the last
-        round, with normal noise along the rays, of both signs, so that what is linear in it cancels. The step of a
-        registration of these points from this pose corrects the true pose. The rounds end with a small step.
-
-        Args:
-            few: (n, 3) in {A} [m], part of the scan.
-            T_ca: registered pose.
-            P: (6, 6) its covariance.
-            budget: of the scan.
-
-        Returns:
-            d = [theta; v] in {C}, T_ac_true = T_ac Exp(d); zero with fewer than 30 rays that meet the model. The ranges
-            are not compared where chance explains d.
-        """
-        target, d = self._target, np.zeros(6)
-        width = self._restarter.width(self._restarter.measure(few, T_ca))
-        budget.spend(MEASURED_WORK * len(few))
-        camera_c = target.visibility.camera_c(target.index, few, T_ca)
-        p, back, true = T_ca.apply(few), T_ca.inverse(), Pose.identity()
-        first = _Noiseless.of(target.index, p, camera_c, true)
-        for k in range(BIAS_ROUNDS):
-            at = _Noiseless.of(target.index, p, camera_c, true.inverse()) if k else first
-            budget.spend(at.work)
-            if len(at.points) < LEAST_FOR_BIAS:
-                return np.zeros(6), False
-            noise = noise_along(at.rays, at.rays, np.full(len(at.rays), at.noise_m), np.ones(len(at.rays)))
-            moved = noise[:, None] * at.rays
-            simulated = back.apply(true.apply(np.concatenate([at.points + moved, at.points - moved])))
-            fit = self._horn.align_within(simulated, T_ca, width, near=True, most=1)
-            budget.spend(fit.work)
-            step = fit.T_ca @ back
-            true = step @ true
-            d, last = (np.concatenate([geometry.log(each.q), each.t]) for each in (true, step))
-            if last @ np.linalg.solve(P, last) < SMALL_STEP:
-                break
-        if d @ np.linalg.solve(P, d) <= UNCERTAIN_CHI2:
-            return d, False
-        at = _Noiseless.of(target.index, p, camera_c, true.inverse())
-        budget.spend(at.work)
-        return d, at.cost(first.noise_m) < first.cost(first.noise_m)
-
     def along_valley(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Pose | None:
         """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
 
@@ -250,11 +197,11 @@ class Neighbourhood:
         Returns:
             None if the work for the comparison is not left.
         """
-        if not budget.allows(VALLEY_WORK):
+        if not budget.allows(VALLEY_WORK + LAST_WORK):
             return None
         budget.spend(VALLEY_WORK)
         few, target = points[:: max(1, len(points) // VALLEY_POINTS)], self._target
-        weak = self._weak(few, T_ca, 2)
+        weak = self._weak(few, T_ca, 2, budget)
         if weak is None:
             return T_ca
         centre, radius, floor, at, camera_c = weak
@@ -269,7 +216,7 @@ class Neighbourhood:
         return _displaced(T_ca, centre, radius, tried[best]) if best else T_ca
 
     def _weak(
-        self, few: NDArray[Any], T_ca: Pose, count: int
+        self, few: NDArray[Any], T_ca: Pose, count: int, budget: Budget
     ) -> tuple[Array, float, Array, Restart, Array | None] | None:
         """Centroid and rms radius of the inliers, and the motions x (count, 6) that they determine least.
 
@@ -277,7 +224,8 @@ class Neighbourhood:
         with fewer than six inliers, which do not determine a pose.
         """
         target, gate = self._target, self._target.limits.gate_m
-        at, camera_c = self._restarter.measure(few, T_ca), target.visibility.camera_c(target.index, few, T_ca)
+        at = self._restarter.measure(few, T_ca, budget)
+        camera_c = target.visibility.camera_c(target.index, few, T_ca)
         on = at.distance < gate
         sums = target.index.normal_equations(few, T_ca, gate, facing=camera_c is not None)
         if min(sums.inliers, int(on.sum())) < 6:
@@ -285,46 +233,6 @@ class Neighbourhood:
         centre = T_ca.apply(few[on]).mean(axis=0)
         info, radius = scaled_information(sums.info, sums.inliers, centre)
         return centre, radius, np.linalg.eigh(info)[1][:, :count].T, at, camera_c
-
-
-@value_class
-class _Noiseless:
-    """The points of a scan as they would be without noise, at one pose.
-
-    Attributes:
-        points, rays: (k, 3) in {C} [m], where the rays meet the model, and their unit directions; without a camera the
-            closest points and their normals. Those of points that are farther than three sigma are left out.
-        off: (n,) distance of each measured point from there [m], infinite where there is none.
-        noise_m: robust standard deviation of these distances.  work: in point searches.
-    """
-
-    points: Array
-    rays: Array
-    off: Array
-    noise_m: float
-    work: int
-
-    @classmethod
-    def of(cls, index: SurfaceIndex, p: Array, camera_c: Array | None, T: Pose) -> _Noiseless:
-        """Look at points p (n, 3) in {C} that are moved by T with the camera (3,)."""
-        if camera_c is None:
-            found = index.closest(p)
-            on, rays, off, work = found.foot, found.normal, np.sqrt(found.d2), len(p)
-        else:
-            eye = T.apply(camera_c)
-            rays = T.apply(p) - eye
-            measured = np.linalg.norm(rays, axis=1)
-            rays /= measured[:, None]
-            ranges, work = index.cast(eye, rays)
-            on, off = eye + ranges[:, None] * rays, np.abs(ranges - measured)
-        met = np.isfinite(off)
-        noise = robust_noise(off[met]) if met.any() else 0.0
-        seen = off < CREDIBLE * noise
-        return cls(on[seen], rays[seen], off, noise, work)
-
-    def cost(self, noise_m: float) -> float:
-        """Return the mean squared distance from the points, in units of three sigma, at most 1 for each."""
-        return float(np.mean(np.minimum(self.off / (CREDIBLE * noise_m), 1.0) ** 2))
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:

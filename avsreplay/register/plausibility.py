@@ -252,7 +252,7 @@ class PlausibilityTest:
         spacing = float(np.median(tree.query(points[:: max(1, len(points) // SPACED)].copy(), k=2)[0][:, -1]))
         near = max(self._gate, 3.0 * noise, 3.0 * spacing)
         surface = T_ac.apply(self._points[expected])
-        supported = tree.query(surface)[0][:, 0] < near
+        supported = tree.query(surface, 1, 1.01 * near)[0][:, 0] < near
         missing = expected[~supported]
         passed, empty = rays.through(surface[~supported], 2.0 * near)
         held = int(np.count_nonzero(supported))

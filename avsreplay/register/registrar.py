@@ -14,14 +14,24 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
-from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
-from avsreplay.register.budget import LEAST_RATIO, SCATTER_WORK, TEST_WORK, Budget, Effort
+from avsreplay.register.backend import Target, create_backend, load_backend
+from avsreplay.register.budget import (
+    LAST_WORK,
+    LEAST_RATIO,
+    SCATTER_WORK,
+    TEST_WORK,
+    Budget,
+    Effort,
+    healthy_work,
+    near_work,
+)
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
+from avsreplay.register.grading import FAR_RAD, Grader
 from avsreplay.register.neighbourhood import NOT_COMPARED, NOT_FOUND, POSTPONED, Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.rivals import FAR_RAD, LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
+from avsreplay.register.rivals import LEAST_RAYS, NOT_TURNED, NOT_VERIFIED, TURNED_RAD, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, usable_points, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
@@ -57,11 +67,12 @@ class Registrar:
         self._visibility = Visibility(surface, self.params.camera, cache_dir)
         surface, self.sided = self._visibility.surface, self._visibility.sided
         self.index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
-        self._target = Target(surface, self.index, self.limits, self._visibility)
-        self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
+        near = near_work(surface, self.index)
+        self._target = Target(surface, self.index, self.limits, self._visibility, near)
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self.index, self._visibility, self.limits.gate_m)
         self._restarter = restarts.Restarter(self._target, self._test)
+        self._grader = Grader(self._target, self.params, self._backend, self._restarter)
         self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter)
 
     def register(
@@ -92,10 +103,10 @@ class Registrar:
         scan = usable_points(points, self.params.subsample_m)
         if refused := self._test.refused(scan, len(points), guess):
             return refused
-        halves, budget = seq % self.params.split_every == 0, Budget(len(scan))
+        halves, budget = seq % self.params.split_every == 0, Budget(healthy_work(len(scan), self._target.near_work))
         if effort is Effort.NONE or (effort is Effort.GUESS and not self._restarter.hopeful(scan, guess, budget)):
             return replace(quality.not_measured(len(scan), AlignStatus.BUDGET_EXHAUSTED, guess), message=POSTPONED)
-        first = self._graded(scan, guess, budget, None, halves, carried, rough=True)
+        first = self._grader.graded(scan, guess, budget, None, halves, carried, rough=True)
         if first.status is AlignStatus.FAILED:
             return first
         sound = self._restarter.sound(scan, first, budget)
@@ -124,7 +135,7 @@ class Registrar:
             return refused
         if effort is not Effort.FULL:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
-        budget = Budget(len(scan))
+        budget = Budget(healthy_work(len(scan), self._target.near_work))
         return self._neighbourhood.with_bias(scan, self._acquire(scan, budget, False), budget)
 
     def _acquire(
@@ -132,7 +143,7 @@ class Registrar:
     ) -> Alignment:
         """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
-        budget.spend(SCATTER_WORK * len(scan))
+        budget.spend(sum(SCATTER_WORK[: 2 if len(target) < len(scan) else 1]) * len(scan))
         few, results, doubt = self._restarter.part(target), list[Alignment](), list[bool]()
         none = quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse())
         whole: SearchResult | None = None
@@ -141,22 +152,23 @@ class Registrar:
                 break
             left = budget.left - self._symmetry.after_search(len(scan))
             search = self._symmetry.search.search(part, number, whole if part is target else None, known, left)
-            budget.spend(search.work + TEST_WORK + restarts.COMPARED_WORK)
+            budget.spend(search.work)
             whole = search if part is target else whole
             found, alone, doubtful = self._acquired(scan, part, search, budget, carried)
             results.append(found)
             doubt.append(doubtful)
             if found.status is AlignStatus.FAILED:
                 return found
-            fits = alone and not search.rivals and not self._restarter.misfit(few, found.T_ac.inverse())
+            fits = alone and not search.rivals and not self._restarter.misfit(few, found.T_ac.inverse(), budget)
             little = search.inlier_ratio >= SURE_RATIO or fits  # little is left to explain
             if found.measured and little and not doubtful and search.width_m <= self.limits.gate_m:
                 break
-        measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
+        known_poses = [each for each in results if each.measured]
+        measured = [(each, self._restarter.measure(few, each.T_ac.inverse(), budget)) for each in known_poses]
         width = max(self.limits.gate_m, 3.0 * min((restart.noise_m for _, restart in measured), default=0.0))
         best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else (results or [none])[0]
-        sure = measured and not doubt[results.index(best)] and not self._restarter.misfit(few, best.T_ac.inverse())
-        if sure or not budget.exhausted:
+        sure = measured and not doubt[results.index(best)]
+        if not budget.exhausted or (sure and not self._restarter.misfit(few, best.T_ac.inverse(), budget)):
             return best
         return replace(best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND)
 
@@ -167,34 +179,48 @@ class Registrar:
 
         Also: whether the points off the model are another object's (far away, or nothing is missing); if doubtful.
         """
+        if not budget.allows(LAST_WORK):
+            return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False, True
         start = self._neighbourhood.of_both_sides(few := self._restarter.part(part), search.best, budget)
         away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
         sure, p = away or search.inlier_ratio >= self.params.acquire.least_ratio, self.params.acquire
         spread = start.noise_m > restarts.HOPELESS * self.index.extent_m or search.inlier_ratio < p.least_separate
+        budget.spend(0 if spread or sure else TEST_WORK)
         if spread or not (sure or self._test.check(few, search.best, self._restarter.part(scan)).covered):
             return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False, True
         found = self._regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
             return found, False, True
+        budget.spend(TEST_WORK)
         at = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan))
         alone = away or at.covered
         if search.inlier_ratio < (p.least_separate if alone else p.least_ratio) or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False, True
         if at.reason:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False, True
-        best, rivals = found.T_ac.inverse(), list(search.rivals)
-        if self._symmetry.marked:
+        rivals, marked = list(search.rivals), self._symmetry.marked
+        decided = marked and budget.allows(self._symmetry.work(len(part), len(rivals)))
+        if marked and not decided and not rivals:
+            none = replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
+            return none, alone, True
+        if decided:
             budget.spend(self._symmetry.work(len(part), len(rivals)))
-            best, rivals = self._symmetry.decided(part, best, rivals, at.covered)
+            best, rivals = self._symmetry.decided(part, found.T_ac.inverse(), rivals, at.covered)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
-                found = self._regraded(scan, few, self._restarter.measure(few, best), budget, True, carried)
+                found = self._regraded(scan, few, self._restarter.measure(few, best, budget), budget, True, carried)
+        return self._unrivalled(scan, found, rivals, at.covered, budget), alone, at.doubtful
+
+    def _unrivalled(
+        self, scan: NDArray[Any], found: Alignment, rivals: list[Pose], covered: bool, budget: Budget
+    ) -> Alignment:
+        """The result of a search; AMBIGUOUS with rivals, not accepted where the view shows faces of many bodies."""
         rivals = self._symmetry.distinct(scan, found, rivals)
         if rivals:
             words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
-        elif self._visibility.sided and not at.covered:
+        elif self._visibility.sided and not covered:
             found = self._neighbourhood.of_one(scan, found, budget)
-        return found, alone, at.doubtful
+        return found
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -235,9 +261,9 @@ class Registrar:
         if not budget.allows(work := self._symmetry.work(len(scan))):
             return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
-        budget.spend(work)
+        budget.spend(work + TEST_WORK)
         best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
-        turned = found if best is T_ca else self._graded(scan, best.inverse(), budget, None, halves, carried)
+        turned = found if best is T_ca else self._grader.graded(scan, best.inverse(), budget, None, halves, carried)
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
         return quality.left_undetermined(found, unknown) if unsure and rivals else found
 
@@ -259,7 +285,7 @@ class Registrar:
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        if budget.allows(self._symmetry.search_work(len(scan), 0)):
+        if budget.allows(self._symmetry.search_work(len(scan), 0) + sum(SCATTER_WORK) * len(scan)):
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED)
 
@@ -268,14 +294,13 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
         few = self._restarter.part(scan)
-        budget.spend(restarts.COMPARED_WORK)
-        starts = self._restarter.starts(few, first, guess)
+        starts = self._restarter.starts(few, first, guess, budget)
         hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self.index.extent_m
         tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
-        final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m)
+        final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         reason = self._restarter.reason(few, final, budget, guess)
-        if not (reason or self._restarter.doubtful(few, guess, final)):
-            return self._restarter.consistent(few, guess, final), False
+        if not (reason or self._restarter.doubtful(few, guess, final, budget)):
+            return self._restarter.consistent(few, guess, final, budget), False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without: another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
@@ -288,13 +313,13 @@ class Registrar:
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
-            kept = LAST_SCANS * healthy_work(len(scan)) + (work if reason and step == "restart" and restart else 0)
+            kept = LAST_SCANS * budget.healthy + (work if reason and step == "restart" and restart else 0)
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._regraded(scan, few, before, budget, halves, carried)
                 reason = self._restarter.reason(few, final, budget, guess)
             if final.measured and not reason:
-                return self._restarter.consistent(few, guess, final), False
+                return self._restarter.consistent(few, guess, final, budget), False
         if not reason:
             return final, False
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
@@ -305,7 +330,7 @@ class Registrar:
     ) -> Alignment:
         """Register with a rejection distance that follows the noise; among other objects also along the valley."""
         width = self._restarter.width(kept)
-        found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
+        found = self._grader.graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
         if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
             return found
         moved = self._neighbourhood.along_valley(few, found.T_ac.inverse(), budget)
@@ -313,38 +338,5 @@ class Registrar:
             return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
-        again = self._graded(scan, moved.inverse(), budget, width, halves, carried)
-        return self._restarter.nearest(few, [found, again], width)
-
-    def _graded(
-        self,
-        scan: NDArray[Any],
-        guess: Pose,
-        budget: Budget,
-        width_m: float | None,
-        halves: bool,
-        carried: bool,
-        rough: bool = False,
-    ) -> Alignment:
-        """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers.
-
-        A close fit that is not at a minimum before the last pass that is allowed is registered once more from there.
-        ``rough``: a part of the scan suffices where it shows that the fit is not close; it is then not converged.
-        """
-        start = T_ca = guess.inverse()
-        limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
-        options = (self.params, halves, self._accuracy, not carried, start)
-        for last in (False, True):
-            fit = aligned(self.params.backend, self._backend, scan, T_ca, width_m, budget.left, rough and not last)
-            if isinstance(fit, str):
-                return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
-            found = quality.grade(self.index, self._visibility, scan, fit, limits, *options)
-            budget.registered(fit, found)
-            ended = last or fit.iterations >= self.limits.n_max or budget.left < healthy_work(len(scan))
-            close = self._restarter.healthy(found.inlier_ratio, found.rms_m)
-            if ended or not close or found.status is not AlignStatus.NOT_CONVERGED:
-                break
-            T_ca = fit.T_ca
-        if found.status is AlignStatus.FAILED:
-            found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
-        return found
+        again = self._grader.graded(scan, moved.inverse(), budget, width, halves, carried)
+        return self._restarter.nearest(few, [found, again], width, budget)

@@ -20,7 +20,15 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
-from avsreplay.register.budget import FAR_WORK, LEAST_RATIO, MEASURED_WORK, PASS_WORK, TEST_WORK, Budget
+from avsreplay.register.budget import (
+    CALL_WORK,
+    FAR_WORK,
+    LEAST_RATIO,
+    STAGE_WORK,
+    STRUCTURE_WORK,
+    TEST_WORK,
+    Budget,
+)
 from avsreplay.register.plausibility import LEAST_BEYOND, NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.quality import PART
 from avsreplay.register.size import LEAST_RESIDUALS
@@ -37,7 +45,6 @@ SHARED = 0.4  # of the rms distance; a correct pose of a correct model has less 
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
-COMPARED_WORK = 6 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about six times
 HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise at the result of a search it is not registered to the whole scan
 
 
@@ -88,20 +95,22 @@ class Restarter:
         """Return about ``POINTS`` points of the scan (n, 3), evenly over its order."""
         return points[np.linspace(0, len(points) - 1, POINTS).astype(np.intp)] if len(points) > POINTS else points
 
-    def measure(self, points: NDArray[Any], T_ca: Pose, guess: Pose | None = None) -> Restart:
+    def measure(self, points: NDArray[Any], T_ca: Pose, budget: Budget, guess: Pose | None = None) -> Restart:
         """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of ``PlausibilityTest.noise``."""
-        return Restart(T_ca, at := self._test.measure(points, T_ca), self._test.noise(at, T_ca, guess))
+        at, work = self._target.visibility.distances(self._target.index, points, T_ca, np.inf)
+        budget.spend(work + CALL_WORK)
+        return Restart(T_ca, at, self._test.noise(at, T_ca, guess))
 
-    def starts(self, points: NDArray[Any], first: Alignment, guess: Pose) -> list[Restart]:
+    def starts(self, points: NDArray[Any], first: Alignment, guess: Pose, budget: Budget) -> list[Restart]:
         """Return a registered pose, and its guess T_ac if part of ``points`` (n, 3) in {A} is off and it is as near.
 
         The wide rejection distance of the first passes can lead away from a good guess on a target that is hidden.
         """
-        at, before = (self.measure(points, T_ac.inverse(), guess) for T_ac in (first.T_ac, guess))
+        at, before = (self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (first.T_ac, guess))
         worse = BETTER_THAN * before.cost(self._target.limits.gate_m) > at.cost(self._target.limits.gate_m)
         return [at] if worse or first.inlier_ratio >= LEAST_RATIO else [at, before]
 
-    def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment) -> Alignment:
+    def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> Alignment:
         """Return the alignment with a covariance that is not contradicted by the distances at the predicted pose.
 
         Where little of the target is in the scan, the distances can be nearly as small along a curve of poses, far
@@ -112,11 +121,12 @@ class Restarter:
             points: (n, 3) in {A} [m], part of the scan.
             guess: predicted T_ac.
             found: the alignment.
+            budget: of the scan.
         """
         P = found.covariance
         if P is None or found.inlier_ratio >= LEAST_RATIO or not self._test.predicted(found.T_ac.inverse(), guess):
             return found
-        at, before = (self.measure(points, T_ac.inverse(), guess) for T_ac in (found.T_ac, guess))
+        at, before = (self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (found.T_ac, guess))
         step = found.T_ac.inverse() @ guess
         d = np.concatenate([geometry.log(step.q), step.t])
         width, noise = self.width(at), max(at.noise_m, before.noise_m, np.finfo(float).tiny)
@@ -135,9 +145,9 @@ class Restarter:
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
 
-    def nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float) -> Alignment:
+    def nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float, budget: Budget) -> Alignment:
         """Return the second alignment if the points, none farther than ``width_m``, are nearer to the model there."""
-        cost = [self.measure(few, each.T_ac.inverse()).cost(width_m) for each in found]
+        cost = [self.measure(few, each.T_ac.inverse(), budget).cost(width_m) for each in found]
         return found[cost[1] < NEARER * cost[0]]
 
     def reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
@@ -145,12 +155,13 @@ class Restarter:
         budget.spend(TEST_WORK)
         return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
 
-    def misfit(self, points: NDArray[Any], T_ca: Pose) -> bool:
+    def misfit(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> bool:
         """Return whether neighbouring points on the model share most of their distances from it, (n, 3) in {A}.
 
         Then the pose or the model is wrong, and another pose may fit better, however few points are off the model.
         """
-        distance, gate = self._test.measure(points, T_ca), self._target.limits.gate_m
+        distance, gate = self.measure(points, T_ca, budget).distance, self._target.limits.gate_m
+        budget.spend(STRUCTURE_WORK)
         shared, rms = self.structure(points, T_ca, gate), np.sqrt(np.mean(distance[distance < gate] ** 2))
         return bool(np.isfinite(shared) and shared > SHARED * rms)
 
@@ -196,10 +207,10 @@ class Restarter:
         if not close or found.inlier_ratio >= COMPLETE or found.well_off < LEAST_BEYOND:
             return close
         few = self.part(points)
-        budget.spend(MEASURED_WORK * len(few))
+        budget.spend(STRUCTURE_WORK)
         return not self._test.continued(few, found.T_ac.inverse())
 
-    def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
+    def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> bool:
         """Return whether an alignment may be a local minimum.
 
         After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess. A misfit of nearly
@@ -210,6 +221,7 @@ class Restarter:
             points: (n, 3) in {A} [m], part of the scan.
             guess: T_ac from which it was registered.
             found: its result.
+            budget: of the scan.
         """
         if found.status is AlignStatus.FAILED or not found.inliers:
             return True
@@ -218,8 +230,11 @@ class Restarter:
         if found.rms_m <= poor or found.inlier_ratio < LEAST_RATIO:
             return found.rms_m > poor
         moved = T_ca.apply(points) - guess.inverse().apply(points)
-        far = float(np.linalg.norm(moved, axis=1).mean()) > gate
-        return far and self.structure(points, T_ca, side=0.5 * PATCH_OF_EXTENT) > max(poor, np.sqrt(0.5) * found.rms_m)
+        if float(np.linalg.norm(moved, axis=1).mean()) <= gate:
+            return False
+        budget.spend(STRUCTURE_WORK)
+        shared = self.structure(points, T_ca, side=0.5 * PATCH_OF_EXTENT)
+        return bool(shared > max(poor, np.sqrt(0.5) * found.rms_m))
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
@@ -228,9 +243,8 @@ class Restarter:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
             found = index.icp(points, T_ca, rules[facing])
             T_ca = Pose.from_matrix(found.T_ca)
-            budget.spend(found.work + PASS_WORK)
-        budget.spend(MEASURED_WORK * len(points))
-        return self.measure(points, T_ca)
+            budget.spend(found.work + STAGE_WORK)
+        return self.measure(points, T_ca, budget)
 
     def hopeful(self, scan: NDArray[Any], guess: Pose, budget: Budget) -> bool:
         """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are mostly on the model."""
@@ -259,7 +273,7 @@ class Restarter:
             before: best of the restarts from guess and result; the starts are then poses turned by ``TURN_RAD``.
             kept: work that is kept for a later step.
         """
-        found = [self.measure(points, result), *([before] if before else [])]
+        found = [self.measure(points, result, budget), *([before] if before else [])]
         tested: Restart | None = None  # the last pose that was tested, and is not plausible
         for T_ca, start in self._starts(guess, result, points.mean(axis=0), before is not None):
             if not budget.allows(self.work(start) * FAR_WORK * len(points), kept):

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache
-from avsreplay.register.backend import Target, healthy_work
-from avsreplay.register.budget import TEST_WORK
+from avsreplay.register.backend import Target
+from avsreplay.register.budget import TEST_WORK, healthy_work
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
-from avsreplay.register.neighbourhood import VALLEY_WORK
+from avsreplay.register.grading import FAR_RAD
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
@@ -43,7 +43,6 @@ OFF = 2.0  # a point farther from the model than this many widths is off it
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
-FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
@@ -142,11 +141,11 @@ class NearSymmetry:
     def after_search(self, points: int) -> int:
         """Return the usual cost of what follows a search for a scan of so many points, in point searches."""
         turned = self.work(points, FINALISTS) if self.marked else 0
-        return VALLEY_WORK + TEST_WORK + healthy_work(points) + turned
+        return TEST_WORK + healthy_work(points, self._target.near_work) + turned
 
     def search_work(self, points: int, number: int) -> int:
-        """Return the usual cost of round ``number`` of the search and of what follows it."""
-        return self.search.work(points, number) + self.after_search(points)
+        """Return the usual cost of round ``number`` of the search and of registering its result."""
+        return self.search.work(points, number) + TEST_WORK + healthy_work(points, self._target.near_work)
 
     def decided(
         self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool

@@ -20,7 +20,7 @@ EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
 STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
-NEIGHBOUR = 8
+NEIGHBOUR, TESTED = 8, 200  # neighbour whose distance counts; points that show whether any are scattered
 EMPTY, SPACED = 2.5, 125  # for the density of rays; no ray within so many spacings: nothing was measured
 AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
 SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
@@ -32,7 +32,7 @@ MOST_SEGMENTS = 3
 MOST_ATTEMPTS = MOST_SEGMENTS + 3
 VOXEL_OF_EXTENT = 0.04
 LEAST_SHARE, LEAST_POINTS = 0.05, 60  # least size of a part: share of the scan, and points
-PLANES, TRIALS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 0.01, 0.2
+PLANES, TRIALS, PLANE_POINTS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 400, 0.01, 0.2
 
 
 def sample(surface: Surface, count: int) -> tuple[Array, Array]:
@@ -167,10 +167,12 @@ def without_scattered_points(points: Array) -> Array:
     if len(points) < 10 * NEIGHBOUR:
         return points
     points = np.ascontiguousarray(points, dtype=np.float64)
-    distance: Array = kernel_module().PointTree(points).query(points, k=NEIGHBOUR + 1)[0][:, -1]
-    low, high = np.quantile(distance, [0.25, 0.75])
+    tree = kernel_module().PointTree(points)
+    few: Array = tree.query(points[:: max(1, len(points) // TESTED)].copy(), k=NEIGHBOUR + 1)[0][:, -1]
+    low, high = np.quantile(few, [0.25, 0.75])
     if high < BIMODAL * low:
         return points
+    distance: Array = tree.query(points, k=NEIGHBOUR + 1)[0][:, -1]
     return points[distance < SCATTERED * float(np.quantile(distance, DENSE_QUANTILE))]
 
 
@@ -228,17 +230,17 @@ def _connected(points: Array, voxel_m: float) -> Iterator[Array]:
     """Parts whose occupied voxels touch each other, at a corner at least."""
     if not len(points):
         return
-    cells, voxel = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0, return_inverse=True)
-    label = kernel_module().PointTree(cells.astype(np.float64)).groups(1.8)
-    part = label[voxel.reshape(-1)]
-    for k in range(int(label.max()) + 1):
+    first, voxel, _ = _voxels(points, voxel_m)
+    cells = np.floor((points[first] - points.min(axis=0)) * (1.0 / voxel_m))
+    part = kernel_module().PointTree(cells).groups(1.8)[voxel]
+    for k in range(int(part.max()) + 1):
         yield points[part == k]
 
 
 def _without_plane(points: Array, width_m: float) -> Array:
     """The points off the plane that holds most of them; all if no plane holds ``PLANE_SHARE``. Seeded RANSAC."""
     rng = np.random.Generator(np.random.PCG64(0))
-    few = points[:: max(1, len(points) // 1000)]
+    few = points[:: max(1, len(points) // PLANE_POINTS)]
     triples = few[rng.integers(len(few), size=(TRIALS, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
@@ -336,7 +338,8 @@ class Rays:
         far = np.linalg.norm(points, axis=1)
         if not len(points) or self.tree is None:
             return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-        angle, k = self.tree.query(points / far[:, None], k=AMONG)
+        angle, k = self.tree.query(points / far[:, None], AMONG, 1.01 * EMPTY * self.spacing)
+        k = np.minimum(k, len(self.ranges) - 1)  # where fewer are so near
         empty = angle[:, 0] > EMPTY * self.spacing
         near = angle[:, -1] < SURROUNDED * self.spacing
         return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty

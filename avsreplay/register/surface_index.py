@@ -86,7 +86,7 @@ class IcpResult:
         converged: the stopping rule held before n_max.  inliers, rms_m: of the last pass, before its step.
         gate_m: rejection distance after the last pass.  step_rad, step_m: the last step.  ignored: points not finite.
         searched: neighbour searches made over all passes.  work: of all passes, counted in ordinary searches.
-        matches: opaque; shortens the search of :meth:`SurfaceIndex.evidence` for the same points.
+        matches: opaque; shortens :meth:`SurfaceIndex.evidence` of the same points. None: it ended with a part of them.
     """
 
     T_ca: Array

@@ -341,7 +341,7 @@ struct Found {
     Facing facing;
     code.face(s, sided ? &eye : nullptr, 0, facing);
     const int64_t compared = code.closest(s, v, 0, v.n, T, facing, sided, bound, {foot.data(), d2.data(), id.data(), normal.data()});
-    work = work_of(v.n, v.n, compared);
+    work = work_of(v.n, compared);
   }
 
   // Whether the closest face of a point is there and faces the eye.

@@ -16,8 +16,8 @@ struct Rule {
   double poor;        // with a larger rms distance after the passes over few points it ends there; 0: never
 };
 
-// In point searches. An ordinary one moves a point and compares about two blocks, which is 4/3 of this unit.
-inline int64_t work_of(int64_t moved, int64_t searched, int64_t compared) { return (moved + searched + compared) / 3; }
+// In point searches: an ordinary one moves a point and compares two blocks.
+inline int64_t work_of(int64_t moved, int64_t compared) { return (moved + 2 * compared) / 5; }
 
 struct Outcome {
   double T[12];  // rows of [R t]
@@ -25,10 +25,11 @@ struct Outcome {
   int few_passes;  // of those the ones over a part
   bool converged;
   int64_t inliers, ignored, searched;
-  int64_t compared;  // blocks and nodes of the tree, by all searches
+  int64_t compared;  // blocks and nodes of the tree
   int64_t moved;     // points, over all passes
 
-  int64_t work() const { return work_of(moved, searched, compared); }
+  int64_t work() const { return work_of(moved, compared) + PASS_WORK * passes; }
+  static constexpr int64_t PASS_WORK = 20;  // cost of a pass over any number of points
   double rms, gate, turn, move;
 };
 

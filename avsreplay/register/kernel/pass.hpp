@@ -87,9 +87,10 @@ static inline Kept kept_at(const Query& q, const Room& room, int32_t nearest) {
 // The nearest lane of the kept neighbour's block, and of the other block where `pair`. `remember`: where what is left of
 // the room is written for later passes, or null.
 template <class Kind>
-static inline int32_t keep_one(const Scope& o, const Query& q, bool pair, const Kept& was, Kept* remember) {
+static inline int32_t keep_one(const Scope& o, const Query& q, bool pair, const Kept& was, Kept* remember, int64_t& compared) {
   Search<Kind> search(o, q);
   search.run_blocks((uint32_t)was.lane / LANES, pair ? was.other : NO_CHILD);
+  compared += search.compared();
   if (!remember || search.lane() < 0) return search.lane();
   const double x = q.x - was.x, y = q.y - was.y, z = q.z - was.z;
   const float moved = 1.0001f * (float)std::sqrt(x * x + y * y + z * z);
@@ -137,7 +138,7 @@ static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list
 // What the searches of a chunk took.
 struct Effort {
   int64_t ignored = 0;                 // points that are not finite
-  int64_t searched = 0, compared = 0;  // searches made, and the blocks and nodes that they compared
+  int64_t searched = 0, compared = 0;  // searches made; blocks and nodes that were compared, also for kept neighbours
   int32_t last = -1;                   // the primitive of the last point
 };
 
@@ -155,7 +156,8 @@ static void search(const Scope& o, int64_t first, int n, const Kept* kept, Kept*
       c.lane[i] = lane;
       if (c.search[i] == KEPT || lane < 0) continue;
       Kept* memory = remember ? remember + first + i : nullptr;
-      c.lane[i] = keep_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.search[i] == IN_PAIR, kept[first + i], memory);
+      const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
+      c.lane[i] = keep_one<Kind>(o, q, c.search[i] == IN_PAIR, kept[first + i], memory, effort.compared);
     } else {
       const int32_t seed = lane < 0 && !c.list[i] ? effort.last : lane;
       Kept* memory = remember ? remember + first + i : nullptr;

@@ -90,7 +90,7 @@ double first_face(const Store& s, const Ray& ray, int64_t& compared) {
 int64_t cast(const Store& s, const Vec3& eye, const double* directions, int64_t n, double* ranges) {
   int64_t compared = 0;
   for (int64_t k = 0; k < n; ++k) ranges[k] = first_face(s, Ray(s, eye, directions + 3 * k), compared);
-  return work_of(n, n, compared);
+  return work_of(n, compared);
 }
 
 }  // namespace avs
