@@ -25,8 +25,8 @@ from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
 from avsreplay.register.budget import FAR_WORK, LAST_WORK, SIZE_WORK, Budget
 from avsreplay.register.degenerate import scaled_information
-from avsreplay.register.noise_bias import BIAS_POINTS, UNCERTAIN_CHI2, NoiseBias
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.pose_bias import BIAS_POINTS, UNCERTAIN_CHI2, NoiseBias
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
 
