@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,7 @@ import tumbling
 from scipy.stats import multivariate_normal
 
 from avsreplay import geometry
-from avsreplay.estimate import _motion, hypotheses, noise, scan_window
+from avsreplay.estimate import _motion, hypotheses, noise, pose_differences, scan_window
 from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state, with_change
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
@@ -77,7 +78,9 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     P, R = A @ A.swapaxes(1, 2), np.array([np.diag(rng.uniform(1.0, 2.0, size=6)) for _ in range(2)])
     S, alpha, one_sigma = H @ P @ H.swapaxes(1, 2) + R, 3.0 * rng.normal(size=(2, 6)), (0.2, 0.3)
     share, none, y = 0.2, np.zeros(12), alpha.reshape(-1)
-    ratio, moments = _motion.change(Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, 1.0, share)
+    ratio, moments = _motion.change(
+        Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, [0.3, 0.1, 0.03, 0.01], 1.0, share
+    )
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
     ratios, weighted = [], []
     for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1, 0.03, 0.01)):
@@ -488,7 +491,7 @@ def test_the_window_holds_the_covariance_of_its_innovations() -> None:
         prediction = Prediction(beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
         seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0, 0.0)
         epochs.append(Epoch(Track(start, "filter"), prediction, seen, False))
-    C = scan_window.window_of(epochs, start, *noises).C
+    C = scan_window.window_of(epochs, 4, start, *noises).C
     for i, first in enumerate(beliefs[1:]):
         for j, later in enumerate(beliefs[1:][i:], start=i):
             _, Phi = propagate_state(first.x, (later.t_ns - first.t_ns) * 1e-9)
@@ -662,10 +665,10 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s
             PoseFix(round(k * interval_s * 1e9), Pose(geometry.exp([turn, 0.0, 0.0]), place), 1e-12 * np.eye(6))
             for k, (turn, place) in enumerate(zip(turned, places, strict=True))
         ]
-        levels = scan_window.disturbance_levels(fixes, 4.0)
+        levels = pose_differences.disturbance_levels(fixes, 4.0)
         if levels is not None:
             found.append(levels[1])
-        assert scan_window.disturbance_levels(fixes[:4], 4.0) is None
+        assert pose_differences.disturbance_levels(fixes[:4], 4.0) is None
     assert len(found) > 20
     assert 0.8 * density < np.sqrt(np.mean(np.square(found))) < 1.3 * density
 
@@ -684,14 +687,23 @@ def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
         assert mixed == pytest.approx((1.0 - share) * before + share * after, rel=1e-9)
 
 
-def test_a_manoeuvre_is_preferred_to_a_random_disturbance_of_equal_likelihood_only_after_quiet_poses() -> None:
-    """A torque that has acted before explains a change of the rate as well as a manoeuvre does."""
-    kind = hypotheses.Hypothesis
-    free, step, random = (
-        hypotheses.Explanation(hypothesis, evidence, 60.0, 78, 13)
-        for hypothesis, evidence in ((kind.FREE_MOTION, 0.0), (kind.MANOEUVRE, 7.5), (kind.DISTURBED, 8.5))
-    )
-    found = [random, step, free]
-    assert hypotheses._ranked(found, True)[0] is step
-    assert hypotheses._ranked(found, False)[0] is random
-    assert hypotheses._ranked([step, random, free], False)[0] is step
+@pytest.mark.parametrize("least", [0.0, 1e-3, math.inf])
+def test_a_disturbance_that_the_earlier_poses_exclude_must_begin_within_the_scans(least: float) -> None:
+    """The mean of Gaussian densities over all root densities, of excluded ones with the prior odds of 0.01."""
+    rng, n = np.random.Generator(np.random.PCG64(7)), 4
+    edges, between = np.array([0.0, 0.4, 1.0, 1.5, 2.0]), 30.0 * rng.normal(size=(n, 6 * n, 6))
+    white, densities = 2.0 * rng.normal(size=6 * n), np.logspace(-6.0, -1.0, 21)
+    found = hypotheses._disturbed(edges, between, white, 0.0, (math.inf, least))
+    possible, values = densities < least, []
+    for q in densities:
+        A = np.hstack([np.sqrt(h) * part[:, 3:] for h, part in zip(np.diff(edges), between, strict=True)])
+        C = np.eye(6 * n) + q * q * A @ A.T
+        values.append(
+            multivariate_normal.logpdf(white, cov=C) + 0.5 * float(white @ white) + 3.0 * n * math.log(2.0 * math.pi)
+        )
+    weights = np.where(possible, 1.0 / max(possible.sum(), 1), np.exp(-4.6) / len(densities))
+    force = float(np.log(weights @ np.exp(values))) - math.log(2.0) + scan_window.PRIOR_ODDS
+    torque = hypotheses._disturbed(edges, between, white, 0.0, (math.inf, 0.0)).log_evidence
+    assert found.log_evidence == pytest.approx(max(force, torque), abs=1e-9)
+    k = int(np.argmax(np.log(weights) + values))
+    assert found.size[3] in (0.0, pytest.approx(densities[k]))

@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from avsreplay.estimate import bad_scans, noise
+from avsreplay.estimate.scan_points import scan_points
 from avsreplay.estimate.scan_window import PRIOR_ODDS, ChangePriors, Hypothesis, Window
 from avsreplay.geometry import Pose
 from avsreplay.records import Innovation
@@ -29,7 +30,8 @@ def window(seed: int, errors: float = 1.0) -> tuple[Window, np.ndarray]:
     R = tuple(np.diag(rng.uniform(0.5, 1.0, size=6)) * 1e-4 for _ in range(n))
     poses = tuple(Pose(np.array([0.0, 0.0, 0.0, 1.0]), rng.normal(size=3)) for _ in range(n))
     late = np.zeros((n + 1, 6 * n, 12))
-    return Window(np.arange(1.0, n + 1.0), y, C, whiten, late, poses, R, (np.eye(3),) * n), whiten @ y
+    times, points = np.arange(1.0, n + 1.0), scan_points(R, FIRST)
+    return Window(points, times, y, C, whiten, late, poses, R, (np.eye(3),) * n), whiten @ y
 
 
 def log_density(y: np.ndarray, C: np.ndarray) -> float:

@@ -76,6 +76,8 @@ def test_the_density_in_use_is_zero_or_the_true_one_where_the_poses_determine_it
     assert strong.likeliest[0] == pytest.approx(1e-2, rel=0.5)
     quiet = drawn(0.0, rng)[0]
     assert density_in_use(quiet, PRESENT) < 1e-4
+    assert quiet.excluded < 1e-2 < strong.excluded
+    assert (quiet.log_odds[quiet.excluded <= DENSITIES] <= np.log(0.01)).all()
     assert (
         density_in_use(quiet, PRESENT, 0.1) < density_in_use(quiet, PRESENT, 0.5) < density_in_use(quiet, PRESENT, 0.9)
     )

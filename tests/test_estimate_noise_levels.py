@@ -70,6 +70,7 @@ def test_the_level_of_white_noise_is_found_and_no_disturbance_beside_it(seed: in
     assert levels.torque < 5e-6
     assert levels.force < 5e-6
     assert not levels.established
+    assert max(levels.excluded) < 1e-3
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -79,6 +80,7 @@ def test_the_density_of_a_random_torque_is_found_within_a_factor_of_two(seed: in
     levels, _ = levels_of(fixes(world.states, seed), world.states[0])
     assert 5e-5 < levels.torque < 2e-4
     assert levels.established
+    assert levels.excluded[0] > 1e-4
     assert levels.white == pytest.approx((1.0, 1.0), rel=0.4)
 
 

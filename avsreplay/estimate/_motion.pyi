@@ -29,6 +29,7 @@ def change(
     R: Array,
     colour: Array,
     one_sigma: tuple[float, float],
+    sizes: list[float],
     scale: float,
     share: float,
 ) -> tuple[float, Array]: ...

@@ -28,14 +28,14 @@ from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.noise import cholesky_root, lasting, risen
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.pose_differences import MOST_DISTURBED, disturbance_levels
+from avsreplay.estimate.scan_points import latest
 from avsreplay.estimate.scan_window import (
     EXPLAINED,
-    MOST_DISTURBED,
     ChangePriors,
     Explanation,
     Hypothesis,
     Window,
-    disturbance_levels,
     last_change_ns,
     long_run,
     odds_over_free,
@@ -49,7 +49,7 @@ from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 
-_FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
+_FEWEST, _MOST = 3, 5  # least and most doubtful scans at a decision
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
 _LEAST_RISE = 2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
@@ -75,7 +75,7 @@ class AnomalyTest:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
         self._extent_m = extent_m
-        self._priors = ChangePriors(*params.change_1s, 0.05 * extent_m, 0.05)
+        self._priors = ChangePriors.of(params, extent_m)
 
     def step(
         self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]
@@ -84,7 +84,7 @@ class AnomalyTest:
         if not self.enabled or verdict.reason not in _TESTED:
             return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
         if track.bias is not None:
-            bias = continued(track.bias, epoch, lambda scans: self._windowed(track, scans), self._priors)
+            bias = continued(track.bias, epoch, lambda *scans: self._windowed(track, *scans), self._priors)
             if bias is not None:
                 return self._still_biased(track.changed(belief=epoch.prediction.belief), bias)
             track = track.changed(bias=None)
@@ -100,8 +100,8 @@ class AnomalyTest:
         window, ranked = self._explained(track, window, first)
         best = ranked[0].hypothesis
         changed = best in _STEPS and odds_over_free(ranked) >= OVER_FREE
-        free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-        changed = changed and (bool(track.doubtful) or linear(free, window))
+        free = next(e for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+        changed = changed and (bool(track.doubtful) or linear(free.chi2, free.dof, window))
         noisier = best is Hypothesis.NOISIER and certain(ranked)
         if not (large or changed or (track.doubtful and (noisier or best is Hypothesis.SENSOR_BIAS))):
             return self._accepted(track, epoch, update), verdict
@@ -122,17 +122,18 @@ class AnomalyTest:
         after = update(track.changed(doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
         after = with_nis(after, track, epoch.innovation.chi2)
         after = after.changed(window=lasting(after.window, epoch.innovation))
-        return after.changed(recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
+        return after.changed(recent=latest((*track.recent, epoch))) if ready(track) else after
 
     def _explained(self, track: Track, window: tuple[Epoch, ...], first: int) -> Ranked:
-        allowed = *self.batch.noise_levels(track), self.batch.orbit, not track.levels.established
+        allowed = *self.batch.noise_levels(track), self.batch.orbit, track.levels.excluded
         used, ranked = explain(window, first, self._priors, *allowed)
         least = math.sqrt(_LEAST_RISE * nis_scale(track))  # noise that the accepted poses have as well is no rise
         return used, [e for e in ranked if e.hypothesis is not Hypothesis.NOISIER or e.size.max() > least]
 
-    def _windowed(self, track: Track, scans: tuple[Epoch, ...]) -> Window:
+    def _windowed(self, track: Track, scans: tuple[Epoch, ...], accepted: int) -> Window:
         start, orbit = scans[0].track.belief, self.batch.orbit
-        return window_of(scans, start, *self.batch.noise_levels(track), None if orbit is None else orbit.at(start.t_ns))
+        arc = None if orbit is None else orbit.at(start.t_ns)
+        return window_of(scans, accepted, start, *self.batch.noise_levels(track), arc)
 
     def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Verdict]:
         """The track after one more scan of a sensor error, unless a manoeuvre explains its scans better."""
@@ -268,7 +269,7 @@ class AnomalyTest:
         for epoch in epochs:
             out, again = self._replay(out, epoch)
             used.append(again)
-        return out.changed(recent=(*track.recent, *used)[-_RECENT:])
+        return out.changed(recent=latest((*track.recent, *used)))
 
     def _reported(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """The track with the manoeuvre in its list; a later report of the same one replaces the first."""

@@ -38,7 +38,7 @@ def noisier(window: Window, white: Array, first: int) -> Explanation:
 
     Args:
         window: the scans.
-        white: (6n,) its whitened innovations.
+        white: (6p,) its whitened innovations.
         first: index of the first doubtful scan.
     """
     value, y, S = _given_accepted(window, white, first)
@@ -49,11 +49,11 @@ def noisier(window: Window, white: Array, first: int) -> Explanation:
         row[part] = rise
     more = np.tile(np.sqrt(factors * factors - 1.0), (1, len(window.R) - first))
     odds, chi2 = _densities(y, S + more[:, :, None] * R * more[:, None, :])
-    k, n, accepted = int(np.argmax(odds)), len(window.R), white[: 6 * first]
+    k, dof, accepted = int(np.argmax(odds)), len(white), white[: 6 * window.points.before(first)]
     left = float(chi2[k]) + float(accepted @ accepted)
-    left = max(left, float(chi2[k]) * n / (n - first))  # it must explain the doubtful scans by themselves as well
+    left = max(left, float(chi2[k]) * dof / len(y))  # it must explain the doubtful scans by themselves as well
     total = value + log_mean(odds.tolist()) + PRIOR_ODDS
-    return Explanation(Hypothesis.NOISIER, total, left, 6 * n, first, size=frozen(factors[k]))
+    return Explanation(Hypothesis.NOISIER, total, left, dof, first, size=frozen(factors[k]))
 
 
 def bad_scans(window: Window, white: Array, priors: ChangePriors, first: int) -> Explanation:
@@ -61,13 +61,13 @@ def bad_scans(window: Window, white: Array, priors: ChangePriors, first: int) ->
 
     Args:
         window: the scans.
-        white: (6n,) its whitened innovations.
+        white: (6p,) its whitened innovations.
         priors: 1 sigma of the errors.
         first: index of the first doubtful scan.
     """
     value, y, S = _given_accepted(window, white, first)
     M, scale = offsets(window, priors)
-    n, accepted, errors = len(window.R), white[: 6 * first], []
+    n, accepted, errors = len(window.R), white[: 6 * window.points.before(first)], []
     for kind, width in product(OFFSETS, _WIDTHS):
         columns = width * scale[kind] * M[first:, :, kind]
         errors.append(_diagonal(columns @ columns.mT))
@@ -79,7 +79,7 @@ def bad_scans(window: Window, white: Array, priors: ChangePriors, first: int) ->
         odds = np.concatenate([odds, others + _PER_BAD_SCAN * (n - first - 1)])
         chi2 = np.concatenate([chi2, chi2_others])
     left = float(chi2[int(np.argmax(odds))]) + float(accepted @ accepted)
-    return Explanation(Hypothesis.BAD_SCANS, value + log_mean(odds.tolist()) + PRIOR_ODDS, left, 6 * n, first)
+    return Explanation(Hypothesis.BAD_SCANS, value + log_mean(odds.tolist()) + PRIOR_ODDS, left, len(white), first)
 
 
 def frozen_sensor(window: Window, first: int) -> Explanation:
@@ -89,18 +89,18 @@ def frozen_sensor(window: Window, first: int) -> Explanation:
         window: the scans.
         first: index of the first doubtful scan.
     """
-    n = len(window.R)
-    value, chi2 = log_density(window.y[: 6 * first], window.C[: 6 * first, : 6 * first])
+    n, a = len(window.R), 6 * window.points.before(first)
+    value, chi2 = log_density(window.y[:a], window.C[:a, :a])
     for k in range(first, n):
         away = pose_difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
         part, size = log_density(away, 2.0 * window.R[k])
         value, chi2 = value + part, chi2 + size
-    return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, 6 * n, first)
+    return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, len(window.y), first)
 
 
 def _given_accepted(window: Window, white: Array, first: int) -> tuple[float, Array, Array]:
     """Log density of the accepted innovations; the doubtful ones less their mean given these, and their covariance."""
-    a = 6 * first
+    a = 6 * window.points.before(first)
     value = -0.5 * float(white[:a] @ white[:a]) + float(np.log(np.diagonal(window.whiten)[:a]).sum())
     root = _motion.lower_inverse(np.ascontiguousarray(window.whiten[a:, a:]))
     return value, root @ white[a:], root @ root.T

@@ -21,6 +21,7 @@ from avsreplay.estimate import _motion
 from avsreplay.geometry import Array
 
 DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
+_EXCLUDED = math.log(0.01)  # log likelihood ratio to none below which a density is excluded
 _TOGETHER = 0.9  # prior probability that torque and force are both random where one is, and neither where one is not
 _SQUARES = np.append(0.0, DENSITIES**2)
 _FEW_ROWS = 36  # rows up to which a triangular matrix is inverted
@@ -74,6 +75,13 @@ class Marginal:
     def evidence(self) -> float:
         """Log likelihood of a disturbance, all decades of whose root density are equally likely, over none."""
         return float(np.logaddexp.reduce(self.log_odds)) - math.log(len(DENSITIES))
+
+    @property
+    def excluded(self) -> float:
+        """The least root density that is excluded together with all larger ones; inf where none is."""
+        possible = np.flatnonzero(self.log_odds > _EXCLUDED)
+        first = int(possible[-1]) + 1 if possible.size else 0
+        return float(DENSITIES[first]) if first < len(DENSITIES) else math.inf
 
     @property
     def likeliest(self) -> tuple[float, float]:

@@ -15,12 +15,12 @@ import numpy as np
 
 from avsreplay.estimate import _motion
 from avsreplay.estimate.bad_scans import bad_scans, frozen_sensor, noisier
+from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
     OFFSETS,
     PRIOR_ODDS,
-    SCALES,
     ChangePriors,
     Explanation,
     Hypothesis,
@@ -30,7 +30,6 @@ from avsreplay.estimate.scan_window import (
     mixed,
     odds_over_free,
     offsets,
-    since_each,
     window_of,
 )
 from avsreplay.estimate.track import Epoch
@@ -62,7 +61,7 @@ def explain(
     torque: float,
     force: float,
     orbit: RelativeOrbit | None = None,
-    quiet: bool = True,
+    excluded: tuple[float, float] = (0.0, 0.0),
 ) -> Ranked:
     """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely first.
 
@@ -77,42 +76,30 @@ def explain(
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
         orbit: the relative orbit of the target; None for free motion.
-        quiet: the poses before these scans show no random disturbance.
+        excluded: root densities of torque and force from which on the poses before exclude a random disturbance.
     """
     start = epochs[0].track.belief
-    window = window_of(epochs, start, torque, force, None if orbit is None else orbit.at(start.t_ns))
+    arc = None if orbit is None else orbit.at(start.t_ns)
+    window = window_of(epochs, first_doubtful, start, torque, force, arc)
     white = window.whiten @ window.y
-    accepted = white[: 6 * first_doubtful]
-    if first_doubtful > 1 and not linear(float(accepted @ accepted), epochs[:first_doubtful]):
+    accepted = white[: 6 * window.points.before(first_doubtful)]
+    if first_doubtful > 1 and not linear(float(accepted @ accepted), len(accepted), epochs[:first_doubtful]):
         left_out = first_doubtful // 2
-        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit, quiet)
+        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit, excluded)
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
-    n, edges = len(epochs), np.append(0.0, window.times_s)
+    edges = window.edges_s
     between = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
     found = [
-        Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
-        _manoeuvre(window, start, white, free, priors, n),
-        _disturbed(edges, between, white, free),
+        Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), len(white), len(epochs)),
+        _manoeuvre(window, start, white, free, priors),
+        _disturbed(edges, between, white, free, excluded),
         _accelerated(edges, between, white, free, priors),
-        _sensor_bias(window, white, free, priors, n),
+        _sensor_bias(window, white, free, priors),
         bad_scans(window, white, priors, first_doubtful),
         noisier(window, white, first_doubtful),
         frozen_sensor(window, first_doubtful),
     ]
-    return tuple(epochs), _ranked(sorted(found, key=lambda e: -e.log_evidence), quiet)
-
-
-def _ranked(found: list[Explanation], quiet: bool) -> list[Explanation]:
-    """The explanations, most likely first, a manoeuvre before random disturbances that are hardly more likely.
-
-    Disturbances as strong as the change would also have acted on the poses before the window, where these were
-    ``quiet``.
-    """
-    if not quiet or found[0].hypothesis is not Hypothesis.DISTURBED:
-        return found
-    least = found[0].log_evidence - _BEGINS
-    close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and e.explains]
-    return close + [e for e in found if e not in close]
+    return tuple(epochs), sorted(found, key=lambda e: -e.log_evidence)
 
 
 def certain(ranked: Sequence[Explanation]) -> bool:
@@ -122,32 +109,40 @@ def certain(ranked: Sequence[Explanation]) -> bool:
     return sure and (free or odds_over_free(ranked) >= OVER_FREE)
 
 
-def linear(chi2: float, epochs: Sequence[Epoch]) -> bool:
+def linear(chi2: float, dof: int, epochs: Sequence[Epoch]) -> bool:
     """Return whether the linearisation about the first prediction holds over scans that were all used.
 
-    Of a linear system the chi-square of free motion is the sum of the NIS, whatever moved the target.
+    Of a linear system the chi-square of free motion is the sum of the NIS, whatever moved the target. Where scans are
+    combined, what they differ by within their points is missing in it.
+
+    Args:
+        chi2: of free motion, with ``dof`` degrees of freedom.
+        dof: as many as six for each scan that is not combined.
+        epochs: the scans.
     """
-    return chi2 < _NONLINEAR * sum(e.innovation.nis for e in epochs)
+    total, all_dof = sum(e.innovation.nis for e in epochs), 6 * len(epochs)
+    return chi2 < _NONLINEAR * max(total - (all_dof - dof), total * dof / all_dof)
 
 
-def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
+def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors) -> Explanation:
     """A change of rate and velocity: at one instant, or spread over one to three intervals between scans.
 
     A thrust or an impact that is not instantaneous is a sum of changes, two in each interval, so that both the velocity
     and the pose at the end of the interval are free. All instants are marginalised for the evidence; the explanation is
     the most likely, with rate and velocity free.
     """
+    edges, lengths = window.edges_s[:-1], np.diff(window.edges_s)
+    n = len(lengths)
     count = _INSTANTS if n < _LONG else _FEWER
-    edges = np.concatenate([[0.0], window.times_s[: n - 1]])
-    lengths = np.diff(np.append(edges, window.times_s[-1]))
     instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
     columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
-    single = free + mixed(columns, white, scale, _CHANGES)
+    single = free + mixed(columns, white, scale, _CHANGES, priors.scales)
+    shares = np.repeat(np.log(np.maximum(n * lengths / lengths.sum(), 1e-300)), count)  # all instants are as likely
     two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array([count // 8, count - 1 - count // 8])
     M = (columns[two.reshape(-1)] * scale).transpose(1, 0, 2).reshape(len(white), -1)
     G, g = M.T @ M, M.T @ white
-    found, total = [], [log_mean(single.tolist())]
+    found, total = [], [log_mean((single + shares).tolist())]
     for m in range(1, len(_SPREAD)):
         if m > len(two):
             total.append(-math.inf)
@@ -159,33 +154,37 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
         total.append(log_mean(values.tolist()) if likely else -math.inf)
         if likely:
             found.append(most_likely)
-    fine, value = _located(window, start, white, free, scale, instants, single)
+    fine, value = _located(window, start, white, free, scale, priors.scales, instants, single)
     total[0] = max(total[0], value - math.log(float(window.times_s[-1])))
     odds = float(np.logaddexp.reduce(np.log(_SPREAD) + total)) + PRIOR_ODDS
     best = max((fine, *found), key=lambda f: f.log_evidence)
     if best is not fine:
-        best = replace(best, after_1s_s=math.hypot(best.after_1s_s, float(lengths.max()) / math.sqrt(12.0)))
+        at = min(int(np.searchsorted(edges, best.after_s)), n - 1)
+        best = replace(best, after_1s_s=math.hypot(best.after_1s_s, float(lengths[at]) / math.sqrt(12.0)))
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
     return replace(best, log_evidence=odds, onset=onset)
 
 
-def _disturbed(edges: Array, between: Array, white: Array, free: float) -> Explanation:
+def _disturbed(edges: Array, between: Array, white: Array, free: float, excluded: tuple[float, float]) -> Explanation:
     """Random torque or force beyond what is allowed for: an impulse between every two scans.
 
     ``size`` holds the most likely root density of the rate [rad/s^1.5] or of the velocity [m/s^1.5], three times each.
-    A constant torque changes the velocity in every interval as well, unlike a manoeuvre.
+    A constant torque changes the velocity in every interval as well, unlike a manoeuvre. From the densities
+    ``excluded`` on, which the earlier poses exclude, a disturbance is possible only if it begins within these scans.
 
-    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6n, 6) the effects of a change in each middle.
+    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6p, 6) the effects of a change in each middle.
     """
     columns, found, n = between * np.sqrt(np.diff(edges))[:, None, None], [], len(between)
-    for kind in _CHANGES[:2]:
-        A = columns[:, :, kind].transpose(1, 0, 2).reshape(6 * n, -1)
+    for kind, least in zip(_CHANGES[:2], (SPHERE * excluded[0], excluded[1]), strict=True):
+        A = columns[:, :, kind].transpose(1, 0, 2).reshape(len(white), -1)
         odds, fall = _motion.impulse_odds(A.T @ A, A.T @ white, _DENSITIES**2)
+        possible = least > _DENSITIES
+        odds = np.where(possible, odds + math.log(len(odds) / max(int(possible.sum()), 1)), odds - _BEGINS)
         k, size = int(np.argmax(odds)), np.zeros(6)
         size[kind] = _DENSITIES[k]
-        value = free + log_mean(odds.tolist()) + PRIOR_ODDS
+        value = free + log_mean(odds.tolist()) - math.log(2.0) + PRIOR_ODDS
         found.append(
-            Explanation(Hypothesis.DISTURBED, value, float(white @ white) - float(fall[k]), 6 * n, n, size=size)
+            Explanation(Hypothesis.DISTURBED, value, float(white @ white) - float(fall[k]), len(white), n, size=size)
         )
     return max(found, key=lambda f: f.log_evidence)
 
@@ -196,17 +195,26 @@ def _accelerated(edges: Array, between: Array, white: Array, free: float, priors
     ``size`` holds the root densities of random disturbances that cause changes as large over the window.
     """
     M, scale = np.tensordot(np.diff(edges), between, 1), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
-    found = [(kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2]) for kind in _CHANGES for f in SCALES]
+    found = [
+        (kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2]) for kind in _CHANGES for f in priors.scales
+    ]
     kind, _, u = max(found, key=lambda f: f[1])
     left, size = white - M[:, kind] @ u, np.zeros(6)
     size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
     value = log_mean([float(value) for _, value, _ in found]) + PRIOR_ODDS
-    n = len(between)
-    return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), 6 * n - len(u), n, size=size)
+    dof = len(white) - len(u)
+    return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), dof, len(between), size=size)
 
 
 def _located(
-    window: Window, start: Belief, white: Array, free: float, scale: Array, instants: Array, single: Array
+    window: Window,
+    start: Belief,
+    white: Array,
+    free: float,
+    scale: Array,
+    scales: Sequence[float],
+    instants: Array,
+    single: Array,
 ) -> tuple[Explanation, float]:
     """A change at one unknown instant, and the log of the integral of its evidence over the instant [s].
 
@@ -226,7 +234,7 @@ def _located(
         first, last = low, high
         instants = low + (high - low) * ((np.arange(_FINE) + 0.5) / _FINE)
         columns = _after_changes(window, start, instants)
-        single = free + mixed(columns, white, scale, _CHANGES)
+        single = free + mixed(columns, white, scale, _CHANGES, scales)
     if columns is None:
         raise AssertionError("the grid is refined at least once")
     weight = np.exp(single - single.max())
@@ -248,7 +256,7 @@ def _located(
 
 
 def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
-    """Derivatives (k, 6n, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
+    """Derivatives (k, 6p, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
     which = np.searchsorted(window.times_s, instants, side="right")
     return _motion.after_changes(window.late, which, impulses(start.x, instants), instants)
 
@@ -315,14 +323,14 @@ def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
     return distance <= float(acts[0]) * size + math.sqrt(_NOT_BY_CHANCE * max(variance, 0.0))
 
 
-def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
+def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors) -> Explanation:
     """A constant offset of the pose in {A} from one of the scans on: of its range, its position, or all of it."""
     M, scale = offsets(window, priors)
-    columns = since_each(window.whiten, M)[1:]
+    columns = window.since_each(M)[1:]
     values = free + mixed(columns, white, scale, OFFSETS)
     onset = int(np.argmax(values)) + 1
     whitened = columns[onset - 1][:, :6]
     _, u, P = log_evidence(white, free, whitened, scale[:6])
     left = white - whitened @ u
     odds = log_mean(values.tolist()) + PRIOR_ODDS
-    return Explanation(Hypothesis.SENSOR_BIAS, odds, float(left @ left), 6 * n - 6, onset, size=u, P=P)
+    return Explanation(Hypothesis.SENSOR_BIAS, odds, float(left @ left), len(white) - 6, onset, size=u, P=P)

@@ -66,6 +66,7 @@ class NoiseLevels:
         slack: by which disturbances enlarge the squared residuals of a fit without them, at least 1.
         count: poses of the estimate, 0 for the prior.
         established: the poses show a random disturbance.
+        excluded: root densities of torque and force from which on the poses exclude a random disturbance.
     """
 
     white: tuple[float, float] = (1.0, 1.0)
@@ -75,6 +76,7 @@ class NoiseLevels:
     slack: float = 1.0
     count: int = 0
     established: bool = False
+    excluded: tuple[float, float] = (math.inf, math.inf)
 
     def factors(self, share: float) -> Array:
         """(2,) factors on the claimed standard deviations of poses with this claimed share of common errors."""
@@ -152,6 +154,7 @@ def estimate_levels(
         force=math.sqrt(theta[5]),
         slack=slack,
         established=any(each.evidence > _ESTABLISHED for each, _ in found.values()),
+        excluded=(found[4][0].excluded if 4 in found else 0.0, found[5][0].excluded if 5 in found else 0.0),
     )
 
 

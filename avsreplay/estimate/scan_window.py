@@ -12,34 +12,31 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from itertools import pairwise
 
 import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
-from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
 from avsreplay.estimate.dynamics import process_noise
 from avsreplay.estimate.error_state import REACHED, rotation
-from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
+from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.relative_orbit import OrbitArc
+from avsreplay.estimate.scan_points import ScanPoints, scan_points
 from avsreplay.estimate.track import NO_CHANGE, Epoch
-from avsreplay.geometry import Array, Pose, conjugate, frozen, log, multiply
+from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Belief
 
 EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SUSPECTED = 5  # last scans in which a change may have begun
-_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
+_SIZES = (0.3, 0.1)  # prior standard deviations of such a change over those of a manoeuvre; a larger one is deferred
+_RUNS = (1, 2, 4, 8, 16, 32)  # lengths of the runs of innovations that are summed
+_RUN_GATE = 18.5  # of their squared sums: 99.5 % point of chi-square with 6 degrees of freedom
 OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # errors of the sensor: range, position, pose
-SCALES = (1.0, 0.1, 0.01)  # factors on the prior standard deviations: a large, a small or a very small change
-FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
-_DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
-_LONGEST = 3.0  # interval between two of them over the median
-_MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
+SCALES = (1.0, 0.1, 0.01)  # factors on a prior standard deviation: a large, a small or a very small error or change
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -58,12 +55,31 @@ class Hypothesis(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ChangePriors:
-    """1 sigma of the size of a change: rate [rad/s], velocity [m/s], position [m] and half angle of a sensor error."""
+    """1 sigma of the size of a change: rate [rad/s], velocity [m/s], position [m] and half angle of a sensor error.
+
+    ``scales`` are the factors on those of rate and velocity that are compared. A single prior that is wide in all
+    directions would hide a small change from few scans.
+    """
 
     rate_radps: float
     velocity_mps: float
     position_m: float
     half_angle: float
+    scales: tuple[float, ...] = SCALES
+
+    @classmethod
+    def of(cls, params: EstimatorParams, extent_m: float) -> ChangePriors:
+        """The priors of a run. Where large changes are expected, the small ones are compared that others show as well.
+
+        Args:
+            params: settings, auto values filled in.
+            extent_m: the target's bounding diagonal [m].
+        """
+        usual = EstimatorParams().resolved(extent_m).change_1s
+        larger = max(1.0, *(given / default for given, default in zip(params.change_1s, usual, strict=True)))
+        more = math.ceil(math.log10(larger) - 1e-9)
+        scales = (*SCALES, *(SCALES[-1] * 0.1 ** (k + 1) for k in range(more)))
+        return cls(*params.change_1s, 0.05 * extent_m, 0.05, scales)
 
 
 @value_class
@@ -99,13 +115,14 @@ class Explanation:
 
 @value_class
 class Window:
-    """Innovations y (6n,) about the trajectory predicted from the belief before the window.
+    """Innovations y (6p,) of p points about the trajectory predicted from the belief before the window of n scans.
 
-    ``C`` (6n, 6n) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor. ``late``
-    (n + 1, 6n, 12) holds the derivatives of the whitened innovations by attitude to velocity at the start of the
+    ``C`` (6p, 6p) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor. ``late``
+    (n + 1, 6p, 12) holds the derivatives of the whitened innovations by attitude to velocity at the start of the
     window, if these act on the scans from each one on alone.
     """
 
+    points: ScanPoints
     times_s: Array
     y: Array
     C: Array
@@ -115,11 +132,29 @@ class Window:
     R: tuple[Array, ...]
     R_ba: tuple[Array, ...]
 
+    @property
+    def edges_s(self) -> Array:
+        """(p + 1,) ends of the intervals between points, from the start on [s]."""
+        return np.append(0.0, self.times_s[np.append(self.points.first[1:], len(self.times_s)) - 1])
+
+    def since_each(self, columns: Array) -> Array:
+        """Columns (n, 6p, m) of the whitened innovations by what acts as ``columns`` (n, 6, m) from each scan on."""
+        return self.points.since_each(self.whiten, columns)
+
 
 def window_of(
-    epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None = None
+    epochs: Sequence[Epoch], accepted: int, start: Belief, torque: float, force: float, arc: OrbitArc | None = None
 ) -> Window:
-    """The scans about the trajectory from ``start``, with disturbances of these root densities."""
+    """The scans about the trajectory from ``start``, with disturbances of these root densities.
+
+    Args:
+        epochs: measured scans in the order of time.
+        accepted: number of them before the doubtful ones.
+        start: belief before the first of them.
+        torque: root density of the angular disturbance [rad/s^1.5].
+        force: root density of the linear disturbance [m/s^1.5].
+        arc: orbit of the target from ``start`` on; None for free motion.
+    """
     n = len(epochs)
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
     states, transitions, by_u, Q = driven_steps(start, times, torque, arc)
@@ -134,24 +169,19 @@ def window_of(
     C = np.where(earlier.T[:, None, :, None], C.transpose(2, 3, 0, 1), C)
     innovations = [e.innovation for e in epochs]
     R = tuple(i.R for i in innovations)
-    flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
     if isinstance(start, DrivenBelief):
         seen = (H @ by_u).reshape(6 * n, 6)
         across = rows.reshape(6 * n, 20) @ start.cross @ seen.T
-        flat += across + across.T + seen @ start.P_u @ seen.T
+        C += (across + across.T + seen @ start.P_u @ seen.T).reshape(n, 6, n, 6)
+    C += correlated_noise(R, [i.share for i in innovations]).reshape(n, 6, n, 6)
+    points = scan_points(R, accepted)
+    p = len(points.first)
+    flat = points.covariance(C).reshape(6 * p, 6 * p)
     flat = 0.5 * (flat + flat.T)
     whiten = _motion.lower_inverse(cholesky_root(flat))
-    late = np.concatenate([since_each(whiten, rows[:, :, :REACHED]), np.zeros((1, 6 * n, REACHED))])
-    return Window(times, y.reshape(-1), flat, whiten, late, poses, R, tuple(rotation(x.q_ab).T for x in states))
-
-
-def since_each(whiten: Array, columns: Array) -> Array:
-    """Columns (n, 6n, m) of the whitened innovations by what acts as ``columns`` (n, 6, m) on each scan and later ones.
-
-    The sum over the scans begins with the last.
-    """
-    by_scan = whiten.reshape(len(whiten), -1, 6).transpose(1, 0, 2) @ columns
-    return np.asarray(np.cumsum(by_scan[::-1], axis=0)[::-1])
+    late = np.concatenate([points.since_each(whiten, rows[:, :, :REACHED]), np.zeros((1, 6 * p, REACHED))])
+    R_ba = tuple(rotation(x.q_ab).T for x in states)
+    return Window(points, times, points.combined(y).reshape(-1), flat, whiten, late, poses, R, R_ba)
 
 
 def offsets(window: Window, priors: ChangePriors) -> tuple[Array, Array]:
@@ -200,6 +230,7 @@ def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors,
         np.array([i.R for i in seen]),
         np.array([c / i.weight for c, i in zip(inflation, seen, strict=True)]),
         (priors.rate_radps, priors.velocity_mps),
+        [size * each for each in priors.scales[:-1] for size in _SIZES],
         scale,
         seen[-1].share,
     )
@@ -239,69 +270,9 @@ def log_density(y: Array, C: Array) -> tuple[float, float]:
     return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
 
 
-def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array:
-    """(k,) log evidence over free motion of unknowns with columns M (k, m, n), the mean over kinds and prior widths.
-
-    A single prior that is wide in all directions would hide a small change of the velocity alone from few scans.
-    """
-    return _motion.mixed(M, white, scale, np.array(SCALES), [(kind.start, kind.stop) for kind in kinds])
-
-
-def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:
-    """Root densities of white disturbances that explain the differences of poses, without a model of the motion.
-
-    Two hypotheses explain a velocity between poses that changes: the poses have independent errors larger than claimed,
-    or the velocity is a random walk. Errors give consecutive changes of the velocity a correlation of -2/3, a random
-    walk 1/4, and smooth motion one near 1. Their likelihoods are marginal over the size of the errors and the density
-    of the walk, and their odds include the prior of every hypothesis.
-
-    Args:
-        fixes: registered poses in the order of time, none of them used.
-        extent_m: the target's bounding diagonal [m].
-
-    Returns:
-        Of the torque over the trace of the inertia tensor [rad/s^1.5], and of the force per unit mass [m/s^1.5]; None
-        where the poses are too few, or contradict one another, or the steps between them are too large to be followed.
-    """
-    if len(fixes) < FEWEST_DISTURBED:
-        return None
-    h = np.diff(np.array([f.t_ns for f in fixes], dtype=np.float64) * 1e-9)
-    if h.min() <= 0.0 or h.max() > _LONGEST * np.median(h):
-        return None
-    turns = np.array([log(multiply(conjugate(a.T_ac.q), b.T_ac.q)) for a, b in pairwise(fixes)])
-    moves = np.diff(np.array([f.T_ac.t for f in fixes]), axis=0)
-    found, odds = [], PRIOR_ODDS
-    for step, most, block in ((turns, _MOST_TURN, slice(0, 3)), (moves, _MOST_MOVE * extent_m, slice(3, 6))):
-        if np.sqrt((np.diff(step, axis=0) ** 2).sum(axis=1)).max() > most:
-            return None
-        claimed = float(np.mean([np.trace(f.C[block, block]) / 3.0 for f in fixes]))
-        errors, walk = _explained_changes(np.diff(step / h[:, None], axis=0), h, claimed)
-        odds += log_mean(walk.tolist()) - log_mean(errors.tolist())
-        weight = np.exp(walk - walk.max())
-        found.append(float(weight @ _DENSITIES**1.5 / weight.sum()) ** (2.0 / 3.0))
-    return (found[0] / SPHERE, found[1]) if odds > 0.0 else None
-
-
-def _explained_changes(changes: Array, h: Array, claimed: float) -> tuple[Array, Array]:
-    """Log likelihoods of changes (m, 3) of the velocity between poses at intervals h (m + 1,) [s].
-
-    Args:
-        changes: of the mean velocity from one interval to the next.
-        h: intervals between the poses.
-        claimed: variance of each component of a pose.
-
-    Returns:
-        (k,) by independent errors of the poses of the sizes ``_ERRORS`` over the claimed one, and (n,) by a random walk
-        of the velocity of the root densities ``_DENSITIES`` with errors as claimed.
-    """
-    second = np.diff(np.diff(np.eye(len(h) + 1), axis=0) / h[:, None], axis=0)
-    noise = claimed * second @ second.T
-    walk = np.diag((h[1:] + h[:-1]) / 3.0) + np.diag(h[1:-1] / 6.0, 1) + np.diag(h[1:-1] / 6.0, -1)
-    out = []
-    for C in (_ERRORS[:, None, None] ** 2 * noise, noise + _DENSITIES[:, None, None] ** 2 * walk):
-        left = np.einsum("mi,kmi->k", changes, np.linalg.solve(C, np.broadcast_to(changes, (len(C), *changes.shape))))
-        out.append(-0.5 * left - 1.5 * np.linalg.slogdet(C)[1])
-    return out[0], out[1]
+def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice], scales: Sequence[float] = SCALES) -> Array:
+    """(k,) log evidence over free motion of unknowns with columns M (k, m, n), the mean over kinds and prior widths."""
+    return _motion.mixed(M, white, scale, np.array(scales), [(kind.start, kind.stop) for kind in kinds])
 
 
 def scans_after(window: tuple[Epoch, ...], found: Explanation) -> int:

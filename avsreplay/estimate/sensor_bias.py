@@ -25,15 +25,14 @@ from avsreplay.estimate.scan_window import (
     mixed,
     odds_over_free,
     offsets,
-    since_each,
 )
 from avsreplay.estimate.track import Epoch, SensorBias
 from avsreplay.geometry import Array
 
 _MOST = 12  # scans of a bias that are compared
 
-Windowed = Callable[[tuple[Epoch, ...]], Window]
-"""The scans about the motion predicted from before the first of them (``scan_window.window_of``)."""
+Windowed = Callable[[tuple[Epoch, ...], int], Window]
+"""Scans, of which as many as stated are accepted, about the motion predicted from before (``window_of``)."""
 Compare = Callable[[tuple[Epoch, ...], int], Ranked]
 """The hypotheses about scans, of which as many as stated are accepted (``hypotheses.explain``)."""
 
@@ -71,7 +70,7 @@ def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: Change
     lasts = still < min(GATE, ended)
     if still < GATE and abs(ended - still) < -2.0 * PRIOR_ODDS and bias.before:
         scans = (*bias.before, *bias.since, epoch)
-        lasts = _end_odds(windowed(scans), len(bias.before), priors) < 0.0
+        lasts = _end_odds(windowed(scans, len(bias.before)), len(bias.before), priors) < 0.0
     return replace(bias, last=epoch) if lasts else None
 
 
@@ -79,7 +78,7 @@ def _end_odds(window: Window, onset: int, priors: ChangePriors) -> float:
     """Log odds of an error that begins at the scan ``onset`` of a window and has ended, over one that lasts."""
     white = window.whiten @ window.y
     M, scale = offsets(window, priors)
-    since = since_each(window.whiten, M)[onset:]
+    since = window.since_each(M)[onset:]
     ratios = mixed(since[0] - np.concatenate([since[1:], np.zeros((1, *since.shape[1:]))]), white, scale, OFFSETS)
     return log_mean(ratios[:-1].tolist()) - float(ratios[-1]) + PRIOR_ODDS
 

@@ -110,7 +110,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.step:
         for hz in (1.0, 2.0, 5.0, 10.0):
-            print(f"{hz:.0f} Hz: " + ", ".join(f"{100.0 * step_power(hz, k, 2e-3):.0f} %" for k in range(1, 8)))
+            print(f"{hz:.0f} Hz: " + ", ".join(f"{100.0 * step_power(hz, k, 2e-3):.0f} %" for k in range(1, 13)))
         return
     bodies, rng = options.bodies, np.random.Generator(np.random.PCG64(1))
     for q in TRUE:

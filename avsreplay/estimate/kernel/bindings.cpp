@@ -183,8 +183,10 @@ nb::tuple correct_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Matrix<
 // The likelihood ratio of a change in the last scans, and the second moments (20, 20) of the error it would cause.
 nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>& P, const Matrix<-1, SEEN, DIM>& H,
                     const Matrix<-1, SEEN>& alpha, const Matrix<-1, SEEN, SEEN>& S, const Matrix<-1, SEEN, SEEN>& R,
-                    const Matrix<-1, 2>& colour, const Two& one_sigma, double scale, double share) {
+                    const Matrix<-1, 2>& colour, const Two& one_sigma, const std::vector<double>& sizes, double scale,
+                    double share) {
   const size_t n = Phi.shape(0);
+  if (sizes.empty()) throw std::invalid_argument("a change needs a size");
   if (!n || P.shape(0) != n || H.shape(0) != n || alpha.shape(0) != n || S.shape(0) != n || R.shape(0) != n ||
       colour.shape(0) != n)
     throw std::invalid_argument("transitions, covariances and innovations must be equally many, one at least");
@@ -199,7 +201,7 @@ nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>&
     std::memcpy(scans[k].Phi, Phi.data() + DIM * DIM * k, sizeof scans[k].Phi);
   }
   Square moments;
-  const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), scale, share, moments);
+  const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), sizes, scale, share, moments);
   return nb::make_tuple(ratio, made(moments));
 }
 
@@ -690,7 +692,7 @@ NB_MODULE(_motion, m) {
         nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"),
         nb::arg("origin_c"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
-        nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
+        nb::arg("colour"), nb::arg("one_sigma"), nb::arg("sizes"), nb::arg("scale"), nb::arg("share"));
   m.def("after_changes", &after_changes, nb::arg("late"), nb::arg("which"), nb::arg("impulses"), nb::arg("instants"));
   m.def("evidence", &evidence_of, nb::arg("M"), nb::arg("white"), nb::arg("size"));
   m.def("log_ratio", &log_ratio_of, nb::arg("A"), nb::arg("b"));

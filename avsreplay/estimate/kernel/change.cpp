@@ -9,8 +9,7 @@
 namespace avs {
 namespace {
 
-constexpr int SIZES = 4;  // prior standard deviations of a change that are compared: from a large to a very small one
-constexpr double SIZE[SIZES] = {0.3, 0.1, 0.03, 0.01}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
+constexpr double PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
 
 constexpr double MOST = 600;  // log of a likelihood ratio, larger ones are cut
 
@@ -50,8 +49,8 @@ void evidence(const double A[SEEN][SEEN], const double b[SEEN], int first, doubl
 
 }  // namespace
 
-double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double share,
-                    double P[DIM][DIM]) {
+double change_ratio(const Used* scans, int count, const double one_sigma[2], const std::vector<double>& sizes, double scale,
+                    double share, double P[DIM][DIM]) {
   std::vector<Candidate> found;
   for (int k = 0; k < count; ++k) {
     const double wider = scale * (1 + (count - 1 - k) * share);  // errors that the scans from k on have in common
@@ -87,7 +86,7 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], dou
             for (int c = 0; c < SEEN; ++c) F[r][c] -= scan.Kt[i][r] * M[i][c];
       }
       for (int kind = 0; kind < 2; ++kind)
-        for (const double size : SIZE) {
+        for (const double size : sizes) {
           Candidate one;
           evidence(A, b, 3 * kind, size * one_sigma[kind], one);
           for (int r = 0; r < DIM; ++r)

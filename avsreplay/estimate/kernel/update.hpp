@@ -1,5 +1,7 @@
 // The filter's update in fixed size: gain, Joseph's form, and the displacement of a state through the chart.
 #pragma once
+#include <vector>
+
 #include <cstring>
 
 namespace avs {
@@ -43,10 +45,10 @@ void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2],
 
 // Likelihood ratio of a change of rate or velocity within one of the intervals before the last scans, to none, and the
 // second moments P of the estimate's error after the last of them if there was one, from the changes that the scans have
-// made more likely. `one_sigma` is that of the rate and of the velocity; `scale` is the factor on the covariance of the
-// innovations, and `share` the part of it that scans have in common.
-double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double share,
-                    double P[DIM][DIM]);
+// made more likely. `one_sigma` is that of the rate and of the velocity, times each of the `sizes`; `scale` is the factor on
+// the covariance of the innovations, and `share` the part of it that scans have in common.
+double change_ratio(const Used* scans, int count, const double one_sigma[2], const std::vector<double>& sizes, double scale,
+                    double share, double P[DIM][DIM]);
 
 // y and P of W unknowns once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
 template <int W>
