@@ -4,8 +4,8 @@ The header (scenario, seed, fault labels, start state) is one MCAP metadata reco
 their shortest exact form, so that a header read back equals the one written, bit for bit. MCAP has no checksum for
 metadata records; this record contains one over its own values.
 
-The model is an attachment or a file of its own: PLY, PCD and binary STL are read with the readers of this package,
-other STL, OBJ, OFF and GLB with trimesh.
+The model is an attachment or a file of its own: PLY and PCD are read with the readers of this package, STL, OBJ, OFF
+and GLB with trimesh.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
-from avsreplay.log.stl import read_binary_stl
 from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
@@ -277,17 +276,16 @@ def _pcd(data: bytes) -> tuple[Array, NDArray[Any]]:
     return points[np.isfinite(points).all(axis=1)], np.zeros((0, 3), np.int32)
 
 
-def _stl(data: bytes) -> tuple[Array, NDArray[Any]]:
-    found = read_binary_stl(data)
-    return _trimesh(data, "stl") if found is None else _merged(*found)
-
-
-_OWN_READERS = {"ply": _ply, "pcd": _pcd, "stl": _stl}
+_OWN_READERS = {"ply": _ply, "pcd": _pcd}
 
 
 def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     import trimesh
 
+    if suffix == "stl" and len(data) >= 84 and not data.lstrip().startswith(b"solid"):
+        promised = int.from_bytes(data[80:84], "little")
+        if 84 + 50 * promised > len(data):
+            raise BadFile(f"declares {promised} triangles in a file of {len(data)} bytes")
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
     # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
     _silence_trimesh()
