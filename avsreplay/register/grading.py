@@ -61,7 +61,8 @@ class Grader:
             of, full = self._restarter.part(scan) if fit.rough else scan, not fit.rough
             options = (self._params, halves and full, self._accuracy, full and not carried, start)
             found = quality.grade(index, self._target.visibility, of, fit, limits, *options)
-            found = replace(found, points=len(scan), inliers=found.inliers * len(scan) // len(of))
+            if fit.rough:
+                found = replace(found, points=len(scan), inliers=found.inliers * len(scan) // len(of))
             budget.registered(fit, found, len(of))
             ended = last or fit.iterations >= limits.n_max or budget.left < budget.healthy
             if ended or found.status is not AlignStatus.NOT_CONVERGED or not self._worth_more(guess, found):
