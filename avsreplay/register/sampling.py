@@ -26,6 +26,7 @@ AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings:
 SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
+PARTIAL = 0.85  # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
 GROUPED = 3000  # points of a scan in which connected groups are looked for
 MOST_SEGMENTS = 3
@@ -190,15 +191,16 @@ def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Itera
         extent_m: of the model.
         found: whether the first round gave a plausible pose.
     """
-    small = geometry.bounding_diagonal(target) <= LARGER * extent_m  # probably the target alone
-    yield target, 0
-    small = small or found()
+    size = geometry.bounding_diagonal(target)
+    first, next_one = (1, 0) if size < PARTIAL * extent_m else (0, 1)  # a part of the target is not at its centroid
+    yield target, first
+    small = size <= LARGER * extent_m or found()  # probably the target alone
     if small:
-        yield target, 1
+        yield target, next_one
     for part in islice(segments(target, extent_m), MOST_SEGMENTS):
         yield part, 0
     if not small:
-        yield target, 1
+        yield target, next_one
     yield target, 2
 
 
