@@ -295,8 +295,8 @@ class Registrar:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
         few = self._restarter.part(scan)
         starts = self._restarter.starts(few, first, guess, budget)
-        hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self.index.extent_m
-        tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
+        near = [at for at in starts if first.measured and at.noise_m <= NOISE_OF_EXTENT * self.index.extent_m]
+        hopeful, tried = bool(near), [self._regraded(scan, few, at, budget, halves, carried) for at in near] or [first]
         final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         reason = self._restarter.reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final, budget)):
