@@ -26,7 +26,7 @@ from avsreplay.register.global_search import (
     VisibleCentroids,
 )
 from avsreplay.register.params import AcquireParams, Camera
-from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
+from avsreplay.register.sampling import attempts, attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.simulate import builtin_surface
 
@@ -379,3 +379,11 @@ def test_a_search_ends_only_with_a_pose_that_little_contradicts(monkeypatch: pyt
     found = registrar.acquire(points)
     assert len(numbers) > 2
     assert found.status is AlignStatus.BUDGET_EXHAUSTED
+
+
+@pytest.mark.parametrize(("size", "numbers"), [(0.8, [1, 0, 2]), (0.9, [0, 1, 2])])
+def test_a_scan_of_a_part_of_the_target_is_searched_with_shifted_starts_first(size: float, numbers: list[int]) -> None:
+    rng = np.random.default_rng(SEED)
+    points = rng.uniform(-0.5, 0.5, (2000, 3)) * np.array([size, 0.0, 0.0]) + [0.0, 0.0, 3.0]
+    points[:2] = [[-0.5 * size, 0.0, 3.0], [0.5 * size, 0.0, 3.0]]
+    assert [number for part, number in attempts(points, 1.0, lambda: False) if part is points] == numbers
