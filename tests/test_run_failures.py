@@ -12,7 +12,7 @@ import trimesh
 from avsreplay.geometry import IDENTITY_QUAT, Pose
 from avsreplay.log import SourceOptions
 from avsreplay.records import Fit
-from avsreplay.register import Registrar
+from avsreplay.register import Registrar, registrar
 from avsreplay.register.registrar import POSTPONED
 from avsreplay.report import Summary
 from avsreplay.report.verdict import Grade, verdict_of
@@ -39,10 +39,16 @@ CASES = {
 }
 
 
+def _replace_backend(monkeypatch, align):
+    """Let every registration of a run use ``align`` in place of the back end."""
+    backend = type("Other", (), {"align": staticmethod(align)})()
+    monkeypatch.setattr(registrar, "create_backend", lambda *_: backend)
+
+
 @pytest.mark.parametrize("message", CASES)
-def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(message):
+def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(monkeypatch, message):
+    _replace_backend(monkeypatch, CASES[message])
     with Run(Job(source=LOG, options=SourceOptions(n_scans=2))) as run:
-        run.registrar._backend = type("Broken", (), {"align": staticmethod(CASES[message])})()
         rows = list(run.rows())
     assert [(row.status, row.gamma, row.message) for row in rows] == [("failed", 0, message)] * 2
     verdict = verdict_of(rows, Summary.fold(rows))
@@ -50,10 +56,10 @@ def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(message)
     assert any(message in reason.text for reason in verdict.reasons)
 
 
-def test_a_back_end_that_returns_its_guess_is_no_sensor():
+def test_a_back_end_that_returns_its_guess_is_no_sensor(monkeypatch):
     """The first pose is that of the global search; the later ones would be those of the filter itself, with NIS 0."""
+    _replace_backend(monkeypatch, lambda points, guess: Fit(guess, 1, True))
     with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
-        run.registrar._backend = type("Idle", (), {"align": staticmethod(lambda points, guess: Fit(guess, 1, True))})()
         rows = list(run.rows())
     message = "back end 'horn' returned its guess unchanged, although the residuals require a step"
     assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [("failed", 0, message)] * 3
