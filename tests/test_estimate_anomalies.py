@@ -620,6 +620,45 @@ def _poses_of(monkeypatch: pytest.MonkeyPatch, pose_at: Callable[[float], Pose])
     monkeypatch.setattr(surprises, "measured", measured)
 
 
+def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses of 0.1 mm at 10 Hz; the offset of 50 mm varies by 0.5 mm, which is many times their standard deviation."""
+    monkeypatch.setattr(surprises, "POS_M", 1e-4)
+    monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        along = [5e-4 * np.sin(40.0 * t) * (case.at_s <= t < case.until_s) for t in times]
+        given = simulated(case, times, states, seed)
+        return [
+            replace(a, T_ac=Pose(a.T_ac.q, a.T_ac.t + np.array([0.0, 0.0, d])))
+            for a, d in zip(given, along, strict=True)
+        ]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+    case = surprises.Case("bias", at_s=45.0, until_s=52.0, bias=0.05, hz=10.0, speed=0.3, seconds=54.0)
+    result = surprises.run(case, 1)
+    assert result.track is not None
+    assert not result.track.manoeuvres
+    during = [reason for t, reason in zip(result.t, result.reason, strict=True) if 45.35 < t < 51.95]
+    assert set(during) == {"sensor_bias"}
+    assert all(gamma for t, gamma in zip(result.t, result.gamma, strict=True) if t > 53.0)
+
+
+def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The offset stays, because the prediction has it: the scans from 60 s on have half of the residuals."""
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        given = simulated(case, times, states, seed)
+        return [replace(a, rms_m=0.016 if 30.0 <= t < 60.0 else 0.008) for t, a in zip(times, given, strict=True)]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+    result = surprises.run(surprises.Case("bias", at_s=45.0, bias=0.015), 0)
+    at = dict(zip(result.t, result.reason, strict=True))
+    assert {at[t] for t in result.t if 48.0 < t < 60.0} == {"sensor_bias"}
+    assert "sensor_bias" not in {at[t] for t in result.t if 60.0 <= t < 62.0}
+
+
 def _swing(t: float) -> Pose:
     """A part on a cable of 2 m that swings by 12 degrees in one plane and 4 in the other, and turns about the cable."""
     a, b = 0.2 * np.cos(2.2 * t), 0.07 * np.cos(2.2 * t + 1.0)

@@ -30,6 +30,8 @@ from avsreplay.estimate.track import Epoch, SensorBias
 from avsreplay.geometry import Array
 
 _MOST = 12  # scans of a bias that are compared
+_VARIES = 0.02  # 1 sigma of the change of an offset from scan to scan, because the view changes, over its size
+_QUIETER = 1.5  # least rms residual before and during an error over that of a scan which shows its end
 
 Windowed = Callable[[tuple[Epoch, ...], int], Window]
 """Scans, of which as many as stated are accepted, about the motion predicted from before (``window_of``)."""
@@ -52,8 +54,10 @@ def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: Change
     """Return the error after one more scan, None where it has ended.
 
     The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
-    scan to the next, where an offset that ends changes the innovation by its own size. Where this change does not
-    decide, because the offset is small, all scans do that are compared.
+    scan to the next, where an offset that ends changes the innovation by its own size. A range error displaces the pose
+    a little differently in every view. Where this change does not
+    decide, because the offset is small, all scans do that are compared. An error that begins with more noise ends with
+    it: the bias of the noise is such an error, and after it the prediction is too uncertain to show the end.
 
     Args:
         bias: after the last scan.
@@ -61,9 +65,14 @@ def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: Change
         windowed: the scans in coordinates of one prediction.
         priors: 1 sigma of the size of an error.
     """
+    seen = [e.innovation.rms_m for e in (*bias.before, *bias.since)]
+    if _QUIETER * epoch.innovation.rms_m < min(seen, default=0.0):
+        return None  # the scans are less noisy than before the error
     last, prediction = bias.last, epoch.prediction
     turned = prediction.H @ prediction.Phi - last.prediction.H
     P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
+    sizes = np.repeat([priors.position_m, priors.half_angle], 3)
+    P += np.diag((_VARIES * float(np.abs(bias.offset / sizes).max()) * sizes) ** 2)
     change = epoch.innovation.alpha - last.innovation.alpha
     still, ended = squared(change, P), squared(change + bias.offset, P + bias.P)
     ended += float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
