@@ -608,6 +608,16 @@ def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
         assert change.size[3:] == pytest.approx(step, abs=0.05)
 
 
+def test_an_error_of_a_known_acceleration_needs_no_other_evidence() -> None:
+    """The prior odds of 1e-3 are those of an acceleration that begins."""
+    rng = np.random.Generator(np.random.PCG64(4))
+    edges, white = np.linspace(0.0, 6.0, 13), rng.normal(size=72)
+    between, priors = rng.normal(size=(12, 72, 6)), scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
+    begins, known = (hypotheses._accelerated(edges, between, white, -5.0, priors, known) for known in (False, True))
+    assert known.log_evidence - begins.log_evidence == pytest.approx(np.log(1e3))
+    assert (known.chi2, known.dof) == (begins.chi2, begins.dof)
+
+
 def _poses_of(monkeypatch: pytest.MonkeyPatch, pose_at: Callable[[float], Pose]) -> None:
     """The campaign's simulated measurements, of other poses."""
     simulated = surprises.measured

@@ -16,7 +16,7 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.bad_scans import bad_scans, frozen_sensor, noisier
 from avsreplay.estimate.batch_covariance import SPHERE
-from avsreplay.estimate.driven import impulses
+from avsreplay.estimate.driven import DrivenBelief, impulses
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
     OFFSETS,
@@ -93,7 +93,7 @@ def explain(
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), len(white), len(epochs)),
         _manoeuvre(window, start, white, free, priors),
         _disturbed(edges, between, white, free, excluded),
-        _accelerated(edges, between, white, free, priors),
+        _accelerated(edges, between, white, free, priors, isinstance(epochs[-1].track.belief, DrivenBelief)),
         _sensor_bias(window, white, free, priors),
         bad_scans(window, white, priors, first_doubtful),
         noisier(window, white, first_doubtful),
@@ -189,10 +189,13 @@ def _disturbed(edges: Array, between: Array, white: Array, free: float, excluded
     return max(found, key=lambda f: f.log_evidence)
 
 
-def _accelerated(edges: Array, between: Array, white: Array, free: float, priors: ChangePriors) -> Explanation:
+def _accelerated(
+    edges: Array, between: Array, white: Array, free: float, priors: ChangePriors, known: bool
+) -> Explanation:
     """A constant torque or force: the same change of the velocity per second in every interval, as in ``_disturbed``.
 
-    ``size`` holds the root densities of random disturbances that cause changes as large over the window.
+    ``size`` holds the root densities of random disturbances that cause changes as large over the window. Where one is
+    ``known`` to act, an error of its value is as likely as none.
     """
     M, scale = np.tensordot(np.diff(edges), between, 1), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     found = [
@@ -201,7 +204,7 @@ def _accelerated(edges: Array, between: Array, white: Array, free: float, priors
     kind, _, u = max(found, key=lambda f: f[1])
     left, size = white - M[:, kind] @ u, np.zeros(6)
     size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
-    value = log_mean([float(value) for _, value, _ in found]) + PRIOR_ODDS
+    value = log_mean([float(value) for _, value, _ in found]) + (0.0 if known else PRIOR_ODDS)
     dof = len(white) - len(u)
     return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), dof, len(between), size=size)
 
