@@ -32,7 +32,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
 from avsreplay.register.budget import Effort, effort_after
-from avsreplay.register.duration import Duration, Durations, OrderedScan
+from avsreplay.register.duration import BIAS_SCANS, BLOCKS, MOST_WEIGHT, Duration, Durations, OrderedScan
 from avsreplay.register.mirror import SeenScan, from_another_side, mirror_image_fits, reflected, wanted
 from avsreplay.register.neighbourhood import POSTPONED
 from avsreplay.register.params import RegisterParams, RegistrationLimits
@@ -59,13 +59,11 @@ POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = 0.001  # least error of size that is reported; a single scan cannot show so small a one
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that would be reported
-BIAS_SCANS = 4  # scans on which the bias of the noise is found
-MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 _MIRRORED = "so that an axis of the model or of the points is inverted: change the sign of one coordinate in its file"
 _SEEN_POINTS, _DURATION_POINTS = 2000, 800  # of a scan: compared with the mirror image, and for its duration
 _PLACE_EVERY, _LEAST_PLACES = 2, 12  # scans of which one gives a place, and places that give the size
-_PLACE_POINTS, _BLOCKS = 500, 6  # points of each, and blocks of consecutive places, for the jackknife
+_PLACE_POINTS = 500  # points of each
 _LEAST_EXPLAINED = 0.5  # least share, explained by the size, of what a uniform motion leaves of the places
 _NOTED = 0.5  # least share of systematic errors that is reported
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
@@ -170,9 +168,9 @@ class ModelCheck:
             t_s = 1e-9 * (place.t_ns - self._places[0].t_ns)
             row = np.column_stack([np.eye(3), t_s * np.eye(3), place.R, -place.change])
             A[k], y[k] = row / max(place.sigma_m, least), place.at / max(place.sigma_m, least)
-        block = np.arange(len(y)) * _BLOCKS // len(y)
+        block = np.arange(len(y)) * BLOCKS // len(y)
         delta, left = _last_unknown(A, y)
-        without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(_BLOCKS)])
+        without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(BLOCKS)])
         uniform = _last_unknown(A[:, :, :9], y)[1]
         return (1.0 + delta, spread_of(without)) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
 
@@ -190,8 +188,11 @@ class ModelCheck:
             self._places, self._stride = self._places[::2], 2 * self._stride
 
     def _mean(self) -> tuple[float, float, Array]:
-        """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
-        return _jackknife(np.array(self._deltas), np.array(self._weights))
+        """The weighted mean of the errors of size, its standard error (jackknife), and the limited weights."""
+        values, weight = np.array(self._deltas), np.array(self._weights)
+        weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
+        without = (weight @ values - weight * values) / (weight.sum() - weight)
+        return float(weight @ values / weight.sum()), spread_of(without), weight
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
@@ -336,10 +337,3 @@ def _last_unknown(A: Array, y: Array) -> tuple[float, float]:
     x = np.linalg.lstsq(rows / scale, right, rcond=1e-9)[0] / scale
     left = right - rows @ x
     return float(x[-1]), float(left @ left)
-
-
-def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:
-    """Weighted mean of values, its standard error, and the weights, at most ``MOST_WEIGHT`` times their median."""
-    weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
-    without = (weight @ values - weight * values) / (weight.sum() - weight)
-    return float(weight @ values / weight.sum()), spread_of(without), weight

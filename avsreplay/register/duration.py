@@ -46,9 +46,12 @@ LEAST_OF_PERIOD = 0.02  # least duration that is reported, over the period
 
 @value_class
 class ScanDuration:
-    """Duration of one scan, its standard errors by the noise and by slowly varying errors [s], and the size.
+    """Duration and size that were fitted to one scan.
 
     Attributes:
+        duration_s: negative if the last point is measured first [s].
+        sigma_s: standard error of the duration by the noise [s].
+        systematic_s: its standard error by errors of model and ranges that vary slowly over the target [s].
         delta: size of the target over that of the model, less 1, fitted with the duration.
         weight: inverse variance of delta, without the slowly varying errors.
     """
