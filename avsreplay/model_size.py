@@ -18,8 +18,9 @@ from avsreplay.geometry import Array
 from avsreplay.log import SourceOptions
 from avsreplay.log.header import scaled
 from avsreplay.log.options import Unit
-from avsreplay.records import AlignStatus, Surface
+from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.mirror import SeenScan, mirror_image_fits, reflected
 from avsreplay.register.params import Camera
 from avsreplay.register.sampling import diameter, part_of_size
 from avsreplay.register.size import MOST_OF_MODEL
@@ -140,13 +141,16 @@ def find_model(
         options: how the log is read.
 
     Returns:
-        One finding: the number of scans in which the model is found, and whether the sensor is elsewhere.
+        The number of scans in which the model is found, and whether the sensor is elsewhere. If the mirror image of
+        the model explains the scans better, a second finding says so.
     """
     named = [advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")]
     scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
     model = scaled(surface, scale / options.model_unit.metres)
-    few = _few(clouds)
-    one, any_pose = _fitting(few, Registrar(model))
+    few, registrar = _few(clouds), Registrar(model)
+    poses = [registrar.acquire(cloud) for cloud in few]
+    one, any_pose = _counts(poses)
+    mirrored = _mirror_advice(few, poses, registrar, model, options)
     text = f"the model is found in {any_pose} of {len(few)} searched scans"
     if any_pose < len(few):
         anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[1]
@@ -154,8 +158,36 @@ def find_model(
             text += f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
             return [Advice("check", "sensor", text, "--set register.camera=none")]
     if not any_pose:
-        return [Advice("check", "pose", f"{text}: is it the right model, and does the topic show the target?")]
-    return [Advice("ok", "pose", text + ("" if one else ", each time in more than one pose"))]
+        doubt = ": is it the right model, and does the topic show the target?"
+        return [Advice("check", "pose", text + doubt * (not mirrored)), *mirrored]
+    return [Advice("ok", "pose", text + ("" if one else ", each time in more than one pose")), *mirrored]
+
+
+def _mirror_advice(
+    clouds: Sequence[NDArray[Any]],
+    poses: Sequence[Alignment],
+    registrar: Registrar,
+    model: Surface,
+    options: SourceOptions,
+) -> list[Advice]:
+    """What is said if the mirror image explains the scans in which the model is found, or is found where it is not."""
+    seen = [
+        SeenScan(np.asarray(cloud, dtype=np.float32), pose.T_ac.inverse())
+        for cloud, pose in zip(clouds, poses, strict=True)
+        if pose.measured
+    ]
+    if seen:
+        if not mirror_image_fits(registrar, model, seen):
+            return []
+        text = "the mirror image of the model explains the scans better than the model"
+    else:
+        found = _counts([registrar.acquire(reflected(cloud)) for cloud in clouds])[0]
+        if 2 * found <= len(clouds):
+            return []
+        text = f"the mirror image of the model is found in {found} of {len(clouds)} searched scans"
+    if options.model_mirror:
+        return [Advice("fail", "mirror", f"{text}: remove --model-mirror")]
+    return [Advice("fail", "mirror", f"{text}: an axis of the model or of the points is inverted", "--model-mirror")]
 
 
 def _few(clouds: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
@@ -245,7 +277,10 @@ def _unit_advice(
 
 def _fitting(clouds: Sequence[NDArray[Any]], registrar: Registrar) -> tuple[int, int]:
     """The numbers of scans in which a search finds one pose of the model, and one pose or more."""
-    found = [registrar.acquire(cloud) for cloud in clouds]
+    return _counts([registrar.acquire(cloud) for cloud in clouds])
+
+
+def _counts(found: Sequence[Alignment]) -> tuple[int, int]:
     return sum(each.status is AlignStatus.ALIGNED for each in found), sum(each.measured for each in found)
 
 

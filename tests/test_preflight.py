@@ -415,6 +415,32 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
     assert "5 healthy" in right.out
 
 
+def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures_folder, tmp_path):
+    """The mirror image is made with trimesh; the run with --model-mirror has the poses of the model turned about x."""
+    log, mirrored = fixtures_folder / "tumble.mcap", tmp_path / "mirrored.ply"
+    with open_source(log) as source:
+        own = source.header.surface
+    turned = trimesh.Trimesh(own.vertices * [1.0, -1.0, 1.0], own.faces[:, ::-1], process=False)
+    mirrored.write_bytes(turned.export(file_type="ply", encoding="binary", vertex_normal=False))
+
+    def options(path, *given):
+        checks = json.loads(cli("info", log, "--model", path, *given, "--json").out)["checks"]
+        return [(c["about"], c["grade"], c["option"]) for c in checks if "mirror" in c["about"]]
+
+    assert options(mirrored) == [("mirror", "fail", "--model-mirror")]
+    assert options(mirrored, "--model-mirror") == []
+    (tmp_path / "own.ply").write_bytes(surface_bytes(own))
+    assert options(tmp_path / "own.ply", "--model-mirror") == [("mirror", "fail", "")]
+    with open_source(log, SourceOptions(model=mirrored, model_mirror=True)) as source:
+        again = source.header.surface
+    half_turn = np.diag([-1.0, -1.0, 1.0])  # the sign of x after that of y
+    np.testing.assert_allclose(again.vertices, own.vertices @ half_turn, atol=1e-6)
+    volume = trimesh.Trimesh(again.vertices, again.faces, process=False).volume
+    assert volume == pytest.approx(trimesh.Trimesh(own.vertices, own.faces, process=False).volume, rel=1e-5)
+    done = cli("run", log, "--model", mirrored, "--model-mirror", "--init", "auto", "--n-scans", 6)
+    assert "6 healthy" in done.out
+
+
 def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(cli, fixtures_folder, tmp_path):
     trimesh.creation.icosphere(subdivisions=2, radius=1.2).export(tmp_path / "ball.stl")
     options = ["--model", tmp_path / "ball.stl", "--init", "auto", "--n-scans", 3, "--json"]

@@ -53,7 +53,7 @@ def test_a_mirrored_model_of_a_nearly_symmetric_object_is_noticed_although_scans
     assert accepted >= 4
     (note,) = check.notes()
     assert "mirror image of the model explains the scans better" in note
-    assert "change the sign of one coordinate" in note
+    assert "--model-mirror" in note
 
 
 @pytest.mark.slow

@@ -79,6 +79,7 @@ run_source_options = added(
     source_setting("--cloud-model", is_flag=True),
     source_setting("--model-unit"),
     source_setting("--model-scale", type=float),
+    source_setting("--model-mirror", is_flag=True),
     source_setting("--topic"),
     source_setting("--truth-topic"),
     source_setting("--truth", "truth_file", type=PATH),

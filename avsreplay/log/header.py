@@ -207,20 +207,20 @@ def with_vertices(surface: Surface, vertices: Array) -> Surface:
     return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
 
 
-def in_metres(surface: Surface, factor: float) -> Surface:
-    """Return the model with its coordinates multiplied by the factor of the reading options.
+def in_metres(surface: Surface, factor: float, mirror: bool = False) -> Surface:
+    """Return the model in metres as the reading options ask for it.
 
     Args:
         surface: the model as in its file.
-        factor: metres per unit of the file, times the scale that the user gives.
-
-    Returns:
-        The scaled model.
+        factor: of its coordinates: metres per unit of the file, times the scale that the user gives.
+        mirror: change the sign of the x coordinates, and the winding of the faces.
 
     Raises:
         UnreadableInput: the scaled model is too large or too small.
     """
     found = scaled(surface, factor)
+    if mirror:
+        found = with_vertices(replace(found, faces=found.faces[:, ::-1].copy()), found.vertices * [-1.0, 1.0, 1.0])
     if found is not surface:
         _check(found.vertices, found.faces, shown(surface.name), cloud_ok=True)
     return found

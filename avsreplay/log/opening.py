@@ -154,11 +154,14 @@ def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tu
             header = decode_header(recording.metadata[HEADER_RECORD])
         except ValueError as error:
             lost.append(Loss(shown(error), 0, 0))
-    surface = read_surface(options.model, options.cloud_model) if options.model is not None else None
-    if surface is None:
-        surface, trouble = _carried(recording)
-        lost += trouble
-    return replace(header, surface=surface and in_metres(surface, options.model_factor)), tuple(lost)
+    carried, trouble = (None, []) if options.model is not None else _carried(recording)
+    return replace(header, surface=_model(options, carried)), tuple(lost + trouble)
+
+
+def _model(options: SourceOptions, carried: Surface | None = None) -> Surface | None:
+    """The model that the user gives or else that of the log, in metres."""
+    surface = carried if options.model is None else read_surface(options.model, options.cloud_model)
+    return surface and in_metres(surface, options.model_factor, options.model_mirror)
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
@@ -197,9 +200,8 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     """
     _refuse_topics("a pose file", path, options)
     poses = streams.PoseFile(path, options.scan_rate_hz)
-    surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     header = LogHeader(
-        surface=surface and in_metres(surface, options.model_factor),
+        surface=_model(options),
         notes={"source": "pose file", "times": options.times_note(poses.timed)},
     )
     truth = streams.GroundTruth()
@@ -304,8 +306,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     files = scan_files(path, tuple(by_name), options.model)
     times = _times(path, files, found)
     clouds = streams.FolderClouds(files, options.scan_rate_hz, options.max_message_mib << 20, times)
-    surface = None if options.model is None else read_surface(options.model, options.cloud_model)
-    surface = surface and in_metres(surface, options.model_factor)
+    surface = _model(options)
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
     header = LogHeader(surface=surface, notes={"source": "folder", "times": options.times_note(times is not None)})

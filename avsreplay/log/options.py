@@ -84,6 +84,9 @@ class SourceOptions(Settings):
         "Factor on the size of the model, in addition to its unit: 1.01 for a model that is 1 % too small.",
         above=0.0,
     )
+    model_mirror: bool = setting(
+        False, "Use the mirror image of the model: the x coordinates change their sign, and the faces their winding."
+    )
     clock: ClockChoice = setting(
         ClockChoice.HEADER,
         "Clock of the scans: stamps of the messages (header), reception by the recorder (log) or publication.",
