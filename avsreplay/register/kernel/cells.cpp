@@ -103,6 +103,7 @@ void write_lists(Store& s, const std::vector<std::vector<Near>>& parts) {
   s.lists.assign(1, 0);
   for (size_t k = 0; k < next.size(); ++k)
     if (start[k + 1] > start[k]) write_list(s, k, entries.data() + start[k], entries.data() + start[k + 1]);
+  s.lists.insert(s.lists.end(), LANES, 0);  // eight entries are read at a time
   s.lists.shrink_to_fit();
 }
 

@@ -1,6 +1,7 @@
 // Memory of large arrays that are read at random: aligned to cache lines, and in huge pages where the system has them.
 #pragma once
 #include <cstddef>
+#include <cstdint>
 #include <new>
 #include <vector>
 #if defined(__linux__)
@@ -32,18 +33,40 @@ struct Pages {
   template <class U>
   Pages(const Pages<U>&) {}
 
-  static std::size_t alignment(std::size_t n) { return n * sizeof(T) < LARGE_ARRAY ? CACHE_LINE : HUGE_PAGE; }
-  static std::size_t bytes(std::size_t n) { return (n * sizeof(T) + alignment(n) - 1) / alignment(n) * alignment(n); }
+  static constexpr bool is_large(std::size_t n) { return n * sizeof(T) >= LARGE_ARRAY; }
 
   T* allocate(std::size_t n) {
-    void* p = ::operator new(bytes(n), std::align_val_t(alignment(n)));
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    if (alignment(n) == HUGE_PAGE) ::madvise(p, bytes(n), MADV_HUGEPAGE);
+    if (is_large(n)) return static_cast<T*>(huge(whole(n, HUGE_PAGE)));
 #endif
-    return static_cast<T*>(p);
+    return static_cast<T*>(::operator new(whole(n, CACHE_LINE), std::align_val_t(CACHE_LINE)));
   }
-  void deallocate(T* p, std::size_t n) { ::operator delete(p, std::align_val_t(alignment(n))); }
+  void deallocate(T* p, std::size_t n) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    if (is_large(n)) return void(::munmap(p, whole(n, HUGE_PAGE)));
+#endif
+    ::operator delete(p, std::align_val_t(CACHE_LINE));
+  }
 
+ private:
+  static std::size_t whole(std::size_t n, std::size_t unit) { return (n * sizeof(T) + unit - 1) / unit * unit; }
+
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  // From the system and not from the memory that was freed before: pages that were used remain small.
+  static void* huge(std::size_t size) {
+    const std::size_t all = size + HUGE_PAGE;
+    void* p = ::mmap(nullptr, all, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (p == MAP_FAILED) throw std::bad_alloc();
+    char* first = static_cast<char*>(p);
+    const std::size_t before = (HUGE_PAGE - reinterpret_cast<std::uintptr_t>(p) % HUGE_PAGE) % HUGE_PAGE;
+    if (before) ::munmap(first, before);
+    if (before < HUGE_PAGE) ::munmap(first + before + size, HUGE_PAGE - before);
+    ::madvise(first + before, size, MADV_HUGEPAGE);
+    return first + before;
+  }
+#endif
+
+ public:
   friend bool operator==(const Pages&, const Pages&) { return true; }
   friend bool operator!=(const Pages&, const Pages&) { return false; }
 };

@@ -18,6 +18,8 @@ struct Strip {
   alignas(32) double c[3][STRIP];   // moved, in {C}
   int32_t lane[STRIP];              // of the primitive that is nearest, -1: none
   const uint32_t* list[STRIP];      // of the cell of a point that is searched for, or null
+  alignas(16) float at[STRIP][4];   // moved, relative to the model's centre; the last is not used
+  float off[STRIP];                 // its distance from the centre of this cell, rounded up [m]
   Treat search[STRIP];
 };
 
@@ -63,6 +65,10 @@ static int gather(const Scope& o, const View& v, int64_t first, int n, const dou
     }
     c.search[i] = kept ? treat(kept[first + i], c, i) : SEARCHED;
   }
+  for (int i = 0; i < n; ++i) {
+    c.at[i][0] = (float)(c.c[0][i] - s.centre.x), c.at[i][1] = (float)(c.c[1][i] - s.centre.y), c.at[i][2] = (float)(c.c[2][i] - s.centre.z);
+    c.at[i][3] = 0;
+  }
   const D4 low[3] = {d4(s.low.x), d4(s.low.y), d4(s.low.z)}, per_cell = d4(o.per_cell);
   for (int i = 0; i < n; i += 4)
     for (int k = 0; k < 3; ++k) store4(c.f[k] + i, (load4(c.c[k] + i) - low[k]) * per_cell);
@@ -71,101 +77,21 @@ static int gather(const Scope& o, const View& v, int64_t first, int n, const dou
       if (const uint32_t* word = c.list[i] = word_at(s, c.f[0][i], c.f[1][i], c.f[2][i])) fetch(word);
   for (int i = 0; i < n; ++i) {
     c.list[i] = list_of(s, c.list[i]);
-    if (c.list[i]) fetch(c.list[i]);
+    if (!c.list[i]) continue;
+    fetch(c.list[i]);
+    c.off[i] = off_centre(s, c.f[0][i], c.f[1][i], c.f[2][i]);
   }
   return ignored;
 }
 
-// Square of a length, with room for rounding; negative where it is not positive.
-static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
+#include "searches.hpp"
 
-template <class Room>
-static inline Kept kept_at(const Query& q, const Room& room, int32_t nearest) {
-  return {q.x, q.y, q.z, squared(room.lane), squared(room.block), squared(room.pair), nearest, room.other};
-}
-
-// The nearest lane of the kept neighbour's block, and of the other block where `pair`. `remember`: where what is left of
-// the room is written for later passes, or null.
-template <class Kind>
-static inline int32_t keep_one(const Scope& o, const Query& q, bool pair, const Kept& was, Kept* remember, int64_t& compared) {
-  Search<Kind> search(o, q);
-  search.run_blocks((uint32_t)was.lane / LANES, pair ? was.other : NO_CHILD);
-  compared += search.compared();
-  if (!remember || search.lane() < 0) return search.lane();
-  const double x = q.x - was.x, y = q.y - was.y, z = q.z - was.z;
-  const float moved = 1.0001f * (float)std::sqrt(x * x + y * y + z * z);
-  const auto left = [moved](float room2) { return room2 > 0.f ? std::sqrt(room2) - moved : 0.f; };
-  const auto room = search.room_left({0.f, left(was.block2), left(was.pair2), was.other});
-  *remember = kept_at(q, room, search.lane());
-  return search.lane();
-}
-
-template <class Kind>
-static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept,
-                                 int64_t& compared) {
-  Search<Kind> search(o, q);
-  search.run(list, seed);
-  compared += search.compared();
-  if (kept) {
-    typename Search<Kind>::Room room{0.f, 0.f, 0.f, NO_CHILD};
-    if (o.lead > 0.f) room = search.room();
-    *kept = kept_at(q, room, search.lane());
-  }
-  return search.lane();
-}
-
-// A kept neighbour that no longer faces the eye is searched for again.
-template <class Kind>
-static inline bool is_kept(const Scope& o, Treat treat, int32_t lane) {
-  if (treat <= SEARCHED) return false;
-  if (!o.eye || lane < 0 || o.facing.sure[lane / LANES] >> lane % LANES & 1) return true;
-  return Kind::faces(o.s, (uint32_t)lane, *o.eye);
-}
-
-constexpr int AHEAD = 4, FAR_AHEAD = 16;  // points ahead of the search, and of the feet
-
-// What the search of a point will read first.
-template <class Kind>
-static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, int32_t lane, uint32_t other) {
-  if ((treat == IN_BLOCK || treat == IN_PAIR) && lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
-  if (treat == IN_PAIR && other != NO_CHILD) Kind::prefetch_block(s, other);
-  if (!list) return;
-  if (lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
-  const uint32_t n = *list & (MOST_BLOCKS - 1);
-  for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch_block(s, list[k] & (MOST_BLOCKS - 1));
-}
-
-// What the searches of a chunk took.
-struct Effort {
-  int64_t ignored = 0;                 // points that are not finite
-  int64_t searched = 0, compared = 0;  // searches made; blocks and nodes that were compared, also for kept neighbours
-  int32_t last = -1;                   // the primitive of the last point
-};
+constexpr int FAR_AHEAD = 16;  // points ahead of the feet
 
 // Finds the primitive of every point of a strip. `remember`: where, for later passes.
 template <class Kind>
 static void search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Strip& c, Effort& effort) {
-  const auto own = [&](int i) { return kept ? kept[first + i].lane : -1; };
-  const auto other = [&](int i) { return kept && c.search[i] == IN_PAIR ? kept[first + i].other : NO_CHILD; };
-  for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], own(i + AHEAD), other(i + AHEAD));
-    c.lane[i] = -1;
-    if (c.search[i] == IGNORED) continue;
-    const int32_t lane = own(i);
-    if (is_kept<Kind>(o, c.search[i], lane)) {
-      c.lane[i] = lane;
-      if (c.search[i] == KEPT || lane < 0) continue;
-      Kept* memory = remember ? remember + first + i : nullptr;
-      const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
-      c.lane[i] = keep_one<Kind>(o, q, c.search[i] == IN_PAIR, kept[first + i], memory, effort.compared);
-    } else {
-      const int32_t seed = lane < 0 && !c.list[i] ? effort.last : lane;
-      Kept* memory = remember ? remember + first + i : nullptr;
-      c.lane[i] = search_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.list[i], seed, memory, effort.compared);
-      ++effort.searched;
-    }
-    effort.last = c.lane[i];
-  }
+  SearchesOfStrip<Kind>(o, n, kept ? kept + first : nullptr, remember ? remember + first : nullptr, c).run(effort);
 }
 
 // Calls put(i, points, feet, which of them are nearer than the bound) for every four points of the strip.
@@ -298,13 +224,12 @@ template <class Kind>
 static bool search_beyond(const Scope& o, int n, double known, Strip& c) {
   if (known >= o.bound) return false;
   bool any = false;
-  int64_t compared = 0;
   for (int i = 0; i < n; ++i) {
     if (c.search[i] <= SEARCHED || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
     const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
     const Vec3& low = o.s.low;
     const uint32_t* word = word_at(o.s, (q.x - low.x) * o.per_cell, (q.y - low.y) * o.per_cell, (q.z - low.z) * o.per_cell);
-    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word), c.lane[i], nullptr, compared);
+    c.lane[i] = Search<Kind>(o, q).run(list_of(o.s, word), c.lane[i]);
     any = true;
   }
   return any;

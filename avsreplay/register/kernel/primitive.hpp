@@ -81,16 +81,16 @@ struct Triangles {
                   dx * load8(b.w[0]) + dy * load8(b.w[1]) + dz * load8(b.w[2])) + z * z;
   }
 
-  // Squared distances of the places (x, y) of the planes from the triangles: zero inside, else to the nearest side.
+  // Squared distances of the places (x, y) of the planes from the triangles: zero inside, else to the nearest side. Both
+  // angles at the longest side are acute. Where y < 0 this side is therefore the nearest, and otherwise the one on the same
+  // side of the altitude, which is mirrored so that it begins at the origin.
   static F8 beside(const TriangleBlock& b, F8 x, F8 y) {
     const F8 zero = f8(0.f), one = f8(1.f), length = load8(b.length), cx = load8(b.cx), cy = load8(b.cy);
-    const F8 bx = length - cx, rx = length - x;
-    const F8 t = clamp8((x * cx + y * cy) / squared(cx, cy), zero, one);
-    const F8 s = clamp8((rx * bx + y * cy) / squared(bx, cy), zero, one);
-    const F8 e1 = squared(x - clamp8(x, zero, length), y), e2 = squared(x - t * cx, y - t * cy);
-    const F8 e3 = squared(rx - s * bx, y - s * cy);
-    const F8::Mask out = either(either(y < zero, x * cy - y * cx < zero), rx * cy - y * bx < zero);
-    return select(out, min8(min8(e1, e2), e3), zero);
+    const F8::Mask left = x < cx;
+    const F8 along = select(left, x, length - x), end = select(left, cx, length - cx);
+    const F8 t = clamp8((along * end + y * cy) / squared(end, cy), zero, one);
+    const F8 outside = select(along * cy < y * end, squared(along - t * end, y - t * cy), zero);
+    return select(y < zero, squared(min8(along, zero), y), outside);
   }
 
   static Four feet(const Store& s, const uint32_t (&lane)[4], const D4 (&p)[3], Ask ask) {

@@ -113,7 +113,7 @@ bool sound_list(const Store& s, uint32_t start) {
   if (start == 0) return true;
   if (start >= s.lists.size()) return false;
   const uint32_t n = s.lists[start] & (MOST_BLOCKS - 1);
-  if (n > (uint32_t)LONGEST_LIST || n > s.lists.size() - start - 1) return false;
+  if (n > (uint32_t)LONGEST_LIST || n + LANES > s.lists.size() - start - 1) return false;
   for (uint32_t k = 1; k <= n; ++k)
     if ((s.lists[start + k] & (MOST_BLOCKS - 1)) >= s.blocks) return false;
   return true;

@@ -51,7 +51,13 @@ static inline F8 operator/(F8 a, F8 b) { return {a.v / b.v}; }
 static inline F8::Mask operator<(F8 a, F8 b) { return a.v < b.v; }
 static inline F8::Mask both(F8::Mask a, F8::Mask b) { return a & b; }
 static inline F8::Mask either(F8::Mask a, F8::Mask b) { return a | b; }
-static inline F8 select(F8::Mask m, F8 a, F8 b) { return {m ? a.v : b.v}; }
+static inline F8 select(F8::Mask m, F8 a, F8 b) {
+#if defined(__AVX__)
+  return {m ? a.v : b.v};
+#else
+  return {(F8::Raw)(((F8::Mask)a.v & m) | ((F8::Mask)b.v & ~m))};
+#endif
+}
 static inline F4 f4(float x) { return {x - F4::Raw{}}; }
 static inline F4 operator+(F4 a, F4 b) { return {a.v + b.v}; }
 static inline F4 operator-(F4 a, F4 b) { return {a.v - b.v}; }
@@ -160,10 +166,29 @@ static inline bool any(D4::Mask m) {
 #endif
 }
 
+#if AVS_VECTORS && defined(__SSE2__) && !defined(__AVX__)
+struct Halves {
+  __m128 low, high;
+};
+static inline Halves halves(F8 a) {
+  Halves r;
+  std::memcpy(&r, &a, sizeof r);
+  return r;
+}
+static inline F8 whole(Halves a) {
+  F8 r;
+  std::memcpy(&r, &a, sizeof r);
+  return r;
+}
+#endif
+
 // The second operand where they are equal or one is not a number, as minps and maxps do.
 static inline F8 min8(F8 a, F8 b) {
 #if AVS_VECTORS && defined(__AVX__)
   return {(F8::Raw)_mm256_min_ps((__m256)a.v, (__m256)b.v)};
+#elif AVS_VECTORS && defined(__SSE2__)
+  const Halves x = halves(a), y = halves(b);
+  return whole({_mm_min_ps(x.low, y.low), _mm_min_ps(x.high, y.high)});
 #else
   return select(a < b, a, b);
 #endif
@@ -171,6 +196,9 @@ static inline F8 min8(F8 a, F8 b) {
 static inline F8 max8(F8 a, F8 b) {
 #if AVS_VECTORS && defined(__AVX__)
   return {(F8::Raw)_mm256_max_ps((__m256)a.v, (__m256)b.v)};
+#elif AVS_VECTORS && defined(__SSE2__)
+  const Halves x = halves(a), y = halves(b);
+  return whole({_mm_max_ps(x.low, y.low), _mm_max_ps(x.high, y.high)});
 #else
   return select(b < a, a, b);
 #endif
@@ -190,11 +218,29 @@ static inline F8 clamp8(F8 x, F8 lo, F8 hi) { return min8(max8(x, lo), hi); }
 static inline F8 sqrt8(F8 a) {
 #if AVS_VECTORS && defined(__AVX__)
   return {(F8::Raw)_mm256_sqrt_ps((__m256)a.v)};
+#elif AVS_VECTORS && defined(__SSE2__)
+  const Halves x = halves(a);
+  return whole({_mm_sqrt_ps(x.low), _mm_sqrt_ps(x.high)});
 #else
   float t[8];
   store8(t, a);
   for (int k = 0; k < 8; ++k) t[k] = std::sqrt(t[k]);
   return load8(t);
+#endif
+}
+
+// The high bits of eight words from bit `SHIFT` on, as numbers.
+template <int SHIFT>
+static inline F8 high_bits8(const uint32_t* p) {
+#if AVS_VECTORS
+  typedef uint32_t Words __attribute__((vector_size(32)));
+  Words words;
+  std::memcpy(&words, p, sizeof words);
+  return {__builtin_convertvector((F8::Mask)(words >> SHIFT), F8::Raw)};
+#else
+  F8 r;
+  for (int k = 0; k < 8; ++k) r.v[k] = (float)(int32_t)(p[k] >> SHIFT);
+  return r;
 #endif
 }
 
@@ -220,6 +266,11 @@ static inline float least(F8 a) {
   __m128 m = _mm_min_ps(_mm256_castps256_ps128((__m256)a.v), _mm256_extractf128_ps((__m256)a.v, 1));
   m = _mm_min_ps(m, _mm_movehl_ps(m, m));
   return _mm_cvtss_f32(_mm_min_ss(m, _mm_movehdup_ps(m)));
+#elif AVS_VECTORS && defined(__SSE2__)
+  const Halves x = halves(a);
+  __m128 m = _mm_min_ps(x.low, x.high);
+  m = _mm_min_ps(m, _mm_movehl_ps(m, m));
+  return _mm_cvtss_f32(_mm_min_ss(m, _mm_shuffle_ps(m, m, 1)));
 #else
   float t[8];
   store8(t, a);
