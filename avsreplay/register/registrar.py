@@ -204,8 +204,9 @@ class Registrar:
             none = replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
             return none, alone, True
         if decided:
-            budget.spend(self._symmetry.work(len(part), len(rivals)))
-            best, rivals = self._symmetry.decided(part, found.T_ac.inverse(), rivals, at.covered)
+            work = self._symmetry.work(len(part), len(rivals))
+            best, rivals, extra = self._symmetry.decided(part, found.T_ac.inverse(), rivals, at.covered)
+            budget.spend(work + extra)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
                 found = self._regraded(scan, few, self._restarter.measure(few, best, budget), budget, True, carried)
         return self._unrivalled(scan, found, rivals, at.covered, budget), alone, at.doubtful
@@ -261,8 +262,9 @@ class Registrar:
         if not budget.allows(work := self._symmetry.work(len(scan))):
             return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
-        budget.spend(work + TEST_WORK)
-        best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
+        covered = self._test.check(part, T_ca).covered
+        best, rivals, extra = self._symmetry.decided(scan, T_ca, [] if unsure else None, covered)
+        budget.spend(work + TEST_WORK + extra)
         turned = found if best is T_ca else self._grader.graded(scan, best.inverse(), budget, None, halves, carried)
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
         return quality.left_undetermined(found, unknown) if unsure and rivals else found

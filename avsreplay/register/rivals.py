@@ -48,8 +48,8 @@ NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the gue
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
-STEPS, LONGEST_STEP = 24, 0.05  # steps from a mark towards the camera; the longest, over the extent
-USUAL_STEPS = 3  # for a mark in the mean: most of them face away, or the steps soon leave the box of the model
+SCREENED_MARKS = 100  # marks with which all motions are compared
+RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
 
 
@@ -88,7 +88,6 @@ class NearSymmetry:
             kept["marks"], kept["marked"] = self._found()
         self._marks, self._normals = kept["marks"]
         self._share, self._area = (float(x) for x in kept["marked"])
-        self._low, self._high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
 
     def _found(self) -> tuple[Array, Array]:
         """Points on the marks and their normals (2, n, 3); the share of the surface that they have, and a point's area.
@@ -134,9 +133,9 @@ class NearSymmetry:
     def work(self, points: int, others: int = 0) -> int:
         """Return the usual cost of a decision between so many other poses and the turned ones in point searches."""
         motions, finalists = sum(len(motions) for motions in self._kinds), FINALISTS * len(self._kinds)
-        rays = USUAL_STEPS * len(self._marks)
+        rays = RAY_WORK * len(self._marks)
         measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
-        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + rays) + measured
+        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
 
     def after_search(self, points: int) -> int:
         """Return the usual cost of what follows a search for a scan of so many points, in point searches."""
@@ -149,8 +148,10 @@ class NearSymmetry:
 
     def decided(
         self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool
-    ) -> tuple[Pose, list[Pose]]:
-        """Return the pose for which the rays decide, and the others that explain the scan as well.
+    ) -> tuple[Pose, list[Pose], int]:
+        """Return the pose for which the rays decide, the others that explain the scan as well, and extra work.
+
+        The extra work is what the comparison took beyond ``work``, because the rays spoke against many motions.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -160,10 +161,11 @@ class NearSymmetry:
         """
         rays = Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
         if not len(rays.points):
-            return T_ca, others or []
-        turned = self._turned(rays, T_ca, others is None)
+            return T_ca, others or [], 0
+        turned, tested = self._turned(rays, T_ca, others is None)
+        extra = max(0, tested - FINALISTS * len(self._kinds)) * self._ray_work
         if others is None and not turned:
-            return T_ca, []
+            return T_ca, [], extra
         found = [self._measured(rays, pose) for pose in (T_ca, *(others or ()), *turned)]
         noise, best = self.search.noise_of(found), found[0]
         width = max(NEAR * self._target.index.extent_m, 3.0 * noise)
@@ -177,7 +179,7 @@ class NearSymmetry:
             and as_good(best, each, max(self._gate, width), margin)
             and not decides(best, each, width, complete)
         ]
-        return best.T_ca, rivals
+        return best.T_ca, rivals, extra
 
     def distinct(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
         """Return the rivals that differ from a degenerate view not only along its unobservable directions; else all."""
@@ -190,20 +192,23 @@ class NearSymmetry:
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
 
-    def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> list[Pose]:
-        """The best poses that the near-symmetries give, registered with the points off the model in their number.
+    def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
+        """The best poses that the near-symmetries give, and at how many of them the marks were tested.
+
+        The poses are registered with the points off the model in their number.
 
         Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose pass through a mark.
         ``better``: only poses that explain more points, by ``LEAST_RAYS`` at least.
         """
-        most_passed = self._passed(rays, T_ca)[0] + LEAST_RAYS
+        stride = self._stride
+        most_passed = self._passed(rays, T_ca, stride)[0] + LEAST_RAYS
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
         few = [k[:: max(1, -(-len(k) // SCREENED))] for k in kinds]
         weights = np.concatenate([np.full(len(f), len(k) / max(1, len(f))) for k, f in zip(kinds, few, strict=True)])
         part = np.ascontiguousarray(rays.points[np.concatenate(few)])
         width = OFF * self._gate
-        kept: list[Pose] = []
+        kept, tested = list[Pose](), 0
         for motions in self._kinds:
             cost = (self._distances(T_ca.apply(part), motions, width) / width) ** 2 @ weights
             here = float((self._distances(T_ca.apply(part), np.eye(4)[None], width) / width)[0] ** 2 @ weights)
@@ -212,47 +217,56 @@ class NearSymmetry:
                 start = Pose.from_matrix(motions[k]) @ T_ca
                 if any(self.search.same(start, other) for other in (T_ca, *kept)):
                     continue
-                if self._passed(rays, start)[0] < most_passed:
+                tested += 1
+                if self._passed(rays, start, stride)[0] < most_passed:
                     kept.append(start)
                 if len(kept) == most:
                     break
-        return [self.search.refined(part, start, width) for start in kept]
+        return [self.search.refined(part, start, width) for start in kept], tested
 
     def _measured(self, rays: Rays, T_ca: Pose) -> Contradicted:
         return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
 
-    def _passed(self, rays: Rays, T_ca: Pose) -> tuple[float, float]:
-        """Rays that passed through marks that should be visible at a pose, and those expected where nothing is."""
-        seen = self._visible(T_ca)
+    @property
+    def _stride(self) -> int:
+        """The marks of which one in so many is tested where all motions are compared."""
+        return max(1, -(-len(self._marks) // SCREENED_MARKS))
+
+    @property
+    def _ray_work(self) -> int:
+        """Cost of the rays to these marks in point searches."""
+        return RAY_WORK * -(-len(self._marks) // self._stride)
+
+    def _passed(self, rays: Rays, T_ca: Pose, stride: int = 1) -> tuple[float, float]:
+        """Rays that passed through marks that should be visible at a pose, and those expected where nothing is.
+
+        Only one in ``stride`` of the marks is tested, and counts for so many.
+        """
+        seen = self._visible(T_ca, stride)
         if not len(seen) or rays.tree is None:
             return 0.0, 0.0
         marks = T_ca.inverse().apply(self._marks[seen])
         far = np.linalg.norm(marks, axis=1)
         cosine = -np.einsum("ij,ij->i", self._normals[seen] @ T_ca.R, marks) / far
-        expected = self._area * cosine / (far * rays.spacing) ** 2
+        expected = stride * self._area * cosine / (far * rays.spacing) ** 2
         angle, nearest = (each[:, 0] for each in rays.tree.query(marks / far[:, None]))
         empty = angle > EMPTY * rays.spacing
         passed = ~empty & (rays.ranges[nearest] > far + OFF * self._gate)
         return float(expected[passed].sum()), float(expected[empty].sum())
 
-    def _visible(self, T_ca: Pose) -> NDArray[np.intp]:
-        """The marks that face the camera and that no other part of the model hides; none if the camera is unknown."""
+    def _visible(self, T_ca: Pose, stride: int) -> NDArray[np.intp]:
+        """One in ``stride`` of the marks, if they face the camera and no other part of the model hides them.
+
+        None if the camera is unknown.
+        """
         if not self._target.visibility.may_be_camera(T_ca):
             return np.empty(0, dtype=np.intp)
-        towards = T_ca.t - self._marks
-        towards /= np.linalg.norm(towards, axis=1)[:, None]
-        seen = np.flatnonzero(np.einsum("ij,ij->i", towards, self._normals) > LEAST_COSINE)
-        at, hidden = np.full(len(seen), OFF * self._gate), np.zeros(len(seen), dtype=bool)
-        most = LONGEST_STEP * self._target.index.extent_m
-        for _ in range(STEPS):
-            p = self._marks[seen] + at[:, None] * towards[seen]
-            inside = ((p > self._low) & (p < self._high)).all(axis=1) & ~hidden
-            if not inside.any():
-                break
-            distance = self._target.index.distances(p[inside], Pose.identity(), most, False, 1, 0.0)[0]
-            hidden[inside] |= distance < 0.25 * self._gate
-            at[inside] += np.maximum(distance, 0.5 * self._gate)
-        return seen[~hidden]
+        away = self._marks[::stride] - T_ca.t
+        far = np.linalg.norm(away, axis=1)
+        away /= far[:, None]
+        seen = np.flatnonzero(np.einsum("ij,ij->i", away, self._normals[::stride]) < -LEAST_COSINE)
+        first = self._target.index.cast(T_ca.t, away[seen])[0]
+        return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
 
 
 def decides(better: Contradicted, other: Contradicted, width_m: float, complete: bool) -> bool:
