@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.report.export import row_poses
 from avsreplay.report.view import CloudView, cone_lines, thin_cloud
-from avsreplay.rows import Row, columns
+from avsreplay.rows import Row
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
@@ -34,7 +35,8 @@ RESIDUAL_REACH = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _IN_MESSAGES = {"seq", "t_ns", *_POSE_COLUMNS, *(f"reg_{name}" for name in _POSE_COLUMNS)}  # what other messages hold
-_COLUMNS = tuple(column.name for column in columns() if column.name not in _IN_MESSAGES)
+_NUMERIC = ("float", "int", "bool")  # types of columns, as declared, without "| None"
+_COLUMNS = tuple(f.name for f in fields(Row) if str(f.type).split()[0] in _NUMERIC and f.name not in _IN_MESSAGES)
 _VALUES = attrgetter(*_COLUMNS)
 RERUN_PORT = 9876  # port of a Rerun viewer
 
@@ -88,7 +90,7 @@ class ResultLogWriter:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
         facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
-        self._log = ResultLog(path, run.surface, facts, approach_cones(run))
+        self._log = ResultLog(path, run.surface, facts, approach_cones(run), _COLUMNS)
 
     def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int] = ()) -> None:
         """Take over the messages of an earlier log of the same run, with the columns of the rows that have changed."""
@@ -121,10 +123,9 @@ class ResultLogWriter:
         )
 
 
-def _numbers(row: Row) -> dict[str, float]:
-    """The numeric columns of a row that have a value."""
-    found = zip(_COLUMNS, _VALUES(row), strict=True)
-    return {name: float(value) for name, value in found if isinstance(value, (int, float))}
+def _numbers(row: Row) -> list[float]:
+    """The numeric columns of a row; NaN without a value."""
+    return [math.nan if value is None else value for value in _VALUES(row)]
 
 
 def approach_cones(run: Run) -> Array | None:
@@ -192,8 +193,7 @@ class RerunStream:
         path = self._paths.of(scan.state)
         if path is not None:
             rr.log("camera/plan", rr.LineStrips3D([path[1]]))
-        for name, value in _numbers(row).items():
-            rr.log(f"rows/{name}", rr.Scalars(value))
+        self._show(row)
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
@@ -201,12 +201,17 @@ class RerunStream:
         """Send the columns of rows again that had other values when their scans were shown."""
         for row in (rows[k] for k in changed):
             self._rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
-            for name, value in _numbers(row).items():
-                self._rr.log(f"rows/{name}", self._rr.Scalars(value))
+            self._show(row)
 
     def close(self) -> None:
         """Send what is still buffered."""
         self._rr.disconnect()
+
+    def _show(self, row: Row) -> None:
+        """Send the numeric columns of a row that have a value."""
+        for name, value in zip(_COLUMNS, _VALUES(row), strict=True):
+            if value is not None:
+                self._rr.log(f"rows/{name}", self._rr.Scalars(float(value)))
 
     def _place(self, path: str, pose: Pose) -> None:
         self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))

@@ -33,7 +33,8 @@ def test_the_tree_holds_every_panel_once(layout):
 def _topics(tmp_path):
     path = tmp_path / "result.mcap"
     surface = Surface(np.eye(3), np.array([[0, 1, 2]], np.int32), "m", "0" * 64)
-    log = ResultLog(path, surface, {"version": "1"}, np.eye(3)[[0, 1]])
+    names = [column.name for column in columns()]
+    log = ResultLog(path, surface, {"version": "1"}, np.eye(3)[[0, 1]], names)
     pose = Pose.identity()
     log.write(
         ResultFrame(
@@ -47,17 +48,19 @@ def _topics(tmp_path):
             healthy=True,
             message="ok",
             values={"rms_m": 0.1},
-            columns={column.name: 1.0 for column in columns()},
+            columns=[1.0] * len(names),
         )
     )
     log.close()
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    return {channel.topic for channel in summary.channels.values()}
+    schemas = summary.schemas.values()
+    fields = next(schema.data.decode().split() for schema in schemas if schema.name == "avsreplay/msg/Row")
+    return {channel.topic for channel in summary.channels.values()} | {f"/rows.{name}" for name in fields[1::2]}
 
 
 def test_every_topic_it_names_is_written(layout, tmp_path):
-    named = set(re.findall(r'"(/[a-z0-9_/]+)', json.dumps(layout)))
+    named = set(re.findall(r'"(/rows[.]\w+|/[a-z0-9_/]+)', json.dumps(layout)))
     assert named
     assert named <= _topics(tmp_path)
-    assert {"/plan/cone", "/truth/model", "/rosout", "/rows/nis"} <= named
+    assert {"/plan/cone", "/truth/model", "/rosout", "/rows.nis"} <= named

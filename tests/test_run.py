@@ -157,9 +157,14 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
     assert np.linalg.eigvalsh(first.pose.covariance.reshape(6, 6)).min() > 0.0
     assert len(seen["/model"][0].points) % 3 == 0
     assert seen["/truth/model"][0].header.frame_id == "target_true"
-    for name in ("nis", "pos_err_m", "gamma", "ogm_rank"):
-        values = [row[name] for row in document["rows"] if row[name] is not None]
-        assert [message.data for message in seen[f"/rows/{name}"]] == values
+    kinds, elsewhere = (int, float), re.compile("seq|t_ns|(reg_)?([xyz]_m|q[xyzw])")  # bool is an int
+    shown = {
+        n for row in document["rows"] for n, v in row.items() if isinstance(v, kinds) and not elsewhere.fullmatch(n)
+    }
+    assert shown <= set(seen["/rows"][0].__dataclass_fields__)
+    for name in shown | {"plan_miss_m"}:
+        values = [np.nan if row[name] is None else row[name] for row in document["rows"]]
+        np.testing.assert_array_equal([getattr(message, name) for message in seen["/rows"]], values, name)
     cloud = next(m for m in seen["/points_aligned"] if m.width)
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "residual"]
     points = np.frombuffer(cloud.data.tobytes(), np.dtype([("p", "<f4", 3), ("residual", "<f4")]))

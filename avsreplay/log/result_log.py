@@ -3,15 +3,15 @@
 Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
 estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
 model; its field ``residual`` is the distance to it [m]. ``/plan/cone`` holds the cones in which the planned approach
-stays. Each numeric column that no other message holds has a topic ``/rows/NAME``. Chunks are compressed by LZ4: clouds
-of points hardly become smaller, and zstd takes three times as long.
+stays. ``/rows`` holds the numeric columns that no other message holds, one message per scan, with a field for each
+column; a column without a value is NaN. Chunks are compressed by LZ4: clouds of points hardly become smaller, and zstd
+takes three times as long.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
-from dataclasses import field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from avsreplay.records import Surface
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
 CHUNK_BYTES = 1 << 20
+ROWS, ROW_TYPE = "/rows", "avsreplay/msg/Row"
 _TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
 _TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -39,9 +40,8 @@ _TOPICS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/truth/model": "visualization_msgs/msg/Marker",
     "/rosout": "rcl_interfaces/msg/Log",
+    ROWS: ROW_TYPE,
 }
-_ROWS = "/rows/"
-_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -61,7 +61,7 @@ class ResultFrame:
         values: scalars by name.
         residuals: (n,) distances of the points to the model at the estimate [m].
         intensities: (n,) of the points, None if the scanner gives none.
-        columns: numeric columns of the row by name.
+        columns: numeric columns of the row, as named to ``ResultLog``; NaN without a value.
     """
 
     t_ns: int
@@ -76,14 +76,19 @@ class ResultFrame:
     values: Mapping[str, float | int | str]
     residuals: NDArray[Any] | None = None
     intensities: NDArray[Any] | None = None
-    columns: Mapping[str, float] = field(default_factory=dict)
+    columns: Sequence[float] = ()
 
 
 class ResultLog:
     """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
     def __init__(
-        self, path: Path, surface: Surface, metadata: Mapping[str, str] | None = None, cone: Array | None = None
+        self,
+        path: Path,
+        surface: Surface,
+        metadata: Mapping[str, str] | None = None,
+        cone: Array | None = None,
+        columns: Sequence[str] = (),
     ) -> None:
         """Create the file and write the model.
 
@@ -92,6 +97,7 @@ class ResultLog:
             surface: the target model, written as a marker.
             metadata: of the run, by name, for example its configuration as JSON.
             cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None without a cone.
+            columns: names of the numeric columns of a row.
 
         Raises:
             UnreadableInput: the file cannot be written.
@@ -112,7 +118,8 @@ class ResultLog:
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._columns: dict[str, int] = {}
+        self._fields = tuple(columns)
+        self._row = struct.Struct(f"<xBxx{len(columns)}d")  # encapsulation of little-endian CDR, then the values
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
@@ -148,12 +155,12 @@ class ResultLog:
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
-        self._append_columns(frame.columns, t)
+        self._append(ROWS, t, self._row.pack(1, *frame.columns))
         if frame.message != self._state:
             self._append("/rosout", t, _said(frame))
         self._state = frame.message
 
-    def copy(self, written: Path, state: str, changed: Mapping[int, Mapping[str, float]] | None = None) -> None:
+    def copy(self, written: Path, state: str, changed: Mapping[int, Sequence[float]] | None = None) -> None:
         """Append all messages of another log of this kind, so that this one continues it.
 
         Args:
@@ -173,23 +180,15 @@ class ResultLog:
             hint = "start anew with --overwrite"
             raise UnreadableInput(f"is damaged: {error}"[:200], where=str(written), hint=hint) from None
 
-    def _copy(self, written: Path, changed: Mapping[int, Mapping[str, float]]) -> None:
+    def _copy(self, written: Path, changed: Mapping[int, Sequence[float]]) -> None:
         from mcap.reader import NonSeekingReader
 
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                columns = changed.get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
-                if columns is None:
-                    self._count = message.sequence
-                    self._append(channel.topic, message.log_time, message.data)
-                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
-                    self._append_columns(columns, message.log_time)
-
-    def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
-        channels, count, add, pack = self._columns, self._count, self._writer.add_message, _FLOAT64.pack
-        for name, value in columns.items():
-            channel = channels.get(name) or channels.setdefault(name, self._channel(_ROWS + name))
-            add(channel, t_ns, pack(1, value), t_ns, count)
+                columns = changed.get(message.sequence - 1) if channel.topic == ROWS else None
+                self._count = message.sequence
+                data = message.data if columns is None else self._row.pack(1, *columns)
+                self._append(channel.topic, message.log_time, data)
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         self._writer.add_message(self._channel(topic), t_ns, payload, t_ns, self._count)
@@ -197,9 +196,12 @@ class ResultLog:
     def _channel(self, topic: str) -> int:
         """Return the number of a topic's channel, which is registered at the first message."""
         if topic not in self._channels:
-            kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
+            kind = _TOPICS[topic]
             if kind not in self._schemas:
-                text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
+                if kind == ROW_TYPE:
+                    text = "".join(f"float64 {name}\n" for name in self._fields)
+                else:
+                    text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
