@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry, monitor
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Estimator, Prediction, Track, with_change
+from avsreplay.estimate import Estimator, Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.reference import FittedMotion
-from avsreplay.estimate.track import deskew, in_doubt, with_scan_duration
+from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import FaultDetector, Gramian
 from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations

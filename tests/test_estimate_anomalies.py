@@ -78,9 +78,8 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     P, R = A @ A.swapaxes(1, 2), np.array([np.diag(rng.uniform(1.0, 2.0, size=6)) for _ in range(2)])
     S, alpha, one_sigma = H @ P @ H.swapaxes(1, 2) + R, 3.0 * rng.normal(size=(2, 6)), (0.2, 0.3)
     share, none, y = 0.2, np.zeros(12), alpha.reshape(-1)
-    ratio, moments = _motion.change(
-        Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, [0.3, 0.1, 0.03, 0.01], 1.0, share
-    )
+    used = [_motion.used(Phi[k], P[k], H[k], alpha[k], S[k], R[k], (1.0, 1.0)) for k in range(2)]
+    ratio, moments = _motion.change(np.array(used), one_sigma, [0.3, 0.1, 0.03, 0.01], 1.0, share)
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
     ratios, weighted = [], []
     for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1, 0.03, 0.01)):

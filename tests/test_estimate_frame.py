@@ -12,7 +12,7 @@ from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.chart import Chart, body_parameters, to_chart
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import boxplus
+from avsreplay.estimate.error_state import boxminus, boxplus
 from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.mixture import Component, mixture_forecast
 from avsreplay.estimate.params import Start
@@ -50,6 +50,21 @@ def followed(estimator: Estimator, seen: list[tuple[float, Alignment]]) -> tuple
         track, _ = estimator.step(track, prediction, innovation, Verdict(1, Reason.OK), False)
         nis.append(innovation.chi2)
     return nis, track
+
+
+def test_mean_and_covariance_about_another_origin_are_those_of_displaced_states() -> None:
+    world, rng, step = tumbling.draw(72, seconds=1.0, hz=2.0), np.random.default_rng(72), 1e-6
+    x, root = world.states[0], rng.normal(size=(20, 20))
+    for acceleration in (np.zeros(3), np.array([0.1, -0.2, 0.3])):
+        frame, t_ns = EstimatorFrame(FAR, acceleration, 0), 2_000_000_000
+        found, J = frame.belief_out(Belief(t_ns, x, root @ root.T)), np.zeros((20, 20))
+        for k in range(20):
+            moved = frame.state_out(boxplus(x, step * np.eye(20)[k]), t_ns)
+            J[:, k] = boxminus(moved, found.x) / step
+        expected = J @ root @ root.T @ J.T
+        np.testing.assert_allclose(found.P, expected, atol=1e-5 * np.abs(expected).max())
+        np.testing.assert_allclose(found.x.T_ac.t, shifted(x.T_ac, -FAR).t + 2.0 * acceleration, rtol=1e-12)
+        np.testing.assert_allclose(frame.belief_into(found).P, root @ root.T, atol=1e-10 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("poses", [6, 40])

@@ -296,7 +296,37 @@ def test_an_innovation_covariance_is_definite_also_where_rounding_has_spoilt_the
     assert found.nis >= 0.0
     good = innovation_of(P, H, np.full(6, 1e-3), R)
     expected = H @ P @ H.T + R
-    np.testing.assert_array_equal(good.S, 0.5 * (expected + expected.T))
+    np.testing.assert_allclose(good.S, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(good.S, good.S.T)
+
+
+def test_the_innovation_and_its_covariances_are_those_of_general_linear_algebra() -> None:
+    rng = np.random.default_rng(11)
+    for trial in range(20):
+        x, H = some_state(trial), rng.normal(size=(6, 20))
+        P, R, part = (a @ a.T * 10.0 ** rng.uniform(-6, 6) for a in (rng.normal(size=(n, n)) for n in (20, 6, 6)))
+        e = rng.normal(size=6)
+        S, definite, nis = _motion.innovation(P, H, e, R)
+        expected = H @ P @ H.T + R
+        np.testing.assert_allclose(S, expected, atol=1e-13 * np.abs(expected).max())
+        assert definite
+        assert nis == pytest.approx(float(e @ np.linalg.inv(expected) @ e), rel=1e-6)
+        np.testing.assert_allclose(_motion.pose_covariance(P, H), H @ P @ H.T, atol=1e-13 * np.abs(H @ P @ H.T).max())
+        B = np.linalg.inv(R) @ part
+        assert _motion.squared_traces(part, R) == pytest.approx(np.trace(B @ B) + np.trace(B) ** 2, rel=1e-6)
+        squares, known = _motion.block_squares(R, e, part)
+        for k, block in enumerate((slice(0, 3), slice(3, 6))):
+            info = np.linalg.inv(R[block, block])
+            assert squares[k] == pytest.approx(float(e[block] @ info @ e[block]), rel=1e-6)
+            assert known[k] == pytest.approx(float(np.trace(info @ part[block, block])), rel=1e-6)
+        values, axes = np.linalg.eigh(R)
+        assert _motion.definite(R)
+        assert not _motion.definite(R - 1.001 * values[0] * np.outer(axes[:, 0], axes[:, 0]))
+        assert not _motion.definite(np.full((6, 6), np.nan))
+        H = _motion.pose_jacobian(x.flat)
+        for d in np.eye(20):
+            there = boxplus(x, 1e-7 * d).T_ac
+            np.testing.assert_allclose(innovation_vector(x, there) / 1e-7, H @ d, atol=1e-5)
 
 
 @pytest.mark.parametrize("dof", [40.0, 120.0])

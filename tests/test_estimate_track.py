@@ -11,7 +11,8 @@ from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector
-from avsreplay.estimate.track import Track, deskew, turned, with_scan_duration
+from avsreplay.estimate.scan_duration import deskew, with_scan_duration
+from avsreplay.estimate.track import Track, turned
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, Belief
 

@@ -18,7 +18,7 @@ from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array
 from avsreplay.log import SourceOptions
-from avsreplay.monitor import Gramian, from_trajectory, gramian, measure, observe, unobserved, weakest
+from avsreplay.monitor import Gramian, _root, from_trajectory, gramian, measure, observe, unobserved, weakest
 from avsreplay.records import Belief
 from avsreplay.rows import Row
 from avsreplay.run import Job, Run
@@ -46,6 +46,32 @@ def test_the_fold_is_the_sum() -> None:
     D = np.diag(np.geomspace(1.0, 1e-3, 6))
     scaled = measure(replace(state, scale=np.diag(D)))
     assert scaled.log10_cond_scaled == pytest.approx(np.log10(np.linalg.cond(D @ W @ D)), abs=1e-5)
+
+
+def test_the_roots_are_those_of_the_rows_and_of_the_rows_weighted_by_their_noise() -> None:
+    rng = np.random.default_rng(4)
+    for n, m, scans in ((20, 6, 1), (20, 6, 9), (12, 6, 40), (3, 1, 2)):
+        state, rows, noise = gramian(np.ones(n)), np.zeros((0, n)), np.zeros((0, m, m))
+        for _ in range(3):
+            more = rng.normal(size=(scans, m, n)) * 10.0 ** rng.uniform(-3, 3, n)
+            R = np.array([a @ a.T + 0.1 * np.eye(m) for a in rng.normal(size=(scans, m, m))])
+            found = _root.extended(state.root, state.white, more, R)
+            state = replace(state, root=found[0], white=found[1])
+            rows, noise = np.vstack([rows, more.reshape(-1, n)]), np.concatenate([noise, R])
+            blocks = rows.reshape(-1, m, n)
+            W, weighted = rows.T @ rows, np.einsum("kma,kmp,kpb->ab", blocks, np.linalg.inv(noise), blocks)
+            scale = np.sqrt(np.outer(W.diagonal(), W.diagonal()))
+            for root, expected in ((state.root, W), (state.white, weighted)):
+                assert np.array_equal(root, np.triu(root))
+                np.testing.assert_allclose(
+                    root.T @ root / scale, expected / scale, atol=1e-9 * np.abs(expected / scale).max()
+                )
+    assert np.array_equal(_root.extended(state.root, state.white, 0.0 * more, R), [state.root, state.white])
+    assert np.isnan(_root.extended(np.zeros((3, 3)), np.zeros((3, 3)), np.full((1, 1, 3), np.nan), R[:1])).any()
+    with pytest.raises(ValueError, match="positive definite"):
+        _root.extended(state.root, state.white, more, -R)
+    with pytest.raises(ValueError, match="differ"):
+        _root.extended(state.root, state.white, more, R[:1])
 
 
 def test_scaling_makes_the_rank_independent_of_units() -> None:

@@ -14,6 +14,6 @@ except ImportError:
 from avsreplay.estimate.dynamics import with_change
 from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.track import Prediction, Track
+from avsreplay.estimate.track import Prediction, Track, in_doubt
 
-__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track", "with_change"]
+__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track", "in_doubt", "with_change"]

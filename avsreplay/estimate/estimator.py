@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.errors import UsageError
-from avsreplay.estimate import dynamics
+from avsreplay.estimate import _motion, dynamics
 from avsreplay.estimate.acceleration import accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
@@ -174,7 +174,7 @@ class Estimator:
             track: after the scan.
             times_s: (n,) >= 0, ascending [s after the scan].
         """
-        noise, b = self.batch.noise_levels(track), self._common_1s(track)
+        noise, b = self.batch.noise_levels(track), common_1s(track, self.frame)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
             found = driven_forecast(self.frame.belief_out(track.belief), times_s, *noise)
         else:
@@ -249,11 +249,9 @@ class Estimator:
         C, inflation = self.pose_covariance(belief), NO_INFLATION if track.inflation is None else track.inflation
         return semidefinite(track.belief.P), C, left, R, inflation, gate_of(innovation.dof, R, R + C)
 
-    def _common_1s(self, track: Track) -> Array:
-        return common_1s(track, self.frame.position_out(track.belief.x.r_a, track.belief.t_ns))
-
     def _common_motions(self, track: Track) -> Array:
-        return np.hstack([track.undetermined, self.frame.motions_into(track.errors.motions)])
+        motions = track.errors.motions
+        return np.hstack([track.undetermined, self.frame.motions_into(motions)]) if motions.size else track.undetermined
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
@@ -300,9 +298,10 @@ class Estimator:
         Args:
             track: after a scan.
         """
-        belief, b = track.belief, self._common_1s(track)
-        P = belief.P + motion_covariance(self._common_motions(track), belief.x.q_bc) + track.change_P
-        P[RHO, RHO] += np.outer(b, b)
+        belief, b, motions = track.belief, common_1s(track, self.frame), self._common_motions(track)
+        P = belief.P + track.change_P
+        P[RHO, RHO] += b[:, None] * b
+        P = P + motion_covariance(motions, belief.x.q_bc) if motions.size else P
         return self.frame.belief_out(replace(belief, P=P))
 
     def motion(self, belief: Belief) -> Trajectory:
@@ -346,5 +345,4 @@ class Estimator:
         Args:
             belief: mean and covariance.
         """
-        H = measurement_jacobian(belief.x)
-        return np.asarray(H @ belief.P @ H.T)
+        return _motion.pose_covariance(belief.P, measurement_jacobian(belief.x))

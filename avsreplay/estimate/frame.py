@@ -24,6 +24,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
+from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.geometry import Array, Pose, frozen
@@ -121,29 +122,27 @@ class EstimatorFrame:
         return r_a + self._fallen(t_ns)[0] if self.falls else r_a
 
     def _moved(self, x: State, t_ns: int, sign: float) -> State:
-        r_a, v_a, c_b = x.r_a, x.v_a, x.c_b
-        if self.falls:
-            away, speed = self._fallen(t_ns)
-            r_a, v_a = r_a - sign * away, v_a - sign * speed
-        if self.shifted:
-            c_b = c_b + sign * geometry.rotate(geometry.matrix(x.q_bc), self.centre_c)
-        if not (self.falls or self.shifted):
-            return x
-        return State.of(np.concatenate((x.q_ab, x.w_b, r_a, v_a, x.sigma, c_b, x.q_bc)))
+        flat = _motion.shifted_mean(x.flat, sign * self.centre_c) if self.shifted else x.flat
+        return State.of(self._falling(flat, t_ns, sign)) if self.falls or self.shifted else x
+
+    def _falling(self, flat: Array, t_ns: int, sign: float) -> Array:
+        """The 22 numbers of a state at another position and velocity."""
+        if not self.falls:
+            return flat
+        away, speed = self._fallen(t_ns)
+        return np.concatenate((flat[:7], flat[7:10] - sign * away, flat[10:13] - sign * speed, flat[13:]))
 
     def _converted(self, belief: Belief, sign: float) -> Belief:
         """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu x]) A(mu)."""
-        x = self._moved(belief.x, belief.t_ns, sign)
         if not self.shifted:
+            x = self._moved(belief.x, belief.t_ns, sign)
             return belief if x is belief.x else replace(belief, x=x)
-        J = 2.0 * geometry.skew(belief.x.c_b - x.c_b)
-        P = belief.P.copy()
-        P[VARRHO] += J @ belief.P[DMU]
-        P[:, VARRHO] += P[:, DMU] @ J.T
+        flat, P = _motion.shifted(belief.x.flat, belief.P, sign * self.centre_c)
+        x = State.of(self._falling(flat, belief.t_ns, sign))
         if not isinstance(belief, DrivenBelief):
             return Belief(belief.t_ns, x, P)
         cross = belief.cross.copy()
-        cross[VARRHO] += J @ belief.cross[DMU]
+        cross[VARRHO] += 2.0 * geometry.skew(belief.x.c_b - x.c_b) @ belief.cross[DMU]
         return replace(belief, x=x, P=P, cross=cross)
 
     def _fallen(self, t_ns: int) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import DrivenBelief, corrected
 from avsreplay.estimate.dynamics import advance, flow, sigma_join, transition
-from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, Quad, boxplus, conjugate_quad, hamilton, rotation
+from avsreplay.estimate.error_state import DIM, SIGMA, Quad, boxplus, conjugate_quad, hamilton, rotation
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, State
 
@@ -32,24 +32,9 @@ Triple = tuple[float, float, float]
 GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a pose above it is an outlier
 
 
-def _constant() -> Array:
-    """The part of H (6, 20) that does not depend on the state."""
-    H = np.zeros((6, DIM))
-    H[:3, RHO] = H[3:, DQ] = H[3:, DMU] = np.eye(3)
-    return H
-
-
-_CONSTANT = _constant()
-
-
 def measurement_jacobian(x: State) -> Array:
     """H (6, 20) at zero error: [-2A(q)[c x] 0 I 0 0 A(q) 0; I 0 0 0 0 0 I]."""
-    A = rotation(x.q_ab)
-    cx, cy, cz = x.c_b.tolist()
-    H = _CONSTANT.copy()
-    H[:3, :3] = A @ np.array([[0.0, 2 * cz, -2 * cy], [-2 * cz, 0.0, 2 * cx], [2 * cy, -2 * cx, 0.0]])
-    H[:3, 14:17] = A
-    return H
+    return _motion.pose_jacobian(x.flat)
 
 
 def innovation_vector(x: State, T_ac: Pose) -> Array:
@@ -173,32 +158,32 @@ def innovation_of(
         correlated_share: the part of R that neighbouring scans have in common.
         dof: degrees of freedom of R as an estimate, inf if it is known.
     """
-    unsymmetric = H @ P @ H.T + R
-    S = _definite(np.asarray(0.5 * (unsymmetric + unsymmetric.T), dtype=np.float64), R)
-    half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
-    distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
-    nis = float(alpha @ np.linalg.solve(S, alpha))
+    S, definite, nis = _motion.innovation(P, H, alpha, R)
+    if not definite:
+        S = _repaired(S, R)
+        nis = float(alpha @ np.linalg.solve(S, alpha))
+    a, b, c, x, y, z = alpha.tolist()
+    distance, half = math.sqrt(a * a + b * b + c * c), min(1.0, math.sqrt(x * x + y * y + z * z))
     of_S = dof_of_sum(dof, R, S)
     chi2, limit = as_chi2(nis, of_S), from_chi2(GATE, of_S)
     weight = limit / nis if robust and nis > limit else 1.0
-    angle = 2.0 * float(np.arcsin(half))
+    angle = 2.0 * math.asin(half)
     return Innovation(alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, dof=dof)
 
 
 def dof_of_sum(dof: float, part: Array, total: Array) -> float:
     """Degrees of freedom of a covariance of which a part is an estimate and the rest is known (Welch, Satterthwaite).
 
-    With B = total^-1 part they are dof p (p + 1) / (tr B^2 + (tr B)^2), by Nel and van der Merwe (1986).
+    With B = total^-1 part they are dof p (p + 1) / (tr B^2 + (tr B)^2), by Nel and van der Merwe (1986), for p = 6.
 
     Args:
         dof: degrees of freedom of the part, inf if it is known.
-        part: (p, p) the estimated part.
-        total: (p, p) the sum.
+        part: (6, 6) the estimated part.
+        total: (6, 6) the sum.
     """
     if not math.isfinite(dof):
         return dof
-    B, p = np.linalg.solve(total, part), len(part)
-    return dof * p * (p + 1) / max(float(np.sum(B * B.T)) + float(np.trace(B)) ** 2, 1e-9)
+    return dof * 42.0 / max(_motion.squared_traces(part, total), 1e-9)
 
 
 def as_chi2(square: float, dof: float) -> float:
@@ -229,16 +214,12 @@ def gate_of(dof: float, part: Array, total: Array) -> float:
     return from_chi2(GATE, dof_of_sum(dof, part, total))
 
 
-def _definite(S: Array, R: Array) -> Array:
-    """S, or, where rounding of a very large P has made it indefinite, R plus the positive part of S - R."""
-    try:
-        np.linalg.cholesky(S)
-    except np.linalg.LinAlgError:
-        scale = np.sqrt(np.abs(np.diagonal(S)) + np.diagonal(R))
-        values, axes = np.linalg.eigh((S - R) / np.outer(scale, scale))
-        half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
-        S = half @ half.T + R
-    return S
+def _repaired(S: Array, R: Array) -> Array:
+    """R plus the positive part of S - R, where rounding of a very large P has made S indefinite."""
+    scale = np.sqrt(np.abs(np.diagonal(S)) + np.diagonal(R))
+    values, axes = np.linalg.eigh((S - R) / np.outer(scale, scale))
+    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
+    return np.asarray(half @ half.T + R)
 
 
 def gain(P: Array, H: Array, S: Array) -> Array:

@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.errors import value_class
+from avsreplay.estimate import _motion
 from avsreplay.estimate.common_errors import systematic_share
 from avsreplay.estimate.measurement import registration_noise, residual
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
@@ -114,12 +115,11 @@ def push(
     window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
 ) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R that was used."""
-    outer = residual[:, None] * residual
-    squares = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2).tolist()
-    known = np.linalg.solve(_blocks(base), _blocks(HPH)).trace(axis1=1, axis2=2) / window.factors[::3] ** 2
-    left = np.maximum(3.0 - known, 0.0).tolist()
-    epoch = NoiseEpoch(outer, HPH, (squares[0], squares[1]), (left[0], left[1]), weight)
-    return replace(_summed((*window.epochs[-length + 1 :], epoch), length, window.level), rise=window.rise)
+    (a, b), known = _motion.block_squares(base, residual, HPH)
+    factors = window.factors[::3].tolist()
+    p, q = (max(3.0 - each / (factor * factor), 0.0) for each, factor in zip(known, factors, strict=True))
+    epoch = NoiseEpoch(residual[:, None] * residual, HPH, (a, b), (p, q), weight)
+    return _summed((*window.epochs[-length + 1 :], epoch), length, window.level, window.rise)
 
 
 def risen(window: NoiseWindow, factor: Array) -> NoiseWindow:
@@ -147,21 +147,19 @@ def lasting(window: NoiseWindow, seen: Innovation) -> NoiseWindow:
     return replace(window, rise=NO_RISE if calm > _CALM else NoiseRise(rise.factor, calm))
 
 
-def _blocks(A: Array) -> Array:
-    """(2, 3, 3) position and attitude blocks of (6, 6)."""
-    return A.reshape(2, 3, 2, 3).diagonal(axis1=0, axis2=2).transpose(2, 0, 1)
-
-
-def _summed(epochs: tuple[NoiseEpoch, ...], length: int, level: tuple[float, float]) -> NoiseWindow:
-    weight = sum(epoch.weight for epoch in epochs)
+def _summed(
+    epochs: tuple[NoiseEpoch, ...], length: int, level: tuple[float, float], rise: NoiseRise = NO_RISE
+) -> NoiseWindow:
+    weight = sum([epoch.weight for epoch in epochs])
     many_outliers = weight < (1.0 - _MANY_OUTLIERS) * len(epochs)
     if len(epochs) < length:
-        return NoiseWindow(epochs, np.ones(6), many_outliers, level)
+        return NoiseWindow(epochs, _ONES, many_outliers, level, rise)
     factors = []
     for block in (0, 1):
-        squares = sum(epoch.weight * epoch.squares[block] for epoch in epochs) + _LEVEL_DOF * level[block]
-        factors.append(math.sqrt(squares / (sum(epoch.weight * epoch.left[block] for epoch in epochs) + _LEVEL_DOF)))
-    return NoiseWindow(epochs, np.repeat(factors, 3), many_outliers, level)
+        squares = sum([epoch.weight * epoch.squares[block] for epoch in epochs]) + _LEVEL_DOF * level[block]
+        left = sum([epoch.weight * epoch.left[block] for epoch in epochs]) + _LEVEL_DOF
+        factors += [math.sqrt(squares / left)] * 3
+    return NoiseWindow(epochs, np.array(factors), many_outliers, level, rise)
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
@@ -183,23 +181,17 @@ def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:
     """R with its eigenvalues, in units of R0, raised to at least ``fraction``."""
-    try:
-        np.linalg.cholesky(R - fraction * R0)
-    except np.linalg.LinAlgError:
-        values, axes = _eigen(R, R0)
-        half = axes * np.sqrt(np.maximum(values, fraction))
-        return half @ half.T
-    return R
+    if _motion.definite(R - fraction * R0):
+        return R
+    values, axes = _eigen(R, R0)
+    half = axes * np.sqrt(np.maximum(values, fraction))
+    return np.asarray(half @ half.T)
 
 
 def at_floor(R: Array, R0: Array, fraction: float) -> int:
     """How many eigenvalues of R, in units of R0, lie on the floor."""
     bound = fraction * (1.0 + 1e-6)
-    try:
-        np.linalg.cholesky(R - bound * R0)
-    except np.linalg.LinAlgError:
-        return int(np.sum(_eigen(R, R0)[0] <= bound))
-    return 0
+    return 0 if _motion.definite(R - bound * R0) else int(np.sum(_eigen(R, R0)[0] <= bound))
 
 
 def _eigen(R: Array, R0: Array) -> tuple[Array, Array]:
@@ -338,7 +330,7 @@ class Noise:
         H P+ H' is divided by the inflation: it is then what an update with white noise would leave.
         """
         left = residual(posterior.x, prior, innovation.alpha)
-        HPH = H @ posterior.P @ H.T * (2.0 / float(inflation[0] + inflation[1]))
+        HPH = _motion.pose_covariance(posterior.P, H) * (2.0 / float(inflation[0] + inflation[1]))
         return push(window, left, HPH, self.base(innovation.R, window), self.params.window, innovation.weight)
 
     def _base(self, alignment: Alignment, x: State) -> Array:

@@ -219,20 +219,12 @@ def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors,
     if not epochs or prior == 0.0:
         return 0.0, NO_CHANGE
     last = epochs[-_SUSPECTED:]
-    seen = [e.innovation for e in last]
-    inflation = [np.ones(2) if e.track.inflation is None else e.track.inflation for e in last]
     ratio, P = _motion.change(
-        np.array([e.prediction.Phi for e in last]),
-        np.array([e.prediction.belief.P for e in last]),
-        np.array([e.prediction.H for e in last]),
-        np.array([i.alpha for i in seen]),
-        np.array([i.S for i in seen]),
-        np.array([i.R for i in seen]),
-        np.array([c / i.weight for c, i in zip(inflation, seen, strict=True)]),
+        np.array([e.used for e in last]),
         (priors.rate_radps, priors.velocity_mps),
         [size * each for each in priors.scales[:-1] for size in _SIZES],
         scale,
-        seen[-1].share,
+        last[-1].innovation.share,
     )
     if not ratio > 1.0:
         return 0.0, NO_CHANGE

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
+from avsreplay.monitor import _root
 from avsreplay.records import BLOCKS, Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, Verdict
 from avsreplay.settings import Settings, setting
 
@@ -44,7 +45,7 @@ class Gramian:
     """The Gramian so far.
 
     Attributes:
-        root: (n, n) with W_o = root' root.  white: (n, n) the same root with rows weighted by R^-1/2.
+        root: (n, n) upper triangular with W_o = root' root.  white: (n, n) the same root with rows weighted by R^-1/2.
         Phi_k0: (n, n) transition from the first scan to the last.  scale: (n,) prior 1 sigma.
     """
 
@@ -114,24 +115,17 @@ def from_trajectory(scale: Array, rows: Array, R: Array, Phi_k0: Array) -> Grami
 
 
 def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
-    n, more = state.scale.size, rows.shape[0] * rows.shape[1]
-    both = np.empty((2, n + more, n))  # of the rows as they are and of the whitened ones
-    both[0, :n], both[0, n:] = state.root, rows.reshape(-1, n)
-    both[1, :n], both[1, n:] = state.white, np.linalg.solve(np.linalg.cholesky(R), rows).reshape(-1, n)
-    root, whitened = np.linalg.qr(both, mode="r")
+    root, whitened = _root.extended(state.root, state.white, rows, R)
     return Gramian(root, whitened, Phi_k0, state.scale)
 
 
 def measure(state: Gramian) -> Observability:
     """Return the rank and the condition numbers."""
     n = state.scale.size
-    roots = np.empty((3, n, n))
-    np.multiply(state.white, state.scale, out=roots[0])
-    np.multiply(state.root, state.scale, out=roots[2])
-    roots[1] = state.root
-    told, raw, scaled = np.linalg.svd(roots, compute_uv=False)
+    told = np.linalg.svd(state.white * state.scale, compute_uv=False)
     if (rank := int(np.count_nonzero(told > 1.0))) < n:
         return Observability(rank, n, None, None)
+    raw, scaled = np.linalg.svd(np.array([state.root, state.root * state.scale]), compute_uv=False)
     return Observability(rank, n, _log10_cond(raw), _log10_cond(scaled))
 
 

@@ -16,7 +16,7 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import nees
-from avsreplay.estimate.track import deskew, with_scan_duration
+from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus, Scan
 from avsreplay.register import ModelCheck, RegisterParams, Registrar

@@ -10,6 +10,7 @@
 
 #include "covariance.hpp"
 #include "evidence.hpp"
+#include "innovation.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -180,28 +181,79 @@ nb::tuple correct_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Matrix<
   return nb::make_tuple(flat(x), made(P));
 }
 
+using Six = Matrix<SEEN, SEEN>;
+
+const double (&six(const Six& from))[SEEN][SEEN] {
+  return as<double[SEEN][SEEN]>(from.data());
+}
+
+// S, whether it is positive definite, and alpha' S^-1 alpha.
+nb::tuple innovation_of(const Matrix<DIM, DIM>& P, const Matrix<SEEN, DIM>& H, const Vector<SEEN>& alpha, const Six& R) {
+  double S[SEEN][SEEN];
+  const double nis = innovation(as<Square>(P.data()), as<double[SEEN][DIM]>(H.data()), alpha.data(), six(R), S);
+  return nb::make_tuple(made(S), definite(S), nis);
+}
+
+Numpy pose_jacobian_of(const Mean& mean) {
+  double H[SEEN][DIM];
+  State x;
+  std::memcpy(&x, mean.data(), sizeof x);
+  pose_jacobian(x, H);
+  return made(H);
+}
+
+Numpy pose_covariance_of(const Matrix<DIM, DIM>& P, const Matrix<SEEN, DIM>& H) {
+  double C[SEEN][SEEN];
+  pose_covariance(as<Square>(P.data()), as<double[SEEN][DIM]>(H.data()), C);
+  return made(C);
+}
+
+std::array<Two, 2> block_squares_of(const Six& R, const Vector<SEEN>& e, const Six& C) {
+  std::array<Two, 2> found;
+  block_squares(six(R), e.data(), six(C), found[0].data(), found[1].data());
+  return found;
+}
+
+Numpy shifted_mean(const Mean& mean, const Vector<3>& to) {
+  State x = state(mean);
+  shift(x, to.data());
+  return flat(x);
+}
+
+nb::tuple shifted_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Vector<3>& to) {
+  State x = state(mean);
+  Square P;
+  std::memcpy(P, P0.data(), sizeof P);
+  shift(x, P, to.data());
+  return nb::make_tuple(flat(x), made(P));
+}
+
+constexpr int USED = sizeof(Used) / sizeof(double);
+
+// The numbers of a scan that was used, for change_of.
+Numpy used_of(const Matrix<DIM, DIM>& Phi, const Matrix<DIM, DIM>& P, const Matrix<SEEN, DIM>& H, const Vector<SEEN>& alpha,
+              const Six& S, const Six& R, const Two& colour) {
+  Pose pose;
+  Used used;
+  std::memcpy(pose.H, H.data(), sizeof pose.H);
+  std::memcpy(pose.alpha, alpha.data(), sizeof pose.alpha);
+  std::memcpy(pose.S, S.data(), sizeof pose.S);
+  std::memcpy(pose.R, R.data(), sizeof pose.R);
+  seen_at(as<Square>(P.data()), pose, colour.data(), used);
+  std::memcpy(used.Phi, Phi.data(), sizeof used.Phi);
+  double* to;
+  Numpy out = array({(size_t)USED}, &to);
+  std::memcpy(to, &used, sizeof used);
+  return out;
+}
+
 // The likelihood ratio of a change in the last scans, and the second moments (20, 20) of the error it would cause.
-nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>& P, const Matrix<-1, SEEN, DIM>& H,
-                    const Matrix<-1, SEEN>& alpha, const Matrix<-1, SEEN, SEEN>& S, const Matrix<-1, SEEN, SEEN>& R,
-                    const Matrix<-1, 2>& colour, const Two& one_sigma, const std::vector<double>& sizes, double scale,
+nb::tuple change_of(const Matrix<-1, USED>& scans, const Two& one_sigma, const std::vector<double>& sizes, double scale,
                     double share) {
-  const size_t n = Phi.shape(0);
-  if (sizes.empty()) throw std::invalid_argument("a change needs a size");
-  if (!n || P.shape(0) != n || H.shape(0) != n || alpha.shape(0) != n || S.shape(0) != n || R.shape(0) != n ||
-      colour.shape(0) != n)
-    throw std::invalid_argument("transitions, covariances and innovations must be equally many, one at least");
-  std::vector<Used> scans(n);
-  for (size_t k = 0; k < n; ++k) {
-    Pose pose;
-    std::memcpy(pose.H, H.data() + SEEN * DIM * k, sizeof pose.H);
-    std::memcpy(pose.alpha, alpha.data() + SEEN * k, sizeof pose.alpha);
-    std::memcpy(pose.S, S.data() + SEEN * SEEN * k, sizeof pose.S);
-    std::memcpy(pose.R, R.data() + SEEN * SEEN * k, sizeof pose.R);
-    seen_at(as<Square>(P.data() + DIM * DIM * k), pose, colour.data() + 2 * k, scans[k]);
-    std::memcpy(scans[k].Phi, Phi.data() + DIM * DIM * k, sizeof scans[k].Phi);
-  }
+  if (sizes.empty() || !scans.shape(0)) throw std::invalid_argument("a change needs a size and a scan");
   Square moments;
-  const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), sizes, scale, share, moments);
+  const double ratio = change_ratio(reinterpret_cast<const Used*>(scans.data()), (int)scans.shape(0), one_sigma.data(), sizes,
+                                    scale, share, moments);
   return nb::make_tuple(ratio, made(moments));
 }
 
@@ -691,8 +743,18 @@ NB_MODULE(_motion, m) {
   m.def("mixture_forecast", &mixture_forecast_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"),
         nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"),
         nb::arg("origin_c"));
-  m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
-        nb::arg("colour"), nb::arg("one_sigma"), nb::arg("sizes"), nb::arg("scale"), nb::arg("share"));
+  m.def("innovation", &innovation_of, nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("R"));
+  m.def("pose_jacobian", &pose_jacobian_of, nb::arg("x"));
+  m.def("pose_covariance", &pose_covariance_of, nb::arg("P"), nb::arg("H"));
+  m.def("definite", [](const Six& A) { return definite(six(A)); }, nb::arg("A"));
+  m.def("squared_traces", [](const Six& part, const Six& total) { return squared_traces(six(part), six(total)); }, nb::arg("part"),
+        nb::arg("total"));
+  m.def("block_squares", &block_squares_of, nb::arg("R"), nb::arg("e"), nb::arg("C"));
+  m.def("shifted_mean", &shifted_mean, nb::arg("x"), nb::arg("to"));
+  m.def("shifted", &shifted_of, nb::arg("x"), nb::arg("P"), nb::arg("to"));
+  m.def("used", &used_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
+        nb::arg("colour"));
+  m.def("change", &change_of, nb::arg("scans"), nb::arg("one_sigma"), nb::arg("sizes"), nb::arg("scale"), nb::arg("share"));
   m.def("after_changes", &after_changes, nb::arg("late"), nb::arg("which"), nb::arg("impulses"), nb::arg("instants"));
   m.def("evidence", &evidence_of, nb::arg("M"), nb::arg("white"), nb::arg("size"));
   m.def("log_ratio", &log_ratio_of, nb::arg("A"), nb::arg("b"));

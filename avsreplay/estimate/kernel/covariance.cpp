@@ -6,20 +6,6 @@
 namespace avs {
 namespace {
 
-// Lower Cholesky factor of C (N, N), of which the lower triangle is used; false where C is not positive definite.
-template <int N>
-bool cholesky(const double C[N][N], double L[N][N]) {
-  for (int r = 0; r < N; ++r)
-    for (int c = 0; c <= r; ++c) {
-      double s = C[r][c];
-      for (int i = 0; i < c; ++i) s -= L[r][i] * L[c][i];
-      if (c < r) L[r][c] = s / L[c][c];
-      else if (s > 0 && std::isfinite(s)) L[r][r] = std::sqrt(s);
-      else return false;
-    }
-  return true;
-}
-
 // The columns in which a row of Phi may differ from 0: Phi is 1 beside the turn and the translation.
 struct Columns {
   int count, at[8];

@@ -1,0 +1,3 @@
+from avsreplay.geometry import Array
+
+def extended(root: Array, white: Array, rows: Array, R: Array) -> Array: ...
