@@ -78,7 +78,7 @@ static int gather(const Scope& o, const View& v, int64_t first, int n, const dou
   for (int i = 0; i < n; ++i) {
     c.list[i] = list_of(s, c.list[i]);
     if (!c.list[i]) continue;
-    fetch(c.list[i]);
+    fetch(c.list[i]), fetch(c.list[i] + LANES), fetch(c.list[i] + 2 * LANES);
     c.off[i] = off_centre(s, c.f[0][i], c.f[1][i], c.f[2][i]);
   }
   return ignored;

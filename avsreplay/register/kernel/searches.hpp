@@ -35,6 +35,7 @@ class SearchesOfStrip {
     other_blocks();
     effort.compared += jobs_ + many_ - STRIP;
     for (int k = 0; k < jobs_; ++k) close(k, effort);
+    for (int p = 0; p < many_pending_; ++p) c_.lane[point_[pending_[p]]] = nearest_of(pending_[p]);
     if (alone_)
       one_by_one(effort);
     else if (jobs_)
@@ -164,6 +165,7 @@ class SearchesOfStrip {
         m = entries(k, m);
     }
     for (int j = 0; j < m; ++j) {
+      if (j + 16 < m) fetch(s_.boxes.data() + entry_[j + 16].block);
       const Visit e = entry_[j];
       const int i = point_[e.job];
       const bool wanted = (o_.facing.may[e.block] != 0) & (e.block != visit_[e.job].block) & (to_box2(s_.boxes[e.block], load4(c_.at[i])) < limit_[e.job]);
@@ -220,10 +222,11 @@ class SearchesOfStrip {
       taken_[i] = ALONE, ++alone_;
       return;
     }
-    int32_t lane;
-    if (!is_alone(o_.facing, first_block_[k], d_[first], exact_[k], other_[k], lane)) lane = nearest_of(k);
     effort.searched += searched;
-    c_.lane[i] = lane;
+    if (is_alone(o_.facing, first_block_[k], d_[first], exact_[k], other_[k], c_.lane[i])) return;
+    for (unsigned left = bits(d_[first] < f8(exact_[k])); left; left &= left - 1)
+      Kind::prefetch_exact(s_, LANES * first_block_[k] + (uint32_t)lowest_bit(left));
+    pending_[many_pending_++] = (uint8_t)k;
   }
 
   // The visits of a job after its first one.
@@ -346,6 +349,8 @@ class SearchesOfStrip {
   const Rank begin_;
   const uint64_t none_ = ranked(FAR, 0);
   int jobs_ = 0, many_ = STRIP, alone_ = 0;
+  int many_pending_ = 0;
+  uint8_t pending_[STRIP];  // jobs with lanes that must be measured exactly
   unsigned uncertain_ = 0;  // not zero: whether some lanes face the eye is not known
   uint8_t taken_[STRIP];  // how the primitive of a point is found
   // Of each job: its point, the entry of the list with which its further blocks begin, and as in Rank.
