@@ -6,16 +6,17 @@
 #include <limits>
 #include <vector>
 
+#include "hot.hpp"
+
 namespace avs {
 namespace {
 
 constexpr double DOMINANT = 0.5;            // a patch with more than this share of the information on a motion is left out
 constexpr int64_t LEAST_POINTS = 6;         // no patch is left out where fewer points would remain
 constexpr double ALONE = 1e-9;              // keeps a motion finite that only one patch determines
-constexpr double SMALL = 0.6;               // trace below which the power series of (I - A)^-1/2 is used
-constexpr double LEAST_TERM = 1e-12;        // the series ends with terms below this
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
+constexpr double SURE = 0.01;               // of it: rounding changes no bound by a factor of 100
 constexpr double LEAST_DOF = 12, MOST_DOF = 1e6;  // of an estimated covariance
 constexpr double LEAST_OF_SIZE = 1.5e-3;    // least share of the effect of a size that the pose cannot explain; patches across an edge feign 1e-3
 constexpr double LEAST_LEFT = 0.2;          // a leverage above 0.8 enlarges the residual of a patch no further
@@ -69,31 +70,32 @@ Six squared(const Six& W) {
   return A;
 }
 
-// (I - A)^-1/2 x with A = W' N_p W: with residuals of independent noise, the sum of its squares over the patches has
-// the identity times the variance as its mean (bias-reduced linearisation).
-std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double, 6> x) {
+// (I - A)^-1/2 x with A = W' N_p W, where the trace of A is not small.
+std::array<double, 6> reduced(const double* Np, const Six& W, const std::array<double, 6>& x) {
   Six A = congruence(W, product(Np, W)), V;
-  double trace = 0;
-  for (int i = 0; i < 6; ++i) trace += A.v[i][i];
-  std::array<double, 6> out = x, term = x;
-  if (trace < SMALL) {
-    double largest = trace;  // of the powers of A
-    for (int n = 1; largest > LEAST_TERM; ++n, largest *= trace) {
-      std::array<double, 6> next{};
-      for (size_t k = 0; k < 6; ++k)
-        for (size_t i = 0; i < 6; ++i) next[i] += A.v[k][i] * term[k];
-      for (size_t i = 0; i < 6; ++i) out[i] += next[i] *= (2 * n - 1) / (2.0 * n);
-      term = next;
-    }
-    return out;
-  }
+  std::array<double, 6> out{};
   eigen(A.v, V.v, 6, 1e-32);
-  out.fill(0);
   for (int k = 0; k < 6; ++k) {
     double along = 0;
     for (size_t i = 0; i < 6; ++i) along += V.v[i][k] * x[i];
     along /= std::sqrt(std::max(1 + ALONE - A.v[k][k], ALONE));
     for (size_t i = 0; i < 6; ++i) out[i] += V.v[i][k] * along;
+  }
+  return out;
+}
+
+// (I - A)^-1/2 W' g of all patches: with residuals of independent noise, the sum of its squares has the identity times the
+// variance as its mean (bias-reduced linearisation).
+std::vector<std::array<double, 6>> all_reduced(const double* normals, const double* gradients, int64_t m, const Six& W) {
+  std::vector<std::array<double, 6>> out((size_t)m);
+  std::vector<uint8_t> done((size_t)m);
+  if (m) code(false).reduce(normals, gradients, m, W.v[0], out[0].data(), done.data());
+  for (int64_t p = 0; p < m; ++p) {
+    if (done[(size_t)p]) continue;
+    std::array<double, 6> x{};
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) x[(size_t)j] += W.v[i][j] * gradients[6 * p + i];
+    out[(size_t)p] = reduced(normals + 36 * p, W, x);
   }
   return out;
 }
@@ -196,8 +198,17 @@ struct Effect {
   }
 };
 
-// Whether the information of a half determines a pose.
-bool determines(Six N) {
+// Whether the information of a half determines a pose. With unit diagonal the largest eigenvalue is at most 6, and the least
+// one at least the inverse of the trace of the inverse; where this decides, the eigenvalues need not be computed.
+bool determines(Six N, const Inverted& of) {
+  double spread = 0;
+  bool whole = true;
+  for (int i = 0; i < 6; ++i) {
+    double column = 0;
+    for (int k = 0; k < 6; ++k) column += of.root.v[k][i] * of.root.v[k][i];
+    spread += N.v[i][i] * of.inverse.v[i][i], whole = whole && column > 0;
+  }
+  if (whole && 6 * spread < SURE * WORST_CONDITION) return true;
   double scale[6];
   for (int i = 0; i < 6; ++i) scale[i] = 1 / std::sqrt(std::max(N.v[i][i], TINY));
   for (int i = 0; i < 6; ++i)
@@ -224,8 +235,9 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
     const Part& part = parts[half];
     const int64_t m = (int64_t)part.gradients.size() / 6;
     const Six N = total(part.normals.data(), m);
-    if (m < LEAST_HALF || !determines(N)) return std::numeric_limits<double>::quiet_NaN();
+    if (m < LEAST_HALF) return std::numeric_limits<double>::quiet_NaN();
     const Inverted of_half = inverted(N);
+    if (!determines(N, of_half)) return std::numeric_limits<double>::quiet_NaN();
     const Six &inverse = of_half.inverse, P = sandwich(part.normals.data(), part.gradients.data(), m, of_half.root).P;
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) d[i] += (half ? 1 : -1) * inverse.v[i][j] * part.sum[j], C.v[i][j] += P.v[i][j];
@@ -292,15 +304,10 @@ Estimated sandwich(const double* normals, const double* gradients, int64_t m, co
     rank += length > 0;
   }
   if (rank == 0) return out;
-  std::vector<std::array<double, 6>> y((size_t)m);
-  for (int64_t p = 0; p < m; ++p) {
-    std::array<double, 6> x{};
-    for (int i = 0; i < 6; ++i)
-      for (int j = 0; j < 6; ++j) x[(size_t)j] += W.v[i][j] * gradients[6 * p + i];
-    y[(size_t)p] = x = reduced(normals + 36 * p, W, x);
+  const std::vector<std::array<double, 6>> y = all_reduced(normals, gradients, m, W);
+  for (const auto& x : y)
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) S.v[i][j] += x[(size_t)i] * x[(size_t)j];
-  }
   out.dof = shrink(y, rank, S);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) {

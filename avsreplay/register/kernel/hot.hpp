@@ -122,6 +122,8 @@ struct Code {
   // Adds the n matches that `order` names, ascending; partial sums of those of a chunk are added in the order of chunks.
   void (*add)(const Match*, const uint32_t* order, int64_t n, PatchSums&);
   void (*field_pass)(const FieldTable&, const FieldLook&, FieldSums&);
+  // The gradients (m, 6) of patches with normals (m, 6, 6) in the axes of W (6, 6), without the effect of their own leverage.
+  void (*reduce)(const double* normals, const double* gradients, int64_t m, const double* W, double* out, uint8_t* done);
 };
 
 const Code& code_base();

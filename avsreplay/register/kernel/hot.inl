@@ -26,6 +26,8 @@ namespace AVS_ISA {
 
 #include "field_pass.hpp"
 
+#include "leverage.hpp"
+
 static int64_t closest(const Store& s, const View& v, int64_t first, int64_t last, const double* T, const Facing& facing,
                        bool sided, double bound, const Feet& out) {
   return s.mesh ? closest_kind<Triangles>(s, v, first, last, T, facing, sided, bound, out)
@@ -54,7 +56,7 @@ static int match(const Store& s, const View& v, int64_t first, int64_t last, con
 
 const Code& AVS_CODE() {
   static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass, AVS_ISA::match,
-                         AVS_ISA::add, AVS_ISA::field_pass};
+                         AVS_ISA::add, AVS_ISA::field_pass, AVS_ISA::reduce};
   return code;
 }
 }  // namespace avs
