@@ -444,6 +444,25 @@ def test_on_small_triangles_most_searches_are_skipped_with_the_same_bits(facing:
     assert found[0].gradients.tobytes() == found[1].gradients.tobytes()
 
 
+@pytest.mark.parametrize("eye", [None, (0.3, -0.2, 4.0)], ids=["both sides", "facing"])
+@pytest.mark.parametrize("shape", ["sheet", "soup", "cloud"])
+def test_each_point_is_found_as_if_it_were_alone(shape: str, eye: tuple[float, float, float] | None) -> None:
+    """The points of a strip are searched together: no point may have the blocks or the distances of another one."""
+    shapes = {"sheet": sheet(40), "soup": soup(800, seed=41), "cloud": surface(rng(42).standard_normal((3000, 3)))}
+    mesh, r = shapes[shape], rng(43)
+    model = SurfaceIndex.build(mesh, 0.4)
+    at = adversarial(mesh.vertices, 44, 60)
+    at = np.concatenate([at, at + 0.01 * r.standard_normal(at.shape), np.full((3, 3), np.nan)])[
+        r.permutation(2 * len(at) + 3)
+    ]
+    together = model.closest(at, camera_c=eye)
+    for k, point in enumerate(at):
+        alone = model.closest(point[None], camera_c=eye)
+        assert alone.id[0] == together.id[k]
+        assert alone.foot.tobytes() == together.foot[k : k + 1].tobytes()
+        assert alone.d2.tobytes() == together.d2[k : k + 1].tobytes()
+
+
 def test_closest_points_beyond_the_largest_distance_are_none(target: Surface) -> None:
     """``most_m`` removes the farther ones and changes no other."""
     model = SurfaceIndex.build(target, 0.4)

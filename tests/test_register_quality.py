@@ -22,6 +22,19 @@ from avsreplay.register.covariance import (
 from avsreplay.register.degenerate import unbounded_directions
 
 
+@pytest.mark.parametrize("patches", [5, 8, 9, 30, 122])
+def test_the_sandwich_of_any_number_of_patches_is_that_of_their_eigenvalues(patches: int) -> None:
+    """Patches with little and with much leverage in any order: four of them are computed together."""
+    rng = np.random.default_rng(patches)
+    for _ in range(20):
+        J = rng.normal(size=(patches, 5, 6)) * 10.0 ** rng.uniform(-1.0, 0.5, (patches, 1, 1))
+        normals, gradients = np.einsum("mki,mkj->mij", J, J), rng.normal(size=(patches, 6))
+        P, dof = sandwich_covariance(normals, gradients)
+        expected, expected_dof = oracle_of.sandwich_covariance(normals, gradients)
+        np.testing.assert_allclose(P, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+        assert dof == pytest.approx(expected_dof, rel=1e-6)
+
+
 def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
     """White noise across the surface: the sandwich must agree with s^2 (J'J)^-1."""
     rng = np.random.default_rng(11)
