@@ -8,7 +8,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
     source, pose = scan.outcome.scan, scan.outcome.pose
     cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=SHOWN_POINTS)
     distances = run.registrar.distance(cloud.points, pose, RESIDUAL_REACH * run.registrar.index.extent_m)
-    return replace(cloud, residual_m=np.asarray(distances, np.float32))
+    return CloudView(cloud.seq, cloud.points, np.asarray(distances, np.float32), cloud.intensity)
 
 
 class NewPaths:

@@ -313,6 +313,7 @@ def test_the_innovation_and_its_covariances_are_those_of_general_linear_algebra(
         assert nis == pytest.approx(float(e @ np.linalg.inv(expected) @ e), rel=1e-6)
         np.testing.assert_allclose(_motion.pose_covariance(P, H), H @ P @ H.T, atol=1e-13 * np.abs(H @ P @ H.T).max())
         B = np.linalg.inv(R) @ part
+        assert _motion.trace_of_ratio(part, R) == pytest.approx(np.trace(B), rel=1e-6)
         assert _motion.squared_traces(part, R) == pytest.approx(np.trace(B @ B) + np.trace(B) ** 2, rel=1e-6)
         squares, known = _motion.block_squares(R, e, part)
         for k, block in enumerate((slice(0, 3), slice(3, 6))):

@@ -68,6 +68,13 @@ def test_the_roots_are_those_of_the_rows_and_of_the_rows_weighted_by_their_noise
                 )
     assert np.array_equal(_root.extended(state.root, state.white, 0.0 * more, R), [state.root, state.white])
     assert np.isnan(_root.extended(np.zeros((3, 3)), np.zeros((3, 3)), np.full((1, 1, 3), np.nan), R[:1])).any()
+    C = R[0] + np.diag([1.0] * len(R[0]))
+    white = _root.whitened(C, np.arange(1.0, len(C) + 1.0))
+    assert white @ white == pytest.approx(
+        np.arange(1.0, len(C) + 1.0) @ np.linalg.inv(C) @ np.arange(1.0, len(C) + 1.0)
+    )
+    with pytest.raises(ValueError, match="positive definite"):
+        _root.whitened(-C, np.ones(len(C)))
     with pytest.raises(ValueError, match="positive definite"):
         _root.extended(state.root, state.white, more, -R)
     with pytest.raises(ValueError, match="differ"):

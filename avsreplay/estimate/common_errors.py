@@ -20,6 +20,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
+from avsreplay.estimate import _motion
 from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment
@@ -64,12 +65,11 @@ class ModelErrors:
         if not self.kept:
             return self
         x, y, z = (0.0, 0.0, 0.0) if sensor is None else sensor.t.tolist()
-        found = replace(self, sensor=(x, y, z))
         if alignment is None or alignment.covariance is None or alignment.systematic is None:
-            return found
+            return replace(self, sensor=(x, y, z))
         part, share = alignment.systematic, systematic_share(alignment)
         sizes = self._with_size(alignment.size, alignment.rms_m / extent_m)
-        return ModelErrors(self.scans + 1, self.share + share, self.systematic + part, sizes, found.sensor)
+        return ModelErrors(self.scans + 1, self.share + share, self.systematic + part, sizes, (x, y, z))
 
     def _with_size(self, size: tuple[float, float] | None, noise: float) -> tuple[float, float, float, float, int]:
         if size is None or not math.isfinite(size[1]):
@@ -113,7 +113,7 @@ def systematic_share(alignment: Alignment) -> float:
     """Return the share of systematic errors in the covariance of a pose, from 0 to 1; 0 where there is none."""
     if alignment.covariance is None or alignment.systematic is None:
         return 0.0
-    return float(np.trace(np.linalg.solve(alignment.covariance, alignment.systematic))) / 6.0
+    return _motion.trace_of_ratio(alignment.systematic, alignment.covariance) / 6.0
 
 
 def line_of_sight_1s(r_a: Array, common_m2: Array, errors: ModelErrors) -> Array:

@@ -144,7 +144,7 @@ def translation(h: float, arc: OrbitArc | None = None) -> Array:
     if arc is not None:
         return np.ascontiguousarray(arc.transitions(np.array([h]))[0])
     path = np.eye(6)
-    path[[0, 1, 2], [3, 4, 5]] = h
+    path.reshape(-1)[3:18:7] = h  # (0, 3), (1, 4), (2, 5)
     return path
 
 
@@ -247,18 +247,15 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None, drive: Triple = NO_D
     Raises:
         ValueError: by the returned function, for a time that is negative or not finite.
     """
-    path, arm = rotation_path(x, drive), geometry.skew(x.c_b)  # w x c = w' [c x]
+    path = rotation_path(x, drive)
 
     def at(times: Array) -> tuple[Array, Array]:
         times = np.asarray(times, dtype=np.float64)
         if times.size and not (float(times.min()) >= 0.0 and float(times.max()) < np.inf):
             raise ValueError("times must be finite and not before now")
-        q, w = path.at(times)
-        A = geometry.matrix(q)
+        place, moving = path.point(times, x.c_b)
         centre, speed = translated(x, times, arc)
-        position = centre + A @ x.c_b
-        velocity = speed + (A @ (w @ arm)[:, :, None])[:, :, 0]
-        return position, velocity
+        return centre + place, speed + moving
 
     return at
 

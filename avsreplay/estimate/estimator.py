@@ -138,8 +138,8 @@ class Estimator:
         x, alignment = prediction.belief.x, self.frame.alignment_into(alignment, prediction.belief.t_ns)
         R, dof = self.noise.of(alignment, x, prediction.window), self.noise.dof(alignment)
         alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment, prediction.counted)
-        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
-        return replace(found, rms_m=alignment.rms_m, free=alignment.free)
+        more = share, dof, alignment.rms_m, alignment.free
+        return innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, *more)
 
     def step(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
@@ -244,8 +244,9 @@ class Estimator:
         else:
             belief, R, scaled = track.belief, innovation.R, prediction.window
             left = residual(belief.x, prediction.belief.x, innovation.alpha)
-        used = track.recent[-1].prediction if track.recent else prediction
-        R = self.noise.rescaled(R, scaled, replace(track.window, rise=used.window.rise))
+        rise = (track.recent[-1].prediction if track.recent else prediction).window.rise
+        window = track.window if track.window.rise is rise else replace(track.window, rise=rise)
+        R = self.noise.rescaled(R, scaled, window)
         C, inflation = self.pose_covariance(belief), NO_INFLATION if track.inflation is None else track.inflation
         return semidefinite(track.belief.P), C, left, R, inflation, gate_of(innovation.dof, R, R + C)
 
@@ -259,8 +260,8 @@ class Estimator:
         prediction = replace(prediction, lag_s=old.lag_s, blur=old.blur)
         seen, R = epoch.innovation, self.noise.rescaled(epoch.innovation.R, old.window, track.window)
         alpha = innovation_vector(prediction.belief.x, measured_pose(old.belief.x, seen.alpha))
-        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
-        innovation = replace(found, rms_m=seen.rms_m)
+        more = seen.share, seen.dof, seen.rms_m
+        innovation = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, *more)
         used = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 

@@ -146,6 +146,8 @@ def innovation_of(
     robust: bool = False,
     correlated_share: float = 0.0,
     dof: float = math.inf,
+    rms_m: float = math.nan,
+    free: Array | None = None,
 ) -> Innovation:
     """The innovation alpha (6,) with its covariance S = H P H' + R, its NIS and its Cauchy weight.
 
@@ -157,6 +159,8 @@ def innovation_of(
         robust: give a pose whose NIS is above its 99.99 % point the Cauchy weight point / NIS; otherwise it is 1.
         correlated_share: the part of R that neighbouring scans have in common.
         dof: degrees of freedom of R as an estimate, inf if it is known.
+        rms_m: of the alignment.
+        free: directions that it does not determine.
     """
     S, definite, nis = _motion.innovation(P, H, alpha, R)
     if not definite:
@@ -168,7 +172,7 @@ def innovation_of(
     chi2, limit = as_chi2(nis, of_S), from_chi2(GATE, of_S)
     weight = limit / nis if robust and nis > limit else 1.0
     angle = 2.0 * math.asin(half)
-    return Innovation(alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, dof=dof)
+    return Innovation(alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, rms_m, dof, free)
 
 
 def dof_of_sum(dof: float, part: Array, total: Array) -> float:

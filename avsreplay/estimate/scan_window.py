@@ -234,9 +234,7 @@ def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors,
 
 def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
     """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
-    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
-    roots, _ = _motion.roots(np.array([one.S for one in last]))
-    sums = np.cumsum((roots @ np.array([one.alpha for one in last])[:, :, None])[:, :, 0], axis=0)
+    sums = np.cumsum([e.white for e in epochs[: -_RUNS[-1] - 1 : -1]], axis=0)
     share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(sums)]
     return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 

@@ -60,6 +60,15 @@ class Epoch:
     innovation: Innovation
     converged: bool
     _used: Array | None = field(default=None, init=False, repr=False)
+    _white: Array | None = field(default=None, init=False, repr=False)
+
+    @property
+    def white(self) -> Array:
+        """The (6,) whitened innovation; computed once."""
+        if (found := self._white) is None:
+            roots, _ = _motion.roots(self.innovation.S[None])
+            object.__setattr__(self, "_white", found := roots[0] @ self.innovation.alpha)
+        return found
 
     @property
     def used(self) -> Array:

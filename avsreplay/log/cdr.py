@@ -175,9 +175,10 @@ class Packer:
 
     def string(self, text: str) -> Packer:
         """Append a string with its closing NUL."""
-        raw = text.encode("utf-8") + b"\x00"
-        self.u32(len(raw))
-        self.out += raw
+        raw, out = text.encode("utf-8"), self.out
+        if missing := (4 - len(out)) % 4:
+            out += bytes(missing)
+        out += _U32.pack(len(raw) + 1) + raw + b"\x00"
         return self
 
     def octets(self, raw: bytes) -> Packer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from avsreplay.log.index import POSE_NAMES, Sink
 from avsreplay.records import State
 
 _MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
+_ROW = struct.Struct("13d")  # pose and twist of a track
 
 
 @value_class(eq=True)
@@ -207,8 +209,7 @@ class PoseTrack:
         return State(q_ab, row[10:13], row[:3], v_a, constants.sigma, constants.c_b, constants.q_bc)
 
     def _row(self, place: int) -> Array:
-        at = 13 * self._index()[place]
-        row = np.array(self._values[at : at + 13])
+        row = np.array(_ROW.unpack_from(self._values, _ROW.size * self._index()[place]))
         row[3:7] = geometry.normalise(row[3:7])
         return row
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
+from avsreplay.monitor import _root
 from avsreplay.monitor.chi_square import mean_band
 from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
@@ -234,7 +235,7 @@ class Consistency:
         if innovation is None or gamma == 0:
             return track
         share = innovation.weight * (innovation.chi2 / innovation.nis if innovation.nis > 0.0 else 1.0)
-        white = np.sqrt(share) * np.linalg.solve(np.linalg.cholesky(innovation.S), innovation.alpha)
+        white = np.sqrt(share) * _root.whitened(innovation.S, innovation.alpha)
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])), innovation.share)
 

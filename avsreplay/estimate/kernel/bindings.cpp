@@ -87,6 +87,22 @@ nb::tuple at(Path& path, const Times& times) {
   return nb::make_tuple(qs, ws);
 }
 
+// Per instant, a point c of the body from its centre of mass and its velocity about it, in {A}.
+nb::tuple point_at(Path& path, const Times& times, const Vector<3>& c) {
+  const size_t n = times.shape(0);
+  double *p, *v;
+  Numpy ps = array({n, 3}, &p), vs = array({n, 3}, &v);
+  const V3 arm = vector(c.data());
+  for (size_t k = 0; k < n; ++k) {
+    const Turn there = path.at(times(k));
+    const M3 A = matrix(quad(there.q));
+    const V3 from = A * arm, moving = A * cross(vector(there.w), arm);
+    std::memcpy(p + 3 * k, from.x, sizeof from.x);
+    std::memcpy(v + 3 * k, moving.x, sizeof moving.x);
+  }
+  return nb::make_tuple(ps, vs);
+}
+
 // The numbers of an array as a matrix of fixed size.
 template <class Fixed>
 const Fixed& as(const double* data) {
@@ -747,6 +763,8 @@ NB_MODULE(_motion, m) {
   m.def("pose_jacobian", &pose_jacobian_of, nb::arg("x"));
   m.def("pose_covariance", &pose_covariance_of, nb::arg("P"), nb::arg("H"));
   m.def("definite", [](const Six& A) { return definite(six(A)); }, nb::arg("A"));
+  m.def("trace_of_ratio", [](const Six& part, const Six& total) { return trace_of_ratio(six(part), six(total)); }, nb::arg("part"),
+        nb::arg("total"));
   m.def("squared_traces", [](const Six& part, const Six& total) { return squared_traces(six(part), six(total)); }, nb::arg("part"),
         nb::arg("total"));
   m.def("block_squares", &block_squares_of, nb::arg("R"), nb::arg("e"), nb::arg("C"));
@@ -823,5 +841,6 @@ NB_MODULE(_motion, m) {
       .def("__init__", [](Path* self, const Vector<4>& q, const Vector<3>& w, const Three& sigma, const Three& drive) {
         new (self) Path(turn(q, w), body(sigma, {0, 0, 0}, drive));
       }, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("drive") = Three{0, 0, 0})
-      .def("at", &at, nb::arg("times"));
+      .def("at", &at, nb::arg("times"))
+      .def("point", &point_at, nb::arg("times"), nb::arg("c"));
 }

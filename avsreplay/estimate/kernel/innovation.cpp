@@ -61,6 +61,14 @@ double innovation(const Square P, const double H[SEEN][DIM], const double e[SEEN
   return squared;
 }
 
+double trace_of_ratio(const double part[SEEN][SEEN], const double total[SEEN][SEEN]) {
+  double B[SEEN][SEEN], trace = 0;
+  std::memcpy(B, part, sizeof B);
+  solve<SEEN, SEEN>(total, B);
+  for (int r = 0; r < SEEN; ++r) trace += B[r][r];
+  return trace;
+}
+
 double squared_traces(const double part[SEEN][SEEN], const double total[SEEN][SEEN]) {
   double B[SEEN][SEEN], trace = 0, squares = 0;
   std::memcpy(B, part, sizeof B);

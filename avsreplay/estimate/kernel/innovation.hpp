@@ -17,6 +17,9 @@ void pose_covariance(const Square P, const double H[SEEN][DIM], double out[SEEN]
 double innovation(const Square P, const double H[SEEN][DIM], const double e[SEEN], const double R[SEEN][SEEN],
                   double S[SEEN][SEEN]);
 
+// tr B of B = total^-1 part.
+double trace_of_ratio(const double part[SEEN][SEEN], const double total[SEEN][SEEN]);
+
 // tr B^2 + (tr B)^2 of B = total^-1 part.
 double squared_traces(const double part[SEEN][SEEN], const double total[SEEN][SEEN]);
 

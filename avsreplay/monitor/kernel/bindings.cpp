@@ -35,8 +35,20 @@ nb::ndarray<nb::numpy, double> extended(const Matrix<-1, -1>& root, const Matrix
   return nb::ndarray<nb::numpy, double>(out, 3, shape, owner);
 }
 
+// L^-1 e of the Cholesky factor L of C (m, m).
+nb::ndarray<nb::numpy, double> whitened(const Matrix<-1, -1>& C, const nb::ndarray<const double, nb::shape<-1>, nb::c_contig>& e) {
+  const size_t m = e.shape(0), shape[1] = {m};
+  if (C.shape(0) != m || C.shape(1) != m) throw std::invalid_argument("sizes of the covariance and the vector differ");
+  double* out = new double[m];
+  nb::capsule owner(out, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+  std::copy(e.data(), e.data() + m, out);
+  if (!avs::whiten(C.data(), out, m, 1)) throw std::invalid_argument("a covariance is not positive definite");
+  return nb::ndarray<nb::numpy, double>(out, 1, shape, owner);
+}
+
 }  // namespace
 
 NB_MODULE(_root, m) {
   m.def("extended", &extended, nb::arg("root"), nb::arg("white"), nb::arg("rows"), nb::arg("R"));
+  m.def("whitened", &whitened, nb::arg("C"), nb::arg("e"));
 }
