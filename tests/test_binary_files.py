@@ -145,7 +145,7 @@ def test_a_damaged_log_of_an_interrupted_run_is_one_line(fixtures_folder, tmp_pa
     path = tmp_path / "r" / "result.mcap"
     data = path.read_bytes()
     assert b"/pose" in data[:200_000]
-    path.write_bytes(data.replace(b"std_msgs", b"std\x80msgs"))
+    path.write_bytes(data.replace(b"tf2_msgs", b"tf2\x80msgs"))
     record = json.loads((tmp_path / "r" / "run.json").read_text())
     (tmp_path / "r" / "run.json").unlink()
     write_manifest(tmp_path / "r", record, 2)
