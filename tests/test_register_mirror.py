@@ -10,7 +10,7 @@ from avsreplay.geometry import Pose
 from avsreplay.records import AlignStatus, Scan, Surface
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import view
-from avsreplay.register.mirror import MOST_SCANS, SeenScan, from_another_side, reflections
+from avsreplay.register.mirror import MOST_SCANS, from_another_side, reflections
 from avsreplay.register.surface_index import SurfaceIndex
 
 NOISE = 0.002  # of the extent
@@ -101,7 +101,8 @@ def test_scans_of_different_sides_are_kept() -> None:
     check, _ = checked(SYMMETRIC, SYMMETRIC, mirrored=False, count=12)
     seen = check._seen
     assert len(seen) == MOST_SCANS
-    sights = np.array([scan.sight for scan in seen])
+    middle = 0.5 * (SYMMETRIC.vertices.min(axis=0) + SYMMETRIC.vertices.max(axis=0))
+    sights = np.array([(middle - scan.T_cs.t) / np.linalg.norm(middle - scan.T_cs.t) for scan in seen])
     cosines = (sights @ sights.T)[np.triu_indices(len(seen), 1)]
     assert cosines.max() < np.cos(np.radians(30.0))
-    assert not from_another_side(SeenScan(seen[0].points[::2], seen[0].T_cs), seen)
+    assert not from_another_side(seen[0].T_cs, seen, middle)

@@ -106,6 +106,7 @@ class ModelCheck:
         self._unmatched: Scan | None = None
         self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
         self._durations = Durations()
+        self._middle = 0.5 * (surface.vertices.min(axis=0) + surface.vertices.max(axis=0))
         self._seen: list[SeenScan] = []  # accepted scans of different sides, to compare the mirror image
 
     def add(self, scan: Scan, found: Alignment | None) -> None:
@@ -263,11 +264,13 @@ class ModelCheck:
 
     def _keep(self, scan: Scan, T_ac: Pose) -> None:
         """Keep a scan of another side of the target, for the comparison with the mirror image."""
-        if not wanted(self._seen) or (p := self._on_model(scan, T_ac, _SEEN_POINTS)) is None:
+        if not wanted(self._seen):
             return
         T_cs = T_ac.inverse() if scan.sensor is None else T_ac.inverse() @ scan.sensor
-        seen = SeenScan(T_cs.inverse().apply(p).astype(np.float32), T_cs)
-        self._seen += [seen] if from_another_side(seen, self._seen) else []
+        if not from_another_side(T_cs, self._seen, self._middle):
+            return
+        if (p := self._on_model(scan, T_ac, _SEEN_POINTS)) is not None:
+            self._seen.append(SeenScan(T_cs.inverse().apply(p).astype(np.float32), T_cs))
 
     def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""

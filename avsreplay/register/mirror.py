@@ -59,12 +59,6 @@ class SeenScan:
     points: NDArray[np.float32]
     T_cs: Pose
 
-    @property
-    def sight(self) -> Array:
-        """Direction (3,) from the sensor to the points in {C}."""
-        middle = self.points.mean(axis=0, dtype=np.float64)
-        return np.asarray(self.T_cs.R @ middle / max(float(np.linalg.norm(middle)), np.finfo(float).tiny))
-
 
 @value_class
 class _Compared:
@@ -81,9 +75,15 @@ class _Compared:
     off: float
 
 
-def from_another_side(scan: SeenScan, kept: Sequence[SeenScan]) -> bool:
-    """Return whether a scan shows another side of the target than those kept."""
-    return all(float(scan.sight @ each.sight) < APART for each in kept)
+def from_another_side(T_cs: Pose, kept: Sequence[SeenScan], middle: Array) -> bool:
+    """Return whether a sensor sees another side of the target, with its middle (3,) in {C} [m], than those kept."""
+    sight = _sight(T_cs, middle)
+    return all(float(sight @ _sight(each.T_cs, middle)) < APART for each in kept)
+
+
+def _sight(T_cs: Pose, middle: Array) -> Array:
+    away = middle - T_cs.t
+    return np.asarray(away / max(float(np.linalg.norm(away)), np.finfo(float).tiny))
 
 
 def wanted(kept: Sequence[SeenScan]) -> bool:
