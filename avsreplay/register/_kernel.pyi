@@ -182,6 +182,12 @@ class Index:
         beyond_m: float,
         least_close: float,
         part: int,
+        numbers: NDArray[np.float64],
+        many: int,
+        least_share: int,
+        most_share: int,
+        small_share: int,
+        quiet_m: float,
         threads: int = 1,
         matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...

@@ -15,6 +15,10 @@ from avsreplay.register.surface_index import SurfaceIndex
 HEALTHY_FIXED, HEALTHY_SEARCHED = (4200, 0.8), (7000, 1.3)  # an ordinary registration: work, and searches (per point)
 GRADE_WORK, POINTS_GRADED = 8000, 2  # the quality of a pose: point searches in all, and points of which each takes one
 NEAR_POINTS, NEAR_OF_EXTENT = 500, 0.002  # points with the noise of an ordinary scan that show the cost of a search
+SIMULATED_WORK, MOST_SIMULATED = (
+    (1000, 2),
+    3000,
+)  # of the simulated noise: point searches in all and per point, to so many
 LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 3, 7  # cost per point of finding whether points are scattered, and of leaving them out
@@ -22,8 +26,7 @@ TEST_WORK, SIZE_WORK = 15_000, 15_000  # cost of a test of a pose, and of fittin
 STRUCTURE_WORK, FREE_WORK = 3000, 8000  # cost of the residuals that neighbours share, and of free directions
 STAGE_WORK, CALL_WORK = 1200, 600  # cost in the interpreter of a stage of a restart, and of measuring a pose
 LAST_WORK = 30_000  # cost of registering a scan once more from its pose, and of the test of the result
-BIAS_WORK = 16_000  # cost of a simulation for the bias of the noise, and of what is measured before or after it
-END_WORK = SIZE_WORK + BIAS_WORK  # cost of what follows the last pose: its size and the bias of its noise
+END_WORK = SIZE_WORK  # cost of what follows the last pose: its size
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
 
@@ -52,9 +55,10 @@ def near_work(surface: Surface, index: SurfaceIndex) -> float:
     return index.distances(near, Pose.identity(), np.inf, False, 1, 0.0)[1] / len(near)
 
 
-def grade_work(points: int) -> int:
-    """Return the work of the quality of a pose of a scan of so many points, in point searches."""
-    return GRADE_WORK + points // POINTS_GRADED
+def grade_work(points: int, noisy: bool = False) -> int:
+    """Return the work of the quality of a pose of a scan of so many points, in point searches; of one with noise."""
+    simulated = SIMULATED_WORK[0] + SIMULATED_WORK[1] * min(points, MOST_SIMULATED) if noisy else 0
+    return GRADE_WORK + points // POINTS_GRADED + simulated
 
 
 class Effort(Enum):
@@ -106,19 +110,18 @@ class Budget:
         """Subtract work that was done."""
         self.left -= searches
 
-    def registered(self, fit: Fit, found: Alignment, graded: int) -> None:
-        """Subtract the work of an alignment, estimated if not counted, and of its quality by ``graded`` points."""
+    def registered(self, fit: Fit, found: Alignment, graded: int, noisy: bool) -> None:
+        """Subtract the work of an alignment, estimated if not counted, and of its quality by ``graded`` points.
+
+        ``noisy``: its noise was simulated.
+        """
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
         free = FREE_WORK + found.points if found.status is AlignStatus.DEGENERATE else 0
-        self.spend((fit.work or fit.iterations * found.points * share) + grade_work(graded) + free)
+        self.spend((fit.work or fit.iterations * found.points * share) + grade_work(graded, noisy) + free)
 
     def for_alignment(self, points: int) -> int:
         """Return the searches that an alignment may take, so that its pose can be graded and tested."""
         return max(1, self.left - grade_work(points) - TEST_WORK)
-
-    def allows_at_the_end(self, searches: int) -> bool:
-        """Return whether this much work is left for what follows the last pose."""
-        return searches <= self.left + END_WORK
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""

@@ -205,12 +205,12 @@ def noise_along(rays: Array, normal: Array, residual: Array, weight: Array) -> A
     """
     along = weight * np.einsum("ij,ij->i", rays, normal)
     size = np.sqrt(float(residual @ residual) / max(float(along @ along), np.finfo(float).tiny))
-    return np.asarray(size * _normal_numbers(1 << len(rays).bit_length())[: len(rays)])
+    return np.asarray(size * normal_numbers(1 << len(rays).bit_length())[: len(rays)])
 
 
 @lru_cache(maxsize=4)
-def _normal_numbers(count: int) -> Array:
-    """Numbers (count,) of a normal distribution, the first of them evenly distributed as well; read-only."""
+def normal_numbers(count: int) -> Array:
+    """Return normal numbers (count,), the first of them evenly distributed as well; read-only."""
     share = (0.5 + np.arange(count) * (0.5 * (np.sqrt(5.0) - 1.0))) % 1.0
     numbers = np.array([NormalDist().inv_cdf(float(x)) for x in share])
     numbers.flags.writeable = False

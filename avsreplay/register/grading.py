@@ -12,7 +12,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register import quality
-from avsreplay.register.backend import Backend, Target, aligned
+from avsreplay.register.backend import Backend, HornBackend, Target, aligned
 from avsreplay.register.budget import Budget
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.restarts import Restarter
@@ -26,6 +26,7 @@ class Grader:
     def __init__(self, target: Target, params: RegisterParams, backend: Backend, restarter: Restarter) -> None:
         self._target, self._params, self._backend, self._restarter = target, params, backend, restarter
         self._accuracy: tuple[float, float] = getattr(backend, "accuracy", quality.ACCURACY)
+        self._closest = isinstance(backend, HornBackend)
 
     def graded(
         self,
@@ -60,10 +61,11 @@ class Grader:
                 return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
             of, full = self._restarter.part(scan) if fit.rough else scan, not fit.rough
             options = (self._params, halves and full, self._accuracy, full and not carried, start)
-            found = quality.grade(index, self._target.visibility, of, fit, limits, *options)
+            found = quality.grade(index, self._target.visibility, of, fit, limits, *options, full and self._closest)
             if fit.rough:
                 found = replace(found, points=len(scan), inliers=found.inliers * len(scan) // len(of))
-            budget.registered(fit, found, len(of))
+            noisy = full and self._closest and found.rms_m > quality.SMALL_NOISE * index.extent_m
+            budget.registered(fit, found, len(of), noisy)
             ended = last or fit.iterations >= limits.n_max or budget.left < budget.healthy
             if ended or found.status is not AlignStatus.NOT_CONVERGED or not self._worth_more(guess, found):
                 break

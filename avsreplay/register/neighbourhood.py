@@ -5,10 +5,6 @@ away from the minimum that the surface alone has; the cost is then lower along t
 shows a small part of the target has several minima, and nearly all points can be near the model at a wrong one; the
 scan is then registered again from poses displaced along these directions. A scan of a panel can be matched to its other
 side; it is registered again from a pose that is displaced towards the camera.
-
-In a scan with noise the minimum itself is displaced, because the closest point is a nonlinear function of the measured
-one: noise near edges, thin parts and curved faces moves the pose in the same way in every scan of a view. The residuals
-do not show this bias. The pose of simulated scans, with noise of the same size, shows it.
 """
 
 from __future__ import annotations
@@ -26,7 +22,6 @@ from avsreplay.register.backend import Target
 from avsreplay.register.budget import FAR_WORK, LAST_WORK, SIZE_WORK, Budget
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.pose_bias import BIAS_POINTS, UNCERTAIN_CHI2, NoiseBias
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
 
@@ -41,7 +36,7 @@ POSTPONED = "the search for a pose is postponed, because the searches of the sca
 NOT_FOUND = "no pose of the model explains the scan, and no work is left for a longer search"
 NOT_COMPARED = "no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
-BIAS_OF_GATE = 0.2  # with a smaller rms distance, in gates, the bias of the noise is not significant
+NOISY_OF_GATE = 0.2  # with a smaller rms distance, in gates, the noise is not the cause of an uncertain attitude
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
 
 
@@ -50,7 +45,7 @@ class Neighbourhood:
 
     def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter) -> None:
         self._target, self._test, self._restarter = target, test, restarter
-        self._extent, self._noise = target.surface.extent, NoiseBias(target, restarter)
+        self._extent = target.surface.extent
 
     def best(
         self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
@@ -152,15 +147,8 @@ class Neighbourhood:
             return found
         return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
 
-    def with_bias(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
-        """Return the alignment with its size, and without the bias of the noise, where the fit is not close.
-
-        The bias is left out as far as it is certain. With x the chi-square of the bias b by the covariance P of the
-        pose, the share s = 1 - 4 / x of it, 0 if negative, is certain (James and Stein, Proc. 4th Berkeley Symp. 1,
-        1961, for 6 unknowns). The pose is corrected by s b if the ranges of the scan then fit better. P is enlarged by
-        b b' times (1 - s)^2 (1 - 1 / x) for what is left, and times (s / 2)^2, because half of a correction counts as
-        its standard error. Where nothing else is stated, the message states a standard deviation of the attitude above
-        ``UNCERTAIN_RAD``.
+    def finished(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
+        """Return the alignment with its size; an attitude that noise leaves uncertain is stated if nothing else is.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -169,18 +157,10 @@ class Neighbourhood:
         """
         found = self.with_size(scan, found, budget)
         P = found.covariance
-        if P is None or found.rms_m <= BIAS_OF_GATE * self._target.limits.gate_m:
+        if P is None or found.message or found.rms_m <= NOISY_OF_GATE * self._target.limits.gate_m:
             return found
-        few = scan[:: max(1, len(scan) // BIAS_POINTS)]
-        b, better = self._noise.bias(few, found.T_ac.inverse(), P, budget)
-        x = max(float(b @ np.linalg.solve(P, b)), 1.0)
-        s = max(0.0, 1.0 - UNCERTAIN_CHI2 / x) if better else 0.0
-        wider = P + ((1.0 - s) ** 2 * (1.0 - 1.0 / x) + (0.5 * s) ** 2) * np.outer(b, b)
-        T_ac = found.T_ac @ Pose(geometry.exp(s * b[:3]), s * b[3:])
-        info = geometry.frozen(np.linalg.inv(wider))
-        found = replace(found, T_ac=T_ac, covariance=geometry.frozen(wider), info=info)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(wider[:3, :3])[-1]))
-        if sigma <= UNCERTAIN_RAD or found.message:
+        sigma = float(np.sqrt(np.linalg.eigvalsh(P[:3, :3])[-1]))
+        if sigma <= UNCERTAIN_RAD:
             return found
         return replace(
             found, message=f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma) only"

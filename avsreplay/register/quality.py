@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
+    normal_numbers,
     pseudo_inverse,
     registration_covariance,
     sandwich_covariance,
@@ -39,6 +41,13 @@ AS_MANY, AS_NEAR = 0.99, 1.02  # ratios of inliers and rms for which a pose fits
 SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # error of size from sums of patches: over the least reported one, sigmas
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
 UNCHANGED = 0.06  # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
+NUMBERS = 1024  # normal numbers of the simulated noise
+SIMULATED, SHARES = (
+    1024,
+    (3, 12, 8),
+)  # points that are simulated; one of so many at most, at least, at most of small noise
+SMALL_NOISE = 0.002  # of the extent: with less noise a part of the simulated points decides whether the others are
+UNCERTAIN_BIAS = 0.5  # of the bias of the noise: standard error
 ACCURACY = (0.1, 1e-3)  # accuracy [deg, share of the extent] of a back end that states none
 
 
@@ -56,6 +65,8 @@ class PoseQuality:
         covariance, systematic: (6, 6) and the part of it from systematic errors.  dof: its degrees of freedom.
         split_nis: the test of halves, NaN where it was not made.
         size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates away.
+        bias, left, chance: (6,) of the pose, caused by the noise, as far as it is not by chance: T_ac_true = T_ac
+            Exp(bias); (6,) the rest of the estimate; (6, 6) covariance of the bias.
         patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
     """
 
@@ -78,6 +89,9 @@ class PoseQuality:
     size: float
     size_1s: float
     well_off: int
+    bias: Array
+    left: Array
+    chance: Array
     patches: tuple[Any, ...]
 
 
@@ -143,6 +157,7 @@ def grade(
     accuracy: tuple[float, float] = ACCURACY,
     systematic: bool = True,
     guess: Pose | None = None,
+    simulated: bool = False,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
@@ -150,13 +165,15 @@ def grade(
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
     end began. A pose that equals this guess, although the residuals require a step, is FAILED. The pose of a degenerate
-    view has its unobservable directions as in the guess, if the surface then fits as well. The size is not fitted; if
-    it should be (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it for the pose that is returned in the end.
+    view has its unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the pose is
+    one of least squared distances. The bias that noise causes in it is taken from the pose, and the mean that noise
+    adds to the residuals from the covariance, see ``kernel/noise.hpp``. The size is not fitted; if it should be
+    (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it for the pose that is returned in the end.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic)
+    found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic, simulated)
     step = found.overlap and found.statistic > UNCHANGED
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
@@ -164,11 +181,14 @@ def grade(
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
     weakest, free = tuple[str, ...](), None
     if found.observable:
-        P = found.covariance
+        b, uncertain = found.bias, UNCERTAIN_BIAS**2 * np.outer(found.bias, found.bias) + found.chance
+        P = found.covariance + uncertain + np.outer(found.left, found.left)
         if not found.bounded:
             weakest, free = unbounded_directions(P, index.extent_m)
         if weakest:
-            info, P = pseudo_inverse(found.covariance), None
+            info, P = pseudo_inverse(P), None
+        elif b.any():
+            T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
     elif found.overlap:
         used = Evidence(found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches)
         view = _directions(used)
@@ -226,6 +246,7 @@ def _grade(
     across: Array,
     accuracy: tuple[float, float],
     systematic: bool,
+    simulated: bool,
 ) -> PoseQuality:
     """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the test of halves."""
     extent = index.extent_m
@@ -235,7 +256,8 @@ def _grade(
     step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
     rule = (min(gate_m, index.reach_m), PATCH_OF_EXTENT * extent, LEAST_PATCHES, *camera, *noise, *overlap, *step)
     counted = (np.ascontiguousarray(across), WELL_OFF * gate_m, MANY_INLIERS, PART)
-    return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, 1, fit.matches))
+    drawn = (normal_numbers(NUMBERS) if simulated else np.empty(0), SIMULATED, *SHARES, SMALL_NOISE * extent)
+    return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, *drawn, 1, fit.matches))
 
 
 def _observable_information(view: Directions, found: Evidence, extent_m: float, systematic: bool) -> Array:

@@ -116,7 +116,7 @@ class Registrar:
         elif not searched:
             found = self._unique(scan, guess, found, budget, halves, carried)
             found = self._settled(scan, found, budget, halves, carried, unknown)
-        return self._neighbourhood.with_bias(scan, found, budget)
+        return self._neighbourhood.finished(scan, found, budget)
 
     def acquire(self, points: NDArray[Any], effort: Effort = Effort.FULL) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -136,7 +136,7 @@ class Registrar:
         if effort is not Effort.FULL:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
         budget = Budget(healthy_work(len(scan), self._target.near_work))
-        return self._neighbourhood.with_bias(scan, self._acquire(scan, budget, False), budget)
+        return self._neighbourhood.finished(scan, self._acquire(scan, budget, False), budget)
 
     def _acquire(
         self, scan: NDArray[Any], budget: Budget, carried: bool, rounds: int = MOST_ATTEMPTS, known: Pose | None = None

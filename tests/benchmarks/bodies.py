@@ -2,7 +2,7 @@
 
 Each is an assembly of primitives of trimesh whose parts overlap, so that it has interior faces as CAD exports do. All
 kinds but ``symmetric`` differ from their mirror images: ``satellite``, ``vehicle`` and ``lander`` by small parts, the
-others by their shape.
+others by their shape. The bodies of ``THIN`` have rods and panels 0.1 to 0.5 % of their extent thick.
 """
 
 from __future__ import annotations
@@ -128,14 +128,109 @@ def symmetric(rng: np.random.Generator) -> list[Mesh]:
     return _car()
 
 
+def rod(start: tuple, end: tuple, radius: float, sections: int = 8) -> Mesh:
+    """A rod between two places."""
+    return cylinder(radius, segment=np.array([start, end], dtype=float), sections=sections)
+
+
+def direction(rng: np.random.Generator) -> np.ndarray:
+    """A random direction."""
+    d = rng.normal(size=3)
+    return d / np.linalg.norm(d)
+
+
+def probe(rng: np.random.Generator) -> list[Mesh]:
+    """A bus with three to five long thin booms, one or two thin panels, a dish on struts and two boxes."""
+    size = rng.uniform(0.5, [1.0, 0.9, 1.1])
+    x, _, z = size
+    parts = [box(size), rod((0, 0, 0), rng.uniform(1.5, 2.5) * direction(rng), rng.uniform(0.008, 0.02))]
+    for _ in range(rng.integers(2, 5)):
+        parts.append(rod((0, 0, 0), rng.uniform(0.8, 2.0) * direction(rng), rng.uniform(0.006, 0.02)))
+    panel = rng.uniform([0.8, 0.006, 0.3], [1.6, 0.02, 0.6])
+    for side in (-1, 1) if rng.random() < 0.6 else (1,):
+        parts.append(at(turned(box(panel), rng.uniform(0, 60), X), side * (x / 2 + 0.15 + panel[0] / 2), 0, 0))
+        parts.append(rod((0, 0, 0), (side * (x / 2 + 0.2), 0, 0), 0.015))
+    parts.append(at(turned(cone(rng.uniform(0.3, 0.5), 0.15, sections=24), 180, X), 0, 0, z / 2 + 0.35))
+    for angle in 2 * np.pi * np.arange(3) / 3:
+        c, s = np.cos(angle), np.sin(angle)
+        parts.append(rod((0.2 * c, 0.2 * s, z / 2 - 0.02), (0.25 * c, 0.25 * s, z / 2 + 0.3), 0.01))
+    for _ in range(2):
+        place, axis = rng.uniform(-0.6, 0.6, 3) * size / 2, rng.integers(3)
+        place[axis] = rng.choice((-1, 1)) * size[axis] / 2
+        parts.append(at(box(rng.uniform(0.1, 0.25, 3)), *place))
+    return parts
+
+
+def guitar(rng: np.random.Generator) -> list[Mesh]:
+    """An electric guitar: a flat body with a horn, neck, head, strings, frets, pegs, pickups and knobs."""
+    t, tilt = rng.uniform(0.035, 0.05), rng.uniform(15, 35)
+    parts = [cylinder(rng.uniform(0.16, 0.19), t, sections=48), at(box((0.22, 0.2, t)), 0.11, 0, 0)]
+    parts.append(at(cylinder(rng.uniform(0.12, 0.15), t, sections=40), 0.22, 0.01, 0))
+    parts.append(at(turned(box((0.16, 0.05, t)), tilt, Z), 0.33, 0.09, 0))
+    parts.append(at(box((0.5, 0.055, 0.022)), 0.55, 0, t / 2 - 0.004))
+    parts.append(at(turned(box((0.18, 0.08, 0.015)), rng.uniform(5, 14), Y), 0.87, 0.005, t / 2 - 0.01))
+    for k in range(6):
+        y, peg = (k - 2.5) * 0.008, 0.82 + 0.022 * k
+        parts.append(rod((-0.05, y, t / 2 + 0.012), (0.80, y * 0.8, t / 2 + 0.012), 0.0007 + 0.0002 * k, 6))
+        parts.append(at(turned(cylinder(0.005, 0.03, sections=8), 90, X), peg, 0.055, t / 2 - 0.012))
+        parts.append(at(box((0.012, 0.02, 0.008)), peg, 0.075, t / 2 - 0.012))
+    parts += [
+        at(cylinder(0.012, 0.018, sections=16), -0.02 - 0.03 * k, -0.11 + 0.01 * k, t / 2 + 0.006) for k in range(3)
+    ]
+    parts += [at(box((0.035, 0.08, 0.01)), 0.05 + 0.1 * k, 0, t / 2 + 0.004) for k in range(2)]
+    parts.append(at(box((0.03, 0.08, 0.012)), -0.05, 0, t / 2 + 0.005))
+    return parts + [at(box((0.002, 0.052, 0.002)), 0.33 + 0.022 * k, 0, t / 2 + 0.0075) for k in range(20)]
+
+
+def comsat(rng: np.random.Generator) -> list[Mesh]:
+    """A bus with two wings of two or three thin panels each, three dishes on masts and four whip antennas."""
+    x, y, z = rng.uniform(0.5, [0.9, 0.9, 1.2])
+    parts, count, tilt = [box((x, y, z))], rng.integers(2, 4), rng.uniform(0, 90)
+    panel = rng.uniform([0.45, 0.006, 0.35], [0.7, 0.02, 0.6])
+    for side in (-1, 1):
+        for k in range(count):
+            parts.append(turned(at(box(panel), side * (x / 2 + 0.2 + (k + 0.5) * (panel[0] + 0.03)), 0, 0), tilt, X))
+        parts.append(rod((0, 0, 0), (side * (x / 2 + 0.2 + count * (panel[0] + 0.03)), 0, 0), 0.012))
+    for _ in range(3):
+        a, b = rng.uniform(-0.4, 0.4, 2) * np.array([x, y])
+        parts.append(at(turned(cone(rng.uniform(0.12, 0.3), 0.08, sections=20), 180, X), a, b, z / 2 + 0.15))
+        parts.append(rod((a, b, z / 2 - 0.02), (a, b, z / 2 + 0.12), 0.01))
+    for _ in range(4):
+        root = np.array([*rng.uniform(-0.4, 0.4, 2) * np.array([x, y]), -z / 2])
+        d = rng.normal(size=3) * [0.4, 0.4, 0.1] - [0, 0, 1]
+        end = root + rng.uniform(0.3, 0.8) * d / np.linalg.norm(d)
+        parts.append(rod(tuple(root), tuple(end), rng.uniform(0.006, 0.012)))
+    return [*parts, at(box((0.2, 0.15, 0.1)), x * 0.2, y / 2, z * 0.2)]
+
+
+def truss(rng: np.random.Generator) -> list[Mesh]:
+    """A triangular mast of rods with a bus at one end, a thin panel at the other and a box."""
+    side, radius, count = rng.uniform(0.12, 0.2), rng.uniform(0.006, 0.014), rng.integers(6, 10)
+    corners = [(side, 0.0), (-side / 2, 0.87 * side), (-side / 2, -0.87 * side)]
+    parts = []
+    for low in 1.6 * side * np.arange(count):
+        high = low + 1.6 * side
+        for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
+            parts += [rod((*a, low), (*a, high), radius), rod((*a, low), (*b, low), radius)]
+            parts.append(rod((*a, low), (*b, high), 0.7 * radius))
+    parts.append(at(box(rng.uniform(0.4, 0.7, 3)), 0, 0, -0.3))
+    parts.append(at(turned(box((0.8, 0.01, 0.4)), rng.uniform(10, 50), Y), 0.2, 0.1, count * 1.6 * side))
+    return [*parts, at(box((0.2, 0.3, 0.15)), 0.3, 0.1, -0.2)]
+
+
 KINDS: dict[str, Callable[[np.random.Generator], list[Mesh]]] = {
     each.__name__: each for each in (satellite, wing, bracket, chair, mug, lander, vehicle, symmetric)
 }
 
 
+THIN: dict[str, Callable[[np.random.Generator], list[Mesh]]] = {
+    each.__name__: each for each in (probe, guitar, comsat, truss)
+}
+
+
 def body(kind: str, seed: int) -> Mesh:
     """A body with the origin off the centre of its box."""
-    mesh = trimesh.util.concatenate(KINDS[kind](np.random.default_rng([seed, sum(map(ord, kind))])))
+    mesh = trimesh.util.concatenate((KINDS | THIN)[kind](np.random.default_rng([seed, sum(map(ord, kind))])))
     return at(mesh, *(0.05 * np.linalg.norm(mesh.extents) * np.array([0.3, -0.2, 0.4]) - mesh.bounds.mean(axis=0)))
 
 

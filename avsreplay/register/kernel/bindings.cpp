@@ -231,17 +231,18 @@ class Index {
   nb::tuple grade(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool camera, int64_t tested,
                   double least_facing, double extent, double noise, double noise_floor, double least_inliers,
                   double least_ratio, double least_information, bool systematic, double turn, double move,
-                  const Doubles& across, double beyond, double least_close, int64_t part, int threads,
-                  const Matches* matches) const {
+                  const Doubles& across, double beyond, double least_close, int64_t part,
+                  const Doubles& numbers, int64_t many, int64_t least_share, int64_t most_share, int64_t small_share, double quiet,
+                  int threads, const Matches* matches) const {
     require(gate > 0 && side > 0 && extent > 0, "gate, patch size and extent must be positive");
-    require(tested > 0 && part > 1, "some points must be tested");
+    require(tested > 0 && part > 1 && many > 0 && least_share > 0 && most_share >= least_share && small_share > 0, "some points must be tested");
     require(across.ndim() == 2 && across.shape(1) == 3, "directions must be (k, 3)");
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
     const GradeRule rule{{gate, side, least, camera}, extent, tested, least_facing, noise, noise_floor, least_inliers, least_ratio,
                          least_information, systematic, turn, move, {across.data(), across.data() + across.size()},
-                         beyond, least_close, part};
+                         beyond, least_close, part, {{numbers.data(), numbers.data() + numbers.size()}, many, least_share, most_share, small_share, quiet}};
     Grade g;
     {
       nb::gil_scoped_release release;
@@ -251,9 +252,13 @@ class Index {
     double* c;
     auto centre = array<double>({3}, &c);
     std::memcpy(c, g.centre, sizeof g.centre);
+    auto bias = array<double>({6}, &c);
+    std::copy(g.bias.begin(), g.bias.end(), c);
+    auto left = array<double>({6}, &c);
+    std::copy(g.left.begin(), g.left.end(), c);
     return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
                           g.observable, g.bounded, g.beyond, array66(g.covariance.P), array66(g.covariance.systematic), g.covariance.dof, g.split,
-                          g.size[0], g.size[1], g.well_off, patches(g.patches));
+                          g.size[0], g.size[1], g.well_off, bias, left, array66(g.chance), patches(g.patches));
   }
 
   nb::tuple distances(nb::handle points, const Doubles& T_ca, double most, bool known, int64_t tested, double least_facing) const {
@@ -675,7 +680,9 @@ NB_MODULE(_kernel, m) {
            nb::arg("least_patches"), nb::arg("camera"), nb::arg("tested"), nb::arg("least_facing"), nb::arg("extent_m"),
            nb::arg("noise_m"), nb::arg("noise_floor_m"), nb::arg("least_inliers"), nb::arg("least_ratio"),
            nb::arg("least_information"), nb::arg("systematic"), nb::arg("turn_rad"), nb::arg("move_m"), nb::arg("across"),
-           nb::arg("beyond_m"), nb::arg("least_close"), nb::arg("part"), nb::arg("threads") = 1, nb::arg("matches").none() = nb::none())
+           nb::arg("beyond_m"), nb::arg("least_close"), nb::arg("part"), nb::arg("numbers"), nb::arg("many"),
+           nb::arg("least_share"), nb::arg("most_share"), nb::arg("small_share"), nb::arg("quiet_m"), nb::arg("threads") = 1,
+           nb::arg("matches").none() = nb::none())
       .def("distances", &Index::distances, nb::arg("points"), nb::arg("T_ca"), nb::arg("most_m"), nb::arg("camera"),
            nb::arg("tested"), nb::arg("least_facing"))
       .def("cast", &Index::cast, nb::arg("eye"), nb::arg("directions"))

@@ -275,7 +275,7 @@ std::size_t Store::bytes() const {
   return id.size() * sizeof id[0] + points.size() * sizeof(Vec3) + triangles.size() * sizeof(Triangle) +
          normals.size() * sizeof(Vec3) + point_blocks.size() * sizeof(PointBlock) +
          triangle_blocks.size() * sizeof(TriangleBlock) + boxes.size() * sizeof(Box) + 
-         nodes.size() * sizeof(Node) + sides.size() * sizeof(NodeSides) +
+         nodes.size() * sizeof(Node) + sides.size() * sizeof(NodeSides) + clear.size() * sizeof clear[0] +
          (top.size() + bricks.size() + lists.size()) * sizeof(uint32_t);
 }
 
@@ -284,6 +284,7 @@ void build(Store& s, const Surface& surface, double reach, const Code& code, Tea
   build_blocks(s, surface);
   if (!s.mesh) build_normals(s, code, team);
   build_cells(s, code, team);
+  if (s.mesh) build_clearances(s, code, team);
 }
 
 }  // namespace avs

@@ -14,6 +14,8 @@ struct Surface {
 };
 
 void build_cells(Store& store, const Code& code, Team& team);
+// Fills in how far the surface around each face is flat.
+void build_clearances(Store& store, const Code& code, Team& team);
 void build(Store& store, const Surface& surface, double reach, const Code& code, Team& team);
 
 }  // namespace avs

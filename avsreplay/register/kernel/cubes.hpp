@@ -37,10 +37,17 @@ class Numbers {
     if (2 * cubes_.size() > slots_.size()) grow();
     return last_;
   }
+  // The number of a cube, or NONE where it never came.
+  uint32_t find(const Cube& cube) const {
+    size_t at = hash(cube) & (slots_.size() - 1);
+    while (slots_[at] != EMPTY && !(cubes_[slots_[at]] == cube)) at = (at + 1) & (slots_.size() - 1);
+    return slots_[at];
+  }
   size_t size() const { return cubes_.size(); }
+  static constexpr uint32_t NONE = UINT32_MAX;
 
  private:
-  static constexpr uint32_t EMPTY = UINT32_MAX;
+  static constexpr uint32_t EMPTY = NONE;
 
   static size_t hash(const Cube& c) {
     const uint64_t h = ((uint64_t)c.x * 73856093u ^ (uint64_t)c.y * 19349663u ^ (uint64_t)c.z * 83492791u) * 0x9e3779b97f4a7c15u;

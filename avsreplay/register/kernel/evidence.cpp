@@ -4,58 +4,16 @@
 #include <cmath>
 #include <memory>
 
-#include "cubes.hpp"
-
 namespace avs {
 namespace {
-
-constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
-
-// The closest points of a scan at a pose, a chunk at a time.
-class Matcher {
- public:
-  Matcher(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, const Matches* matches)
-      : s_(s), code_(code), v_(v), sided_(rule.facing && s.mesh) {
-    const Vec3 eye{T[3], T[7], T[11]};
-    const bool hold = matches && matches->hold(v.n, eye, sided_);
-    if (!hold) code.face(s, sided_ ? &eye : nullptr, 0, own_);
-    look_ = {T, rule.gate, 0.f, Pass::plane, sided_, hold ? &matches->facing : &own_, hold ? NEARER * matches->gate : 0};
-    kept_ = hold ? matches->kept.data() : nullptr;
-  }
-  Matcher(const Matcher&) = delete;
-  Matcher& operator=(const Matcher&) = delete;
-
-  int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
-
-  // The inliers of a chunk, in the order of the scan; returns how many. `off`: the numbers of the others in the chunk.
-  int inliers(int64_t chunk, Match* out, uint16_t* off = nullptr) const {
-    const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
-    const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
-    return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out, off);
-  }
-
- private:
-  const Store& s_;
-  const Code& code_;
-  const View v_;
-  const bool sided_;
-  Facing own_;
-  Look look_{};
-  const Kept* kept_ = nullptr;
-};
 
 // What one chunk adds.
 struct Part {
   int inliers = 0;
   uint16_t off[CHUNK];  // the first are the numbers of its other points
   double sum_d2 = 0, sum[3] = {0, 0, 0};
+  std::vector<Sample> samples;
 };
-
-// Moves a point onto the plane of its face, which leaves J. Patches by the measured points would divide a face that lies near
-// the boundary of two cubes by the sign of e, and the errors within each patch would then look correlated.
-void onto_face(Match& m) {
-  for (int a = 0; a < 3; ++a) m.p[a] -= m.e * m.n[a];
-}
 
 constexpr int64_t BLOCK = 8;  // chunks whose matches are held at a time
 
@@ -132,12 +90,14 @@ double median(std::vector<double>& x) {
 
 Evidence evidence(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
                   const Matches* matches) {
-  const Matcher matcher(s, code, v, T, rule, matches);
+  return evidence(Matcher(s, code, v, T, rule, matches), code, v, rule, team, 0);
+}
+
+Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const PatchRule& rule, Team& team, int64_t stride) {
   const int64_t chunks = matcher.chunks();
   std::vector<Part> parts((size_t)chunks);
   std::vector<double> errors((size_t)v.n);
   Sorted sorted(std::min(chunks, BLOCK));
-  Numbers numbers;
   Evidence out;
   out.points = v.n;
   for (int64_t first = 0; first < chunks; first += BLOCK) {
@@ -145,7 +105,9 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
     team.each(many, [&](int64_t k) {
       Match* found = sorted.chunk(k);
       Part& part = parts[(size_t)(first + k)];
-      part.inliers = matcher.inliers(first + k, found, part.off);
+      Footing feet[CHUNK];
+      part.inliers = matcher.inliers(first + k, found, part.off, stride > 0 ? feet : nullptr);
+      for (int i = (int)(stride / 2); stride > 0 && i < part.inliers; i += (int)stride) part.samples.push_back({found[i], feet[i]});
       for (Match* m = found; m != found + part.inliers; ++m) {
         part.sum_d2 += m->d2;
         for (int a = 0; a < 3; ++a) part.sum[a] += m->p[a];
@@ -159,15 +121,17 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
       const int64_t begin = (first + k) * CHUNK, others = std::min<int64_t>(v.n - begin, CHUNK) - part.inliers;
       for (int64_t i = 0; i < others; ++i) out.off.push_back(begin + part.off[i]);
       out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
+      out.samples.insert(out.samples.end(), part.samples.begin(), part.samples.end());
       for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
     }
-    sorted.add(code, parts.data() + first, many, 1 / rule.side, numbers, out.patches);
+    sorted.add(code, parts.data() + first, many, 1 / rule.side, out.cubes, out.patches);
   }
   for (double& x : out.centre) x = out.inliers ? x / (double)out.inliers : 0;
   errors.resize((size_t)out.inliers);
   out.median = median(errors);
   if (out.patches.size() > (size_t)rule.least) return out;
   out.patches.clear();  // too few cubes: every point is a patch
+  out.samples.clear();
   const uint32_t one = 0;
   for (int64_t k = 0; k < chunks; ++k) {
     Match found[CHUNK];

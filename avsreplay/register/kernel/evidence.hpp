@@ -1,8 +1,15 @@
 // The quality of a pose: what its inliers tell, summed over patches of the model.
 #pragma once
+#include "cubes.hpp"
 #include "loop.hpp"
 
 namespace avs {
+
+// An inlier before it is moved onto its face.
+struct Sample {
+  Match match;
+  Footing at;
+};
 
 struct Evidence {
   int64_t points = 0, inliers = 0;
@@ -10,6 +17,8 @@ struct Evidence {
   double median = 0;                         // of |e|
   std::vector<int64_t> off;                  // numbers of the points that are no inliers, ascending
   std::vector<PatchSums> patches;            // in the order of their first points
+  Numbers cubes;                             // of the patches, unless every point is one
+  std::vector<Sample> samples;               // some of the inliers, none where every point is a patch
 };
 
 struct PatchRule {
@@ -18,10 +27,55 @@ struct PatchRule {
   bool facing;
 };
 
+// The closest points of a scan at a pose, a chunk at a time.
+class Matcher {
+ public:
+  Matcher(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, const Matches* matches)
+      : s_(s), code_(code), v_(v), sided_(rule.facing && s.mesh) {
+    const Vec3 eye{T[3], T[7], T[11]};
+    const bool hold = matches && matches->hold(v.n, eye, sided_);
+    if (!hold) code.face(s, sided_ ? &eye : nullptr, 0, own_);
+    look_ = {T, rule.gate, 0.f, Pass::plane, sided_, hold ? &matches->facing : &own_, hold ? NEARER * matches->gate : 0};
+    kept_ = hold ? matches->kept.data() : nullptr;
+  }
+  Matcher(const Matcher&) = delete;
+  Matcher& operator=(const Matcher&) = delete;
+
+  // What is matched, and how.
+  const Look& look() const { return look_; }
+  int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
+
+  // The inliers of a chunk, in the order of the scan; returns how many. `off`: the numbers of the others in the chunk; `feet`:
+  // where the feet of the inliers are.
+  int inliers(int64_t chunk, Match* out, uint16_t* off = nullptr, Footing* feet = nullptr) const {
+    const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
+    const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
+    return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out, off, feet);
+  }
+
+ private:
+  static constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
+  const Store& s_;
+  const Code& code_;
+  const View v_;
+  const bool sided_;
+  Facing own_;
+  Look look_{};
+  const Kept* kept_ = nullptr;
+};
+
+// Moves a point onto the plane of its face, which leaves J. Patches by the measured points would divide a face that lies near
+// the boundary of two cubes by the sign of e, and the errors within each patch would then look correlated.
+inline void onto_face(Match& m) {
+  for (int a = 0; a < 3; ++a) m.p[a] -= m.e * m.n[a];
+}
+
 // T: rows of [R t], scan into {C}. Points that are not finite are left out. `matches`: of an alignment of the same scan
 // that ended near T, or null; it changes the time, never the result.
 Evidence evidence(const Store& store, const Code& code, const View& points, const double* T, const PatchRule& rule,
                   Team& team, const Matches* matches);
+// The same; `stride`: every such inlier of a chunk is a sample, 0: none.
+Evidence evidence(const Matcher& matcher, const Code& code, const View& points, const PatchRule& rule, Team& team, int64_t stride);
 
 // Whether t of T may be the camera: of about `tested` points of the scan that have a closest point, at least this share has it on
 // a face that faces t. A quarter of them decides where their share is far from the least one.

@@ -49,6 +49,24 @@ double form(const Six& A, const double (&x)[6]) {
   return sum;
 }
 
+// The sum of the gradients, and the Gauss-Newton step of it.
+void step_of(const PatchArrays& sums, const Six& inverse, double (&gradient)[6], double (&step)[6]) {
+  for (int i = 0; i < 6; ++i) gradient[i] = step[i] = 0;
+  for (int64_t p = 0; p < sums.size(); ++p)
+    for (int i = 0; i < 6; ++i) gradient[i] += sums.gradients[(size_t)(6 * p + i)];
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) step[i] += inverse.v[i][j] * gradient[j];
+}
+
+// The covariance of the pose with what is uncertain of the bias of the noise.
+Six with_noise(const Grade& found) {
+  Six P = found.covariance.P;
+  for (size_t i = 0; i < 6; ++i)
+    for (size_t j = 0; j < 6; ++j)
+      P.v[i][j] += found.chance.v[i][j] + found.bias[i] * found.bias[j] + found.left[i] * found.left[j];
+  return P;
+}
+
 double length(const double* x) { return std::sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]); }
 
 // Whether the standard deviations are below the extent, and those of rotations below 1 rad, as their sum of squares tells.
@@ -88,7 +106,7 @@ void only(const std::vector<uint8_t>& keep, std::vector<T>& x) {
 
 PatchArrays::PatchArrays(const std::vector<PatchSums>& patches) {
   const size_t m = patches.size();
-  normals.resize(36 * m), gradients.resize(6 * m), offsets.resize(6 * m), errors.resize(m), places.resize(3 * m), counts.resize(m);
+  normals.resize(36 * m), gradients.resize(6 * m), offsets.resize(6 * m), errors.resize(m), places.resize(3 * m), counts.resize(m), number.resize(m);
   for (size_t k = 0; k < m; ++k) {
     const PatchSums& from = patches[k];
     for (size_t r = 0; r < 6; ++r) {
@@ -96,7 +114,15 @@ PatchArrays::PatchArrays(const std::vector<PatchSums>& patches) {
       gradients[6 * k + r] = from.rows[r][6], offsets[6 * k + r] = from.rows[r][7];
     }
     for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.last[a] / (double)from.points;
-    errors[k] = from.last[3], counts[k] = from.points;
+    errors[k] = from.last[3], counts[k] = from.points, number[k] = (int64_t)k;
+  }
+}
+
+void PatchArrays::without(const std::vector<std::array<double, 7>>& expected) {
+  for (size_t p = 0; p < counts.size(); ++p) {
+    const std::array<double, 7>& mean = expected[(size_t)number[p]];
+    for (size_t i = 0; i < 6; ++i) gradients[6 * p + i] -= mean[i];
+    errors[p] -= mean[6];
   }
 }
 
@@ -105,7 +131,7 @@ bool PatchArrays::drop(const Inverted& all) {
   drop_dominant(normals.data(), counts.data(), size(), all, keep.data());
   if (std::find(keep.begin(), keep.end(), 0) == keep.end()) return false;
   for (std::vector<double>* each : {&normals, &gradients, &offsets, &errors, &places}) only(keep, *each);
-  only(keep, counts);
+  only(keep, counts), only(keep, number);
   return true;
 }
 
@@ -113,7 +139,10 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
             const Matches* matches) {
   PatchRule patches = rule.patches;
   patches.facing = patches.facing && faces_camera(s, code, v, T, rule.tested, rule.least_facing);
-  const Evidence e = evidence(s, code, v, T, patches, team, matches);
+  const Matcher matcher(s, code, v, T, patches, matches);
+  const NoiseRule& simulated = rule.simulated;
+  const int64_t stride = simulated.numbers.empty() ? 0 : std::min(std::max(simulated.least, v.n / simulated.many), simulated.most);
+  const Evidence e = evidence(matcher, code, v, patches, team, stride);
   const double nan = std::numeric_limits<double>::quiet_NaN();
   Grade out;
   out.points = e.points, out.inliers = e.inliers, out.split = nan;
@@ -122,13 +151,11 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   std::copy(e.centre, e.centre + 3, out.centre);
   out.overlap = (double)e.inliers >= std::max(rule.least_inliers, rule.least_ratio * (double)e.points);
   PatchArrays sums(e.patches);
-  double gradient[6] = {}, step[6] = {};
-  for (int64_t p = 0; p < sums.size(); ++p)
-    for (int i = 0; i < 6; ++i) gradient[i] += sums.gradients[(size_t)(6 * p + i)];
   out.total = total(sums.normals.data(), sums.size());
   Inverted all = inverted(out.total);
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) step[i] += all.inverse.v[i][j] * gradient[j];
+  const Inverted whole_scan = all;
+  double gradient[6] = {}, step[6] = {};
+  step_of(sums, whole_scan.inverse, gradient, step);
   for (int i = 0; i < 6; ++i) out.statistic += step[i] * gradient[i];
   out.statistic /= out.noise * out.noise;
   if (out.overlap && sums.drop(all)) all = inverted(out.total = total(sums.normals.data(), sums.size()));
@@ -142,10 +169,19 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
     return out;
   }
   out.measured = true;
+  const NoiseEffect noise = noise_effect(s, code, matcher.look(), e, patches.side, whole_scan, out.noise, simulated);
+  if (!noise.patches.empty()) {
+    std::copy(noise.bias, noise.bias + 6, out.bias.begin());
+    std::copy(noise.left, noise.left + 6, out.left.begin());
+    out.chance = noise.chance;
+    PatchArrays whole(e.patches);
+    whole.without(noise.patches), sums.without(noise.patches);
+    step_of(whole, whole_scan.inverse, gradient, step);
+  }
   measure(sums, all, rule, out);
   out.bounded = is_bounded(out.covariance.P, rule.extent);
   const bool large = length(step) > rule.turn || length(step + 3) > rule.move;
-  out.beyond = large && form(pseudo_inverse(out.covariance.P), step) > BEYOND;
+  out.beyond = large && form(pseudo_inverse(with_noise(out)), step) > BEYOND;
   return out;
 }
 

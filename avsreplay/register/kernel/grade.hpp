@@ -2,6 +2,7 @@
 #pragma once
 #include "covariance.hpp"
 #include "evidence.hpp"
+#include "noise.hpp"
 
 namespace avs {
 
@@ -18,18 +19,21 @@ struct GradeRule {
   std::vector<double> across;    // (k, 3) directions of the test of halves
   double beyond, least_close;    // [m], see `well_off`; with a smaller share of inliers all others are counted
   int64_t part;
+  NoiseRule simulated;           // what the noise adds is taken from the sums, if it has numbers
 };
 
 // The sums of the patches as arrays.
 struct PatchArrays {
   std::vector<double> normals, gradients, offsets, errors, places;  // (m, 6, 6), (m, 6), (m, 6), (m), (m, 3)
-  std::vector<int64_t> counts;
+  std::vector<int64_t> counts, number;  // number: of the patch among those of the evidence
 
   PatchArrays() = default;
   explicit PatchArrays(const std::vector<PatchSums>& patches);
   // Leaves out the patches that give too much of the information on some motion. `all`: of the sum of the normals.
   // Returns whether there were any.
   bool drop(const Inverted& all);
+  // Takes the expected gradients and errors of all patches of the evidence from those of these patches.
+  void without(const std::vector<std::array<double, 7>>& expected);
   int64_t size() const { return (int64_t)counts.size(); }
 };
 
@@ -44,6 +48,8 @@ struct Grade {
   bool bounded = true, beyond = false;  // standard deviations below the extent; the residuals ask for a step
   int64_t well_off = 0;          // of `part` points, those off the model by `beyond`, see `count_beyond`
   Estimated covariance;
+  std::array<double, 6> bias{}, left{};  // of the pose, see `NoiseEffect`
+  Six chance = {};
   double split;                  // NaN: not tested
   std::array<double, 2> size{};  // of `size_error`
 };

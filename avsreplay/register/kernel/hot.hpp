@@ -62,6 +62,18 @@ struct Match {
   double e, d2;       // n . (p - foot), and the squared distance
 };
 
+// Where the foot of an inlier is, in {C}, and on which primitive.
+struct Footing {
+  double foot[3];
+  int32_t lane;  // 8 block + lane
+};
+
+// Where a ray meets a face: its range [m], and the lane of the face, -1: none.
+struct Hit {
+  double range;
+  int32_t lane;
+};
+
 // Sums over the inliers of one patch, with J = [p x n, n] about {C}'s origin.
 struct PatchSums {
   int64_t points = 0;
@@ -117,8 +129,12 @@ struct Code {
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
   // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
-  // is said there must hold for the eye of `look`, and below its `known`. `off`: the numbers of the others, or null.
-  int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out, uint16_t* off);
+  // is said there must hold for the eye of `look`, and below its `known`. `off`: the numbers of the others, or null; `feet`:
+  // of the inliers, or null.
+  int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out, uint16_t* off,
+               Footing* feet);
+  // The first face of a mesh on a ray from `eye` with the unit direction d between two ranges.
+  Hit (*first_face)(const Store&, const Vec3& eye, const double* d, double from, double to);
   // Adds the n matches that `order` names, ascending; partial sums of those of a chunk are added in the order of chunks.
   void (*add)(const Match*, const uint32_t* order, int64_t n, PatchSums&);
   void (*field_pass)(const FieldTable&, const FieldLook&, FieldSums&);

@@ -24,6 +24,8 @@ namespace AVS_ISA {
 
 #include "pass.hpp"
 
+#include "segment.hpp"
+
 #include "field_pass.hpp"
 
 #include "leverage.hpp"
@@ -48,15 +50,15 @@ static void pass(const Store& s, const View& v, int64_t first, int64_t last, con
 }
 
 static int match(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out,
-                 uint16_t* off) {
-  return s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out, off)
-                : match_kind<Points>(s, v, first, last, look, kept, out, off);
+                 uint16_t* off, Footing* feet) {
+  return s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out, off, feet)
+                : match_kind<Points>(s, v, first, last, look, kept, out, off, feet);
 }
 }  // namespace AVS_ISA
 
 const Code& AVS_CODE() {
   static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass, AVS_ISA::match,
-                         AVS_ISA::add, AVS_ISA::field_pass, AVS_ISA::reduce};
+                         AVS_ISA::first_face, AVS_ISA::add, AVS_ISA::field_pass, AVS_ISA::reduce};
   return code;
 }
 }  // namespace avs

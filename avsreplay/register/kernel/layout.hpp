@@ -4,6 +4,8 @@
 // copies relative to the model's centre, which only pre-select; results come from the double-precision records.
 // A tree with eight children a node bounds the blocks by axis-aligned boxes.
 #pragma once
+#include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -80,6 +82,8 @@ struct Store {
   Many<Box> boxes;        // of each block, relative to the centre
   Many<Node> nodes;       // preorder
   Many<NodeSides> sides;  // of each node, a mesh's
+  Many<uint32_t> clear;   // LANES a block, a mesh's: levels of `clear_radius`, four bits each: at the middle of the face, inside
+                          // it, and on its sides ab, bc and ca
 
   Vec3 low{};       // corner of the grid
   double cell = 0;  // side of a cell [m]; 0: no grid
@@ -106,6 +110,17 @@ inline uint32_t left_part(uint32_t n) {
 
 // Half a cell's diagonal, rounded up.
 inline float cell_radius(const Store& s) { return (float)(0.8660255 * s.cell) + s.slack; }
+
+// The largest radius, of so many levels, of clear balls on both sides of a face [m]; see clear.cpp. Level 0 is no ball.
+constexpr int CLEAR_LEVELS = 5;
+constexpr double LEAST_CLEAR = 0.00075;   // of the extent, the radius of the first level; the others are twice as large each
+inline double clear_radius(const Store& s, int level) { return level > 0 ? LEAST_CLEAR * (double)(1 << (level - 1)) * s.extent : 0; }
+
+// Distances of a place of a face, in its own plane, from the sides ab, bc and ca; negative outside.
+inline std::array<double, 3> side_distances(const Triangle& t, double x, double y) {
+  const double ac = std::sqrt(t.cx * t.cx + t.cy * t.cy), bx = t.length - t.cx, bc = std::sqrt(bx * bx + t.cy * t.cy);
+  return {y, ((t.length - x) * t.cy - y * bx) / bc, (x * t.cy - y * t.cx) / ac};
+}
 
 // Which lanes of the blocks face an eye that is within `margin` of `eye`. `may`: the lane faces at least one such
 // place, or rounding cannot tell; `sure`: it faces all of them. A child without any `may` lane is not `alive`.

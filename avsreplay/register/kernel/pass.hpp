@@ -237,7 +237,7 @@ static bool search_beyond(const Scope& o, int n, double known, Strip& c) {
 
 template <class Kind>
 static int match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out,
-                      uint16_t* off) {
+                      uint16_t* off, Footing* feet) {
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, 0.f);
   if (look.sided && s.mesh) o.eye = &eye;
@@ -257,7 +257,9 @@ static int match_kind(const Store& s, const View& v, int64_t first, int64_t last
       }
       const double N[3] = {c.n[0][i], c.n[1][i], c.n[2][i]};
       const double e = N[0] * (c.p[0][i] - c.f[0][i]) + N[1] * (c.p[1][i] - c.f[1][i]) + N[2] * (c.p[2][i] - c.f[2][i]);
-      out[found++] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {N[0], N[1], N[2]}, e, c.d2[i]};
+      out[found] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {N[0], N[1], N[2]}, e, c.d2[i]};
+      if (feet) feet[found] = {{c.f[0][i] + s.centre.x, c.f[1][i] + s.centre.y, c.f[2][i] + s.centre.z}, c.lane[i]};
+      ++found;
     }
   }
   return found;

@@ -74,7 +74,7 @@ template <class Stream, class S>
 void each_field(S& s, Stream&& field) {
   field(s.reach), field(s.extent), field(s.centre), field(s.slack), field(s.tie), field(s.tie2), field(s.grain);
   field(s.blocks), field(s.last_valid), field(s.id), field(s.points), field(s.triangles), field(s.normals);
-  field(s.point_blocks), field(s.triangle_blocks), field(s.boxes), field(s.nodes), field(s.sides);
+  field(s.point_blocks), field(s.triangle_blocks), field(s.boxes), field(s.nodes), field(s.sides), field(s.clear);
   field(s.low), field(s.cell), field(s.step), field(s.size), field(s.top), field(s.bricks), field(s.lists);
 }
 
@@ -86,6 +86,10 @@ bool sound_sizes(const Store& s, int64_t ids) {
   if ((s.mesh ? s.triangle_blocks.size() : s.point_blocks.size()) != s.blocks) return false;
   if (s.boxes.size() != s.blocks) return false;
   if (s.sides.size() != (s.mesh ? s.nodes.size() : 0)) return false;
+  if (s.clear.size() != (s.mesh ? lanes : 0)) return false;
+  for (uint32_t levels : s.clear)
+    for (int shift = 0; shift < 32; shift += 4)
+      if ((levels >> shift & 15) > (shift < 20 ? (uint32_t)CLEAR_LEVELS : 0u)) return false;
   for (int32_t id : s.id)
     if (id < 0 || id >= ids) return false;
   return true;

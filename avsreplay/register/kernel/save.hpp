@@ -7,7 +7,7 @@
 
 namespace avs {
 
-constexpr uint32_t LAYOUT = 7;  // raise with any change of what is stored or how it is built
+constexpr uint32_t LAYOUT = 8;  // raise with any change of what is stored or how it is built
 
 std::string save(const Store& store);
 // Detects damage, not intended changes; of the bytes in the order of this machine.
