@@ -324,7 +324,7 @@ def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
     expected = rays.decided(points, T_ac.inverse(), [], True)
     found = rays.decided(np.concatenate([points, missing]), T_ac.inverse(), [], True)
     np.testing.assert_array_equal(found[0].matrix, expected[0].matrix)
-    np.testing.assert_array_equal(rays.decided(missing, T_ac.inverse(), None, True)[0].matrix, T_ac.inverse().matrix)
+    np.testing.assert_array_equal(rays.decided(missing, T_ac.inverse(), [], True)[0].matrix, T_ac.inverse().matrix)
 
 
 def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:

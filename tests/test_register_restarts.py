@@ -432,3 +432,17 @@ def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
     found = Registrar(target).register(scan, off(truth, 10.0, 0.15, 103).inverse())
     assert found.status is AlignStatus.ALIGNED
     assert error(found.T_ac.inverse().matrix, truth)[0] < 0.2
+
+
+def test_a_fit_whose_points_share_their_distances_is_not_close() -> None:
+    """A pose shifted by a third of the gate, with points off the model; noise of single points is a close fit."""
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
+    registrar = Registrar(surface)
+    gate, T_ca = registrar.limits.gate_m, T_ac.inverse()
+    scan = T_ac.apply(view(surface, 3000, T_ca.t))
+    first = registrar._grader.graded(scan, T_ac, Budget(10**7), None, False, False)
+    off = replace(first, inliers=int(0.95 * first.points), rms_m=0.28 * gate, well_off=20)
+    shift = Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.35 * gate]))
+    noisy = scan * (1.0 + 0.25 * gate * rng.standard_normal((len(scan), 1)) / np.linalg.norm(scan, axis=1)[:, None])
+    assert registrar._restarter.sound(noisy, replace(off, T_ac=T_ac), Budget(10**7))
+    assert not registrar._restarter.sound(scan, replace(off, T_ac=shift @ T_ac), Budget(10**7))

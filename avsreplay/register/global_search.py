@@ -22,8 +22,9 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
-from avsreplay.register.sampling import attitudes, directions, sample_evenly, scan_axes, thin_to, without_sparse_points
+from avsreplay.register.sampling import attitudes, sample_evenly, scan_axes, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
+from avsreplay.register.visibility import VisibleCentroids
 
 COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
@@ -48,7 +49,6 @@ LOOK_UPS, ROUND_WORK = 6, 28_000  # look-ups in the grid that cost as much as a 
 SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
 REGISTERED_SHARE, REGISTERED_WORK = 0.8, 10  # of the work left, for the last poses; usual cost for each fine point
 APART = 0.6  # usual share of different starts
-CELL_OF_EXTENT, LEAST_COSINE = 0.02, 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
 
 
@@ -139,6 +139,7 @@ class GlobalSearch:
         before: SearchResult | None = None,
         known: Pose | None = None,
         left: int = 2**62,
+        kept: int = 0,
     ) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
 
@@ -149,8 +150,9 @@ class GlobalSearch:
             before: result of another round for the same points, whose poses are compared as well.
             known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
             left: work that is left, in point searches; after most of it no pose is registered.
+            kept: work of it that a later step needs.
         """
-        self._most = int(REGISTERED_SHARE * left)
+        self._most = min(int(REGISTERED_SHARE * left), left - kept)
         self._spent = self._looked(len(points), number)
         self._registered = REFINED_POINTS // (2 if left < SHORT * self.work(len(points), number) else 1)
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
@@ -196,16 +198,16 @@ class GlobalSearch:
         poses, costs = self._field.refine(
             np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
-        poses = _best(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
+        poses = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
         poses, costs = self._field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
-        poses, narrow = _best(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)), narrow * FALL**SECOND_PASSES
+        poses, narrow = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)), narrow * FALL**SECOND_PASSES
         poses, costs = self._field.refine(few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse)
-        poses = self._different(_best(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
+        poses = self._different(best_of(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
         poses, costs = self._field.refine(some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle)
-        poses, narrow = _best(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
+        poses, narrow = best_of(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
         poses, costs = self._field.refine(some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle)
-        found = self._different(_best(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
+        found = self._different(best_of(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
         return [Pose.from_matrix(T) for T in found]
 
     def _different(self, poses: Array, most: int, scale: float) -> Array:
@@ -228,7 +230,7 @@ class GlobalSearch:
         starts = np.concatenate([first.matrix[None], self.symmetries @ first.matrix])
         turned, costs = self._field.refine(some, starts, TURNED_PASSES, width, *rule)
         near = 1 + np.flatnonzero(costs[1:] < costs[0] + RIVAL_WITHIN)
-        others = np.concatenate([starts[:1], _best(turned[near], costs[near], len(near))])
+        others = np.concatenate([starts[:1], best_of(turned[near], costs[near], len(near))])
         rivals = [Pose.from_matrix(T) for T in self._different(others, 1 + TURNED_RIVALS, 0.5)[1:]]
         return [*found, *self._to_the_end(fine, rivals, width, least)[0]]
 
@@ -310,41 +312,6 @@ def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> 
     return bool(excess.mean() < max(margin, error))
 
 
-def _best(poses: Array, costs: Array, most: int) -> Array:
+def best_of(poses: Array, costs: Array, most: int) -> Array:
     """The poses (k, 4, 4) of least cost, best first; of equal costs the first."""
     return np.ascontiguousarray(poses[np.argsort(costs, kind="stable")[:most]])
-
-
-class VisibleCentroids:
-    """Centroid of the part of a model that a distant camera sees, tabulated for ``count`` directions."""
-
-    def __init__(self, points: Array, normals: Array, extent_m: float, count: int = 80) -> None:
-        """Build it from points sampled on the surface, (n, 3) in {C} [m]; zero normals: visible from all sides.
-
-        The centroid is that of the points that face the camera and are the nearest of their pixel, within a cell.
-        """
-        self._directions, cell = directions(count), CELL_OF_EXTENT * extent_m
-        cosine = normals @ self._directions.T if normals.any() else np.ones((len(points), count))
-        depth = points @ self._directions.T
-        u = np.cross(self._directions, np.eye(3)[np.argmin(np.abs(self._directions), axis=1)])
-        u /= np.linalg.norm(u, axis=1)[:, None]
-        x, y = (np.floor(points @ axes.T / cell).astype(np.int64) for axes in (u, np.cross(self._directions, u)))
-        x, y = x - x.min(axis=0), y - y.min(axis=0)
-        wide, high = int(x.max()) + 1, int(y.max()) + 1
-        pixel = (x + wide * y) + wide * high * np.arange(count)
-        nearest = np.full(count * wide * high, -np.inf)
-        facing = cosine > LEAST_COSINE
-        np.maximum.at(nearest, pixel[facing], depth[facing])
-        weight = np.where(facing & (depth > nearest[pixel] - cell), cosine, 0.0)
-        total = weight.sum(axis=0)
-        seen = total > 0.0
-        self._centroids = np.where(
-            seen[:, None],
-            np.einsum("nk,nj->kj", weight, points) / np.where(seen, total, 1.0)[:, None],
-            points.mean(axis=0),
-        )
-
-    def of(self, direction_c: Array) -> Array:
-        """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
-        centroid: Array = self._centroids[np.argmax(direction_c @ self._directions.T, axis=-1)]
-        return centroid

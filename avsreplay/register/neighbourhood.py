@@ -19,8 +19,9 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
-from avsreplay.register.budget import FAR_WORK, LAST_WORK, SIZE_WORK, Budget
+from avsreplay.register.budget import FAR_WORK, LAST_WORK, LEAST_RATIO, SIZE_WORK, Budget
 from avsreplay.register.degenerate import scaled_information
+from avsreplay.register.grading import Grader
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
@@ -43,8 +44,8 @@ SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of 
 class Neighbourhood:
     """Local minima near registered poses of one target."""
 
-    def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter) -> None:
-        self._target, self._test, self._restarter = target, test, restarter
+    def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter, grader: Grader) -> None:
+        self._target, self._test, self._restarter, self._grader = target, test, restarter, grader
         self._extent = target.surface.extent
 
     def best(
@@ -72,7 +73,9 @@ class Neighbourhood:
             return None, found.status, ""
         if not budget.allows(self._minima_work):
             return None, AlignStatus.BUDGET_EXHAUSTED, NOT_COMPARED
-        minima = self._minima(points, T_ca, DIRECTIONS if aligned else 0, budget)
+        minima, compared = self._minima(points, T_ca, DIRECTIONS if aligned else 0, budget)
+        if not compared:
+            return None, AlignStatus.BUDGET_EXHAUSTED, NOT_COMPARED
         best, width = self._restarter.least(minima), 3.0 * min(each.noise_m for each in minima)
         width = max(STOP_OF_EXTENT * self._extent, width)
         others = (each for each in minima if not self._restarter.same(best.T_ca, each.T_ca))
@@ -95,7 +98,7 @@ class Neighbourhood:
         known = target.visibility.camera_c(target.index, points, T_ca) is not None
         if known or at.noise_m > NOISE_OF_EXTENT * self._extent or self._minima_work + LAST_WORK > budget.left:
             return at
-        return self._restarter.least(self._minima(points, T_ca, DIRECTIONS, budget))
+        return self._restarter.least(self._minima(points, T_ca, DIRECTIONS, budget, LAST_WORK)[0])
 
     @property
     def _minima_work(self) -> int:
@@ -108,19 +111,28 @@ class Neighbourhood:
         turned = float(geometry.angle(step.q)) * RADIUS_OF_EXTENT * self._extent
         return turned + self._restarter.shift(step) > UNMOVED * self._target.limits.gate_m
 
-    def _minima(self, points: NDArray[Any], T_ca: Pose, count: int, budget: Budget) -> list[Restart]:
-        """The pose, and those registered from poses displaced towards the camera and along ``count`` directions."""
+    def _minima(
+        self, points: NDArray[Any], T_ca: Pose, count: int, budget: Budget, kept: int = 0
+    ) -> tuple[list[Restart], bool]:
+        """The pose, and those registered from poses displaced towards the camera and along ``count`` directions.
+
+        Also: whether all were registered; else the work was not enough besides ``kept`` for a later step.
+        """
         few = points[:: max(1, len(points) // POINTS)]
         found, weak = [self._restarter.measure(points, T_ca, budget)], self._weak(few, T_ca, count, budget)
         if weak is None:
-            return found
+            return found, True
         centre, radius, directions = weak[:3]
+        dearest = 0  # work of one registration so far
         nearer = np.concatenate([np.zeros(3), T_ca.t - centre])[None] / np.linalg.norm(T_ca.t - centre)
         for x in DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions]):
-            start = _displaced(T_ca, centre, radius, x)
+            start, left = _displaced(T_ca, centre, radius, x), budget.left
+            if dearest + kept > left:
+                return found, False
             ended = self._restarter.graduated(few, start, self._restarter.narrow_m, budget)
             found.append(self._restarter.measure(points, ended.T_ca, budget))
-        return found
+            dearest = max(dearest, left - budget.left)
+        return found, True
 
     def with_size(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
         """Return an alignment with what its scan (n, 3) in {A} says about the size, if that is still to be fitted.
@@ -194,6 +206,71 @@ class Neighbourhood:
         d2 = target.index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
         best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
         return _displaced(T_ca, centre, radius, tried[best]) if best else T_ca
+
+    def regraded(
+        self, scan: NDArray[Any], few: NDArray[Any], kept: Restart | Pose, budget: Budget, halves: bool, carried: bool
+    ) -> Alignment:
+        """Return an alignment with a rejection distance that follows the noise; among other objects along the valley.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            few: part of it.
+            kept: the pose T_ca to begin with, measured or not.
+            budget: work that is left.
+            halves: as of ``Grader.graded``.
+            carried: as well.
+        """
+        kept = self._restarter.measure(few, kept, budget) if isinstance(kept, Pose) else kept
+        width = self._restarter.width(kept)
+        found = self._grader.graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
+            return found
+        moved = self.along_valley(few, found.T_ac.inverse(), budget)
+        if moved is None:
+            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
+        if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
+            return found
+        again = self._grader.graded(scan, moved.inverse(), budget, width, halves, carried)
+        return self._restarter.nearest(few, [found, again], width, budget)
+
+    def replaced(self, scan: NDArray[Any], found: Alignment, T_ca: Pose, budget: Budget, carried: bool) -> Alignment:
+        """Return the alignment at a pose for which the rays decide against an accepted one; IMPLAUSIBLE as tested.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            found: the alignment that is contradicted.
+            T_ca: the pose.
+            budget: work that is left; if it does not suffice, the scan has no accepted pose.
+            carried: as of ``Grader.graded``.
+        """
+        if not budget.allows(LAST_WORK):
+            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
+        few = self._restarter.part(scan)
+        found = self.regraded(scan, few, T_ca, budget, True, carried)
+        reason = self._restarter.reason(few, found, budget, None)
+        return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason) if reason else found
+
+    def at_pose(self, scan: NDArray[Any], T_ca: Pose, budget: Budget, halves: bool, carried: bool) -> Alignment:
+        """Return an alignment of a scan (n, 3) in {A} at a pose that is known to be the best of several minima.
+
+        A wide rejection distance can lead to another minimum, and with a narrow one the few points of a mark may not
+        determine the pose. Of both the nearer one is returned, and the wide one if they end at the same pose.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            T_ca: the pose.
+            budget: work that is left.
+            halves: as of ``Grader.graded``.
+            carried: as well.
+        """
+        few = self._restarter.part(scan)
+        found = self.regraded(scan, few, T_ca, budget, halves, carried)
+        if not budget.allows(LAST_WORK):
+            return found
+        wide = self._grader.graded(scan, T_ca.inverse(), budget, None, halves, carried)
+        if self._restarter.same(wide.T_ac.inverse(), found.T_ac.inverse()):
+            return wide
+        return self._restarter.nearest(few, [found, wide], self._target.limits.gate_m, budget)
 
     def _weak(
         self, few: NDArray[Any], T_ca: Pose, count: int, budget: Budget

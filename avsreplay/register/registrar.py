@@ -25,7 +25,7 @@ from avsreplay.register.budget import (
     healthy_work,
     near_work,
 )
-from avsreplay.register.degenerate import motions_outside, turn_words
+from avsreplay.register.degenerate import motions_outside
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.grading import FAR_RAD, Grader
 from avsreplay.register.neighbourhood import NOT_COMPARED, NOT_FOUND, POSTPONED, Neighbourhood
@@ -73,7 +73,7 @@ class Registrar:
         self._test = PlausibilityTest(surface, self.index, self._visibility, self.limits.gate_m)
         self._restarter = restarts.Restarter(self._target, self._test)
         self._grader = Grader(self._target, self.params, self._backend, self._restarter)
-        self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter)
+        self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter, self._grader)
 
     def register(
         self,
@@ -88,8 +88,7 @@ class Registrar:
 
         Args:
             points: (n, 3) in {A} [m], float32 or float64, possibly strided; points that are not finite are left out.
-            guess: predicted T_ac. ICP aligns the scan to the model, so it receives the inverse, and its result is
-                inverted.
+            guess: predicted T_ac. ICP aligns the scan to the model: it receives the inverse and gives the inverse.
             seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
             carried: the points were carried to one instant by the predicted motion. Its error distorts the scan, but
                 the estimator models this (``Alignment.instants``), so that the covariance leaves it out.
@@ -146,12 +145,14 @@ class Registrar:
         budget.spend(sum(SCATTER_WORK[: 2 if len(target) < len(scan) else 1]) * len(scan))
         few, results, doubt = self._restarter.part(target), list[Alignment](), list[bool]()
         none = quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse())
-        whole: SearchResult | None = None
+        whole, more = None, True
         for part, number in islice(attempts(target, self.index.extent_m, lambda: results[0].measured), rounds):
-            if not budget.allows(self._symmetry.search_work(len(part), number)):
+            kept = self._symmetry.elsewhere_work(len(part), len(scan), True)
+            compared = any(each.status in ACCEPTED and not unsure for each, unsure in zip(results, doubt, strict=True))
+            if not (more := budget.allows(self._symmetry.search_work(len(part), number), kept if compared else 0)):
                 break
-            left = budget.left - self._symmetry.after_search(len(scan))
-            search = self._symmetry.search.search(part, number, whole if part is target else None, known, left)
+            left = budget.left - self._symmetry.after_search(len(scan)), kept if number == 1 else 0
+            search = self._symmetry.search.search(part, number, whole if part is target else None, known, *left)
             budget.spend(search.work)
             whole = search if part is target else whole
             found, alone, doubtful = self._acquired(scan, part, search, budget, carried)
@@ -163,12 +164,14 @@ class Registrar:
             little = search.inlier_ratio >= SURE_RATIO or fits  # little is left to explain
             if found.measured and little and not doubtful and search.width_m <= self.limits.gate_m:
                 break
-        known_poses = [each for each in results if each.measured]
-        measured = [(each, self._restarter.measure(few, each.T_ac.inverse(), budget)) for each in known_poses]
+        poses = (each for each in results if each.measured)
+        measured = [(each, self._restarter.measure(few, each.T_ac.inverse(), budget)) for each in poses]
         width = max(self.limits.gate_m, 3.0 * min((restart.noise_m for _, restart in measured), default=0.0))
         best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else (results or [none])[0]
         sure = measured and not doubt[results.index(best)]
-        if not budget.exhausted or (sure and not self._restarter.misfit(few, best.T_ac.inverse(), budget)):
+        if best.status in ACCEPTED:
+            best = self._verified(scan, target, best, budget, carried)
+        if (more and not budget.exhausted) or (sure and not self._restarter.misfit(few, best.T_ac.inverse(), budget)):
             return best
         return replace(best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND)
 
@@ -188,7 +191,7 @@ class Registrar:
         budget.spend(0 if spread or sure else TEST_WORK)
         if spread or not (sure or self._test.check(few, search.best, self._restarter.part(scan)).covered):
             return quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()), False, True
-        found = self._regraded(scan, few, start, budget, True, carried)
+        found = self._neighbourhood.regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
             return found, False, True
         budget.spend(TEST_WORK)
@@ -201,27 +204,40 @@ class Registrar:
         rivals, marked = list(search.rivals), self._symmetry.marked
         decided = marked and budget.allows(self._symmetry.work(len(part), len(rivals)))
         if marked and not decided and not rivals:
-            none = replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
-            return none, alone, True
+            status = AlignStatus.BUDGET_EXHAUSTED
+            return replace(found, status=status, covariance=None, message=NOT_TURNED), alone, True
         if decided:
             work = self._symmetry.work(len(part), len(rivals))
             best, rivals, extra = self._symmetry.decided(part, found.T_ac.inverse(), rivals, at.covered)
             budget.spend(work + extra)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
-                found = self._regraded(scan, few, self._restarter.measure(few, best, budget), budget, True, carried)
+                found = self._neighbourhood.regraded(scan, few, best, budget, True, carried)
         return self._unrivalled(scan, found, rivals, at.covered, budget), alone, at.doubtful
+
+    def _verified(
+        self, scan: NDArray[Any], target: Array, found: Alignment, budget: Budget, carried: bool
+    ) -> Alignment:
+        """The result of a search; AMBIGUOUS if a pose that it did not try explains the points on the model as well."""
+        symmetry, T_ca = self._symmetry, found.T_ac.inverse()
+        partial = self._test.partial(target, T_ca)
+        if not partial and (found.inliers >= LEAST_RATIO * len(target) or symmetry.marked):
+            return found
+        if symmetry.elsewhere_work(found.inliers, len(scan), partial) > budget.left:
+            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
+        best, rivals, work = symmetry.elsewhere(scan, T_ca, partial, budget.left)
+        budget.spend(work)
+        if not symmetry.search.same(best, T_ca):
+            found = self._neighbourhood.replaced(scan, found, best, budget, carried)
+        return symmetry.rivalled(scan, found, rivals) if found.status in ACCEPTED else found
 
     def _unrivalled(
         self, scan: NDArray[Any], found: Alignment, rivals: list[Pose], covered: bool, budget: Budget
     ) -> Alignment:
         """The result of a search; AMBIGUOUS with rivals, not accepted where the view shows faces of many bodies."""
-        rivals = self._symmetry.distinct(scan, found, rivals)
-        if rivals:
-            words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
-            found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
-        elif self._visibility.sided and not covered:
-            found = self._neighbourhood.of_one(scan, found, budget)
-        return found
+        found = self._symmetry.rivalled(scan, found, rivals)
+        if found.status is AlignStatus.AMBIGUOUS or covered or not self._visibility.sided:
+            return found
+        return self._neighbourhood.of_one(scan, found, budget)
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -239,7 +255,7 @@ class Registrar:
         Args:
             points: (n, 3) in {A} [m].
             T_ac: pose of the model.
-            most_m: larger distances are limited to this value [m]; it is at most the reach of the index.
+            most_m: larger distances are limited to this value, at most the reach of the index [m].
         """
         return self.index.distances(points, T_ac.inverse(), most_m, False, 1, 0.0)[0]
 
@@ -251,22 +267,24 @@ class Registrar:
     def _settled(
         self, scan: NDArray[Any], found: Alignment, budget: Budget, halves: bool, carried: bool, unknown: Array | None
     ) -> Alignment:
-        """The pose turned by a near-symmetry of the model, if the points off the model decide for it.
-
-        DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
-        """
+        """The pose turned by a near-symmetry, if the points off the model decide for it; DEGENERATE as of the guess."""
         unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self.index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in ACCEPTED
-        if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
+        if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.turned:
             return found
-        if not budget.allows(work := self._symmetry.work(len(scan))):
-            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
-        covered = self._test.check(part, T_ca).covered
-        best, rivals, extra = self._symmetry.decided(scan, T_ca, [] if unsure else None, covered)
-        budget.spend(work + TEST_WORK + extra)
-        turned = found if best is T_ca else self._grader.graded(scan, best.inverse(), budget, None, halves, carried)
-        found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
+        none = replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
+        if not budget.allows(self._symmetry.turning_work):
+            return none
+        turned, screened = (None, 0) if unsure else self._symmetry.better(scan, T_ca)
+        work = self._symmetry.work(len(scan)) + TEST_WORK
+        if turned == [] or not budget.allows(work):
+            budget.spend(screened)
+            return found if turned == [] else none
+        best, rivals, extra = self._symmetry.decided(scan, T_ca, [], self._test.check(part, T_ca).covered, turned)
+        budget.spend(work + extra)
+        if best is not T_ca:  # the rays contradict the pose, whatever the status of the turned one
+            found = self._neighbourhood.at_pose(scan, best, budget, halves, carried)
         return quality.left_undetermined(found, unknown) if unsure and rivals else found
 
     def _unique(
@@ -275,7 +293,7 @@ class Registrar:
         """The best of the minima around a pose of a part of the target; not accepted if another is as good."""
         best, status, doubt = self._neighbourhood.best(scan, guess, found, budget)
         if best is not None:
-            found = self._regraded(scan, self._restarter.part(scan), best, budget, halves, carried)
+            found = self._neighbourhood.regraded(scan, self._restarter.part(scan), best, budget, halves, carried)
         return replace(found, status=status, covariance=None, message=doubt) if doubt else found
 
     def _far(self, guess: Pose, found: Alignment) -> bool:
@@ -298,7 +316,10 @@ class Registrar:
         few = self._restarter.part(scan)
         starts = self._restarter.starts(few, first, guess, budget)
         near = [at for at in starts if first.measured and at.noise_m <= NOISE_OF_EXTENT * self.index.extent_m]
-        hopeful, tried = bool(near), [self._regraded(scan, few, at, budget, halves, carried) for at in near] or [first]
+        hopeful, tried = (
+            bool(near),
+            [self._neighbourhood.regraded(scan, few, at, budget, halves, carried) for at in near] or [first],
+        )
         final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         reason = self._restarter.reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final, budget)):
@@ -318,7 +339,7 @@ class Registrar:
             kept = LAST_SCANS * budget.healthy + (work if reason and step == "restart" and restart else 0)
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
-                final = self._regraded(scan, few, before, budget, halves, carried)
+                final = self._neighbourhood.regraded(scan, few, before, budget, halves, carried)
                 reason = self._restarter.reason(few, final, budget, guess)
             if final.measured and not reason:
                 return self._restarter.consistent(few, guess, final, budget), False
@@ -326,19 +347,3 @@ class Registrar:
             return final, False
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
-
-    def _regraded(
-        self, scan: NDArray[Any], few: NDArray[Any], kept: restarts.Restart, budget: Budget, halves: bool, carried: bool
-    ) -> Alignment:
-        """Register with a rejection distance that follows the noise; among other objects also along the valley."""
-        width = self._restarter.width(kept)
-        found = self._grader.graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
-            return found
-        moved = self._neighbourhood.along_valley(few, found.T_ac.inverse(), budget)
-        if moved is None:
-            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
-        if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
-            return found
-        again = self._grader.graded(scan, moved.inverse(), budget, width, halves, carried)
-        return self._restarter.nearest(few, [found, again], width, budget)

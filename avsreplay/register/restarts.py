@@ -41,6 +41,7 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 COMPLETE = 0.985  # with more inliers too few points are left that could continue beyond an edge of the model
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
+SHARED_OF_GATE = 0.2  # with a larger rms distance and points off the model it is tested what neighbours share
 SHARED = 0.4  # of the rms distance; a correct pose of a correct model has less than 0.3 in common to neighbours
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
@@ -150,7 +151,7 @@ class Restarter:
         cost = [self.measure(few, each.T_ac.inverse(), budget).cost(width_m) for each in found]
         return found[cost[1] < NEARER * cost[0]]
 
-    def reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
+    def reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose | None) -> str:
         """Return why a pose is not plausible; "" if it is, or nothing was measured."""
         budget.spend(TEST_WORK)
         return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
@@ -202,13 +203,18 @@ class Restarter:
         return inlier_ratio >= LEAST_RATIO and rms_m <= POOR_OF_GATE * self._target.limits.gate_m
 
     def sound(self, points: NDArray[Any], found: Alignment, budget: Budget) -> bool:
-        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues beyond the model."""
+        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues beyond the model.
+
+        Where some points are off the model, the others must not share a distance from it.
+        """
         close = self.healthy(found.inlier_ratio, found.rms_m)
         if not close or found.inlier_ratio >= COMPLETE or found.well_off < LEAST_BEYOND:
             return close
-        few = self.part(points)
+        few, T_ca = self.part(points), found.T_ac.inverse()
         budget.spend(STRUCTURE_WORK)
-        return not self._test.continued(few, found.T_ac.inverse())
+        if found.rms_m > SHARED_OF_GATE * self._target.limits.gate_m and self.misfit(few, T_ca, budget):
+            return False
+        return not self._test.continued(few, T_ca)
 
     def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> bool:
         """Return whether an alignment may be a local minimum.

@@ -12,19 +12,22 @@ pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is belo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus, Surface
+from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register import index_cache
 from avsreplay.register.backend import Target
 from avsreplay.register.budget import TEST_WORK, healthy_work
-from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
+from avsreplay.register.degenerate import turn_words
+from avsreplay.register.elsewhere import COMPARED, OFF, Contradicted, Search, decides
+from avsreplay.register.global_search import FINE_PASSES, as_good
 from avsreplay.register.grading import FAR_RAD
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
@@ -33,37 +36,21 @@ from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 
-VERSION = 9  # version of the kept data of a model
+VERSION = 10  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
 NEAR = 0.004  # a point within this (over the extent), or within three sigma of the noise, is on the model
-OFF = 2.0  # a point farther from the model than this many widths is off it
-LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
-CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
-LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
+LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
+SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 LEAST_RAYS = 8  # fewer points off the model decide nothing
-MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Contradicted(Candidate):
-    """A pose with what contradicts it.
-
-    Attributes:
-        passed: rays that passed through a mark that should be visible.
-        empty: rays expected on marks in directions in which nothing was measured.
-    """
-
-    passed: float
-    empty: float
 
 
 class NearSymmetry:
@@ -73,7 +60,7 @@ class NearSymmetry:
         search: the global search of the same target.
     """
 
-    def __init__(self, target: Target, test: PlausibilityTest, search: GlobalSearch, kept: dict[str, Array]) -> None:
+    def __init__(self, target: Target, test: PlausibilityTest, search: Search, kept: dict[str, Array]) -> None:
         """Find the axis of revolution, if there is one, and sample the marks; or take both from ``kept``."""
         self._target, self._test, self.search, self._gate = target, test, search, target.limits.gate_m
         surface = target.surface
@@ -99,7 +86,8 @@ class NearSymmetry:
             return none, np.zeros(2)
         points, _ = sample(surface, SAMPLES)
         moved = self._carried_off(points, MOST_MARKED)
-        share, area = float(moved.mean()), surface_area(surface)
+        normals = mesh.normals(surface.vertices, surface.faces)
+        share, area = float(moved.mean()), 0.5 * float(np.linalg.norm(normals, axis=1).sum())
         if not moved.any() or share >= MOST_MARKED:
             return none, np.array([share, 0.0])
         dense, normals = sample(surface, DENSE)
@@ -121,21 +109,38 @@ class NearSymmetry:
         return moved
 
     @property
+    def turned(self) -> bool:
+        """Whether some motion carries most of the model onto itself."""
+        return len(self._kinds) > 0
+
+    @property
     def near(self) -> bool:
         """Whether turned copies of the model differ from it by a mark at most."""
-        return len(self._kinds) > 0 and self._share < MOST_MARKED
+        return self.turned and self._share < MOST_MARKED
 
     @property
     def marked(self) -> bool:
         """Whether a mark distinguishes the turned copies of the model, and nothing else does."""
         return self.near and self._share > 0.0
 
+    @property
+    def turning_work(self) -> int:
+        """The usual cost of :meth:`better` in point searches, where no pose is better."""
+        return 2 * SCREENED * sum(len(motions) for motions in self._kinds)
+
     def work(self, points: int, others: int = 0) -> int:
         """Return the usual cost of a decision between so many other poses and the turned ones in point searches."""
-        motions, finalists = sum(len(motions) for motions in self._kinds), FINALISTS * len(self._kinds)
+        finalists = FINALISTS * len(self._kinds)
         rays = RAY_WORK * len(self._marks)
         measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
-        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
+        return self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
+
+    def elsewhere_work(self, points: int, measured: int, partial: bool) -> int:
+        """Return the usual cost of :meth:`elsewhere` for a scan with so many points on the model, and in all."""
+        return self.search.elsewhere_work(points, partial) + self._compared_work(measured)
+
+    def _compared_work(self, points: int) -> int:
+        return (1 + COMPARED) * (min(points, MOST_POINTS) + RAY_WORK * len(self._marks))
 
     def after_search(self, points: int) -> int:
         """Return the usual cost of what follows a search for a scan of so many points, in point searches."""
@@ -146,8 +151,21 @@ class NearSymmetry:
         """Return the usual cost of round ``number`` of the search and of registering its result."""
         return self.search.work(points, number) + TEST_WORK + healthy_work(points, self._target.near_work)
 
+    def better(self, scan: NDArray[np.floating], T_ca: Pose) -> tuple[list[Pose], int]:
+        """Return the poses turned by a near-symmetry that explain more of a scan (n, 3) in {A}, and the work."""
+        turned, tested = self._turned(self._rays(scan), T_ca, True)
+        return turned, self.turning_work + (1 + tested) * self._ray_work
+
+    def _rays(self, scan: NDArray[np.floating]) -> Rays:
+        return Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
+
     def decided(
-        self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool
+        self,
+        scan: NDArray[np.floating],
+        T_ca: Pose,
+        others: list[Pose],
+        complete: bool,
+        turned: list[Pose] | None = None,
     ) -> tuple[Pose, list[Pose], int]:
         """Return the pose for which the rays decide, the others that explain the scan as well, and extra work.
 
@@ -156,17 +174,18 @@ class NearSymmetry:
         Args:
             scan: (n, 3) in {A} [m].
             T_ca: registered pose.
-            others: other poses that explain the scan; with None only a pose that explains more of it is sought.
+            others: other poses that explain the scan.
             complete: the visible side of the model is complete in the scan, so that empty directions count.
+            turned: poses turned by a near-symmetry; None: the best ones.
         """
-        rays = Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
+        rays = self._rays(scan)
         if not len(rays.points):
-            return T_ca, others or [], 0
-        turned, tested = self._turned(rays, T_ca, others is None)
-        extra = max(0, tested - FINALISTS * len(self._kinds)) * self._ray_work
-        if others is None and not turned:
-            return T_ca, [], extra
-        found = [self._measured(rays, pose) for pose in (T_ca, *(others or ()), *turned)]
+            return T_ca, others, 0
+        extra = 0
+        if turned is None:
+            turned, tested = self._turned(rays, T_ca, False)
+            extra = max(0, tested - FINALISTS * len(self._kinds)) * self._ray_work
+        found = [self._measured(rays, pose) for pose in (T_ca, *others, *turned)]
         noise, best = self.search.noise_of(found), found[0]
         width = max(NEAR * self._target.index.extent_m, 3.0 * noise)
         for each in found[1:]:
@@ -181,48 +200,86 @@ class NearSymmetry:
         ]
         return best.T_ca, rivals, extra
 
-    def distinct(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
-        """Return the rivals that differ from a degenerate view not only along its unobservable directions; else all."""
-        if found.status is not AlignStatus.DEGENERATE or not rivals:
-            return rivals
+    def elsewhere(
+        self, scan: NDArray[np.floating], T_ca: Pose, partial: bool, left: int
+    ) -> tuple[Pose, list[Pose], int]:
+        """Return the pose for which the rays decide among those far from a result that explain its points as well.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            T_ca: the result of a search.
+            partial: the scan shows a part of the target, so that displaced poses are tried as well.
+            left: work that is left.
+
+        Returns:
+            The pose, the others that explain the points on the model as well, and the work in point searches.
+        """
+        rays, gate = self._rays(scan), self._gate
+        on, compared = self._test.measure(rays.points, T_ca) < gate, self._compared_work(len(rays.points))
+        poses, work = self.search.elsewhere(rays.points[on], T_ca, partial, left - compared)
+        found = [self._measured(rays, each) for each in (T_ca, *poses)]
+        width = max(NEAR * self._target.index.extent_m, 3.0 * self.search.noise_of(found))
+        on = np.min([each.distance for each in found], axis=0) < max(gate, width)
+        found = [replace(each, distance=each.distance[on]) for each in found]
+        best = found[0]
+        for each in found[1:]:
+            best = each if decides(each, best, width, not partial) else best
+        margin = self.search.margin(width / 3.0)
+        others = [each for each in found if not self.search.same(best.T_ca, each.T_ca)]
+        as_near = [each for each in others if as_good(best, each, max(gate, width), margin)]
+        repeated = len(as_near) >= COMPARED  # there may be more of them, which were not compared
+        rivals = [each.T_ca for each in as_near if repeated or not decides(best, each, width, not partial)]
+        return best.T_ca, rivals, work + compared
+
+    def rivalled(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> Alignment:
+        """Return the alignment; AMBIGUOUS with rivals that differ not only along its unobservable directions."""
         at, target = found.T_ac.inverse(), self._target
-        free = view_directions(target.index, target.visibility, scan, at, self._gate)
-        return [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
+        if rivals and found.status is AlignStatus.DEGENERATE:
+            free = view_directions(target.index, target.visibility, scan, at, self._gate)
+            rivals = [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
+        if not rivals:
+            return found
+        words = turn_words(at @ rivals[0].inverse())
+        return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
 
     def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
-        """The best poses that the near-symmetries give, and at how many of them the marks were tested.
-
-        The poses are registered with the points off the model in their number.
+        """The best poses that the near-symmetries give, registered, and at how many of them the marks were tested.
 
         Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose pass through a mark.
-        ``better``: only poses that explain more points, by ``LEAST_RAYS`` at least.
+        ``better``: only poses that explain more rays, by ``LEAST_RAYS`` at least; also those turned by a few degrees,
+        because a body of revolution with marks has a minimum wherever a mark of the model meets some of the points.
         """
-        stride = self._stride
-        most_passed = self._passed(rays, T_ca, stride)[0] + LEAST_RAYS
+        stride, tested = self._stride, 0
+        passed = self._passed(rays, T_ca, stride)[0]
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
         few = [k[:: max(1, -(-len(k) // SCREENED))] for k in kinds]
         weights = np.concatenate([np.full(len(f), len(k) / max(1, len(f))) for k, f in zip(kinds, few, strict=True)])
         part = np.ascontiguousarray(rays.points[np.concatenate(few)])
         width = OFF * self._gate
-        kept, tested = list[Pose](), 0
+        kept = list[Pose]()
+        here = (self._distances(T_ca.apply(part), np.eye(4)[None], width)[0] / width) ** 2
         for motions in self._kinds:
-            cost = (self._distances(T_ca.apply(part), motions, width) / width) ** 2 @ weights
-            here = float((self._distances(T_ca.apply(part), np.eye(4)[None], width) / width)[0] ** 2 @ weights)
-            most, order = len(kept) + FINALISTS, np.argsort(cost, kind="stable")
-            for k in order[cost[order] < here - LEAST_RAYS] if better else order:
+            excess = (self._distances(T_ca.apply(part), motions, width) / width) ** 2 - here
+            cost, most, most_cost = excess @ weights, len(kept) + FINALISTS, np.inf
+            if better:  # where rays pass through marks, also poses that the few points do not exclude
+                most_cost = passed - LEAST_RAYS
+                cost -= SCREEN_SIGMAS * np.sqrt(excess**2 @ weights**2) * (passed > LEAST_RAYS)
+            order = np.argsort(cost, kind="stable")
+            for k in order[cost[order] < most_cost]:
                 start = Pose.from_matrix(motions[k]) @ T_ca
-                if any(self.search.same(start, other) for other in (T_ca, *kept)):
+                if any(self.search.same(start, other) for other in (kept if better else (T_ca, *kept))):
                     continue
                 tested += 1
-                if self._passed(rays, start, stride)[0] < most_passed:
+                if self._passed(rays, start, stride)[0] < min(passed + LEAST_RAYS, most_cost - cost[k]):
                     kept.append(start)
                 if len(kept) == most:
                     break
-        return [self.search.refined(part, start, width) for start in kept], tested
+        evenly = np.ascontiguousarray(rays.points[:: max(1, len(rays.points) // len(part))])
+        return [self.search.refined(evenly, start, width) for start in kept], tested
 
     def _measured(self, rays: Rays, T_ca: Pose) -> Contradicted:
         return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
@@ -269,25 +326,6 @@ class NearSymmetry:
         return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
 
 
-def decides(better: Contradicted, other: Contradicted, width_m: float, complete: bool) -> bool:
-    """Return whether the rays decide for one pose against another.
-
-    Args:
-        better: the pose that is to be decided for.
-        other: the other pose, measured on the same points.
-        width_m: distance within which a point is on the model [m].
-        complete: as of ``NearSymmetry.decided``.
-    """
-    a, b, off = better.distance, other.distance, OFF * width_m
-    share = max(CONTRADICTING, float(np.mean((a > width_m) & (b > width_m))))
-    if share >= 0.5:
-        return False
-    rays_for = np.count_nonzero((a < width_m) & (b > off)) + other.passed + (other.empty if complete else 0.0)
-    against = np.count_nonzero((b < width_m) & (a > off)) + better.passed + (better.empty if complete else 0.0)
-    enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
-    return bool(enough and against <= MOST_AGAINST * rays_for)
-
-
 def prepared(target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None) -> NearSymmetry:
     """Return the near-symmetries of a target with its search. They are kept in a folder where one is given.
 
@@ -303,14 +341,8 @@ def prepared(target: Target, test: PlausibilityTest, params: AcquireParams, fold
         path = index_cache.cache_path(folder, layout, surface.vertices, surface.faces, limits.reach_m)
     kept = index_cache.read_arrays(path, kernel.checksum)
     known = len(kept)
-    search = GlobalSearch(target, params, kept)
+    search = Search(target, params, kept)
     symmetry = NearSymmetry(target, test, search, kept)
     if len(kept) > known:
         index_cache.write_arrays(path, kept, kernel.checksum)
     return symmetry
-
-
-def surface_area(surface: Surface) -> float:
-    """Return the area of a mesh [m^2]."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())

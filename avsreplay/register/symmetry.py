@@ -20,7 +20,7 @@ from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import SurfaceIndex
 
 TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; to recognise the axis
-REVOLVED, FITS = 0.02, 2  # distance of turned surface on the model [extent]; fits of the axis
+REVOLVED, FITS, LEAST_FITTED = 0.02, 2, 60  # distance of turned surface on the model [extent]; fits of the axis, points
 AXIS_STRIDE, GROUP_STRIDE, CIRCLE_STRIDE = 3, 40, 20  # every n-th point for the axis, a product, the circle of turns
 FINALISTS = 2  # poses of each kind of motion that are refined; kinds of single motions
 CIRCLE, LOW = 360, 0.75  # turns along the circle; largest cost at the teeth of a gear over the median cost
@@ -58,7 +58,7 @@ def near_symmetries(search: GlobalSearch, index: SurfaceIndex, points: Array, no
     if not len(found):
         return NONE
     on_axis = (points[::AXIS_STRIDE], normals[::AXIS_STRIDE])
-    axis = _axis(index, *on_axis) or next(_axes_of(index, on_axis[0], found), None)
+    axis = _axis(index, *on_axis, 0.5) or next(_axes_of(index, on_axis[0], found), None) or _axis(index, *on_axis, 0.0)
     if axis is not None:
         turns, least = _turns(index, points[::CIRCLE_STRIDE], *axis)
         flips = [T for T in found if axis[0] @ T[:3, :3] @ axis[0] < -0.9]
@@ -116,8 +116,11 @@ def _among(T: Array, others: list[Array]) -> bool:
     return bool((trace > 1.0 + 2.0 * np.cos(DIFFERENT_RAD)).any())
 
 
-def _axis(index: SurfaceIndex, points: Array, normals: Array) -> tuple[Array, Array] | None:
-    """Direction and a point of the axis about which most of the surface is a surface of revolution, or None."""
+def _axis(index: SurfaceIndex, points: Array, normals: Array, least: float) -> tuple[Array, Array] | None:
+    """Direction and a point of the axis about which most of the surface is a surface of revolution, or None.
+
+    Large marks displace the first fit, after which a smaller share of the surface, ``least``, leads to the next one.
+    """
     on = np.ones(len(points), dtype=bool)
     for _ in range(FITS):
         centre = points[on].mean(axis=0)
@@ -130,9 +133,9 @@ def _axis(index: SurfaceIndex, points: Array, normals: Array) -> tuple[Array, Ar
             return None
         direction, centre = theta / size, centre + np.cross(theta, x[3:]) / size**2
         on = _revolved(index, points, direction, centre)
-        if on.mean() < 0.5:
+        if np.count_nonzero(on) < LEAST_FITTED or on.mean() < least:
             return None
-    return direction, centre
+    return (direction, centre) if on.mean() >= 0.5 else None
 
 
 def _axes_of(index: SurfaceIndex, points: Array, found: Array) -> Iterator[tuple[Array, Array]]:

@@ -28,6 +28,7 @@ VIEWS, SIDE_POINTS, VIEWED_FROM = 24, 2000, 2.0  # cameras that look at points o
 PATCH_OF_EXTENT, LEAST_INCIDENCE = 0.05, 0.05  # side of a patch; least cosine of a ray
 FROM_BEHIND, LEAST_ONE_SIDED = 0.05, 0.2  # share of the views of a patch; share of the area with one side
 FRONT, BACK, BOTH = 1, 2, 3
+CENTROID_CELL = 0.02  # of the image in which the nearest points are seen, over the extent
 VERSION = 1  # of the rule for the sides of open parts, for the cache
 
 
@@ -187,3 +188,38 @@ def _sides(surface: Surface, faces: NDArray[np.int32], part: NDArray[np.int64]) 
 def _counts(group: NDArray[np.int64], of: NDArray[np.int64], *views: Array) -> Array:
     """Sums (k, m) of the views (n,) of the points on faces ``of`` (n,) over the group (m,) of each face."""
     return np.stack([np.bincount(group[of], each, int(group.max()) + 1)[group] for each in views])
+
+
+class VisibleCentroids:
+    """Centroid of the part of a model that a distant camera sees, tabulated for ``count`` directions."""
+
+    def __init__(self, points: Array, normals: Array, extent_m: float, count: int = 80) -> None:
+        """Build it from points sampled on the surface, (n, 3) in {C} [m]; zero normals: visible from all sides.
+
+        The centroid is that of the points that face the camera and are the nearest of their pixel, within a cell.
+        """
+        self._directions, cell = directions(count), CENTROID_CELL * extent_m
+        cosine = normals @ self._directions.T if normals.any() else np.ones((len(points), count))
+        depth = points @ self._directions.T
+        u = np.cross(self._directions, np.eye(3)[np.argmin(np.abs(self._directions), axis=1)])
+        u /= np.linalg.norm(u, axis=1)[:, None]
+        x, y = (np.floor(points @ axes.T / cell).astype(np.int64) for axes in (u, np.cross(self._directions, u)))
+        x, y = x - x.min(axis=0), y - y.min(axis=0)
+        wide, high = int(x.max()) + 1, int(y.max()) + 1
+        pixel = (x + wide * y) + wide * high * np.arange(count)
+        nearest = np.full(count * wide * high, -np.inf)
+        facing = cosine > LEAST_INCIDENCE
+        np.maximum.at(nearest, pixel[facing], depth[facing])
+        weight = np.where(facing & (depth > nearest[pixel] - cell), cosine, 0.0)
+        total = weight.sum(axis=0)
+        seen = total > 0.0
+        self._centroids = np.where(
+            seen[:, None],
+            np.einsum("nk,nj->kj", weight, points) / np.where(seen, total, 1.0)[:, None],
+            points.mean(axis=0),
+        )
+
+    def of(self, direction_c: Array) -> Array:
+        """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
+        centroid: Array = self._centroids[np.argmax(direction_c @ self._directions.T, axis=-1)]
+        return centroid

@@ -218,19 +218,43 @@ def truss(rng: np.random.Generator) -> list[Mesh]:
     return [*parts, at(box((0.2, 0.3, 0.15)), 0.3, 0.1, -0.2)]
 
 
+def grid(rng: np.random.Generator) -> list[Mesh]:
+    """A plate of bars that cross at right angles, with a plate in one of its holes and a small box on it."""
+    rows, columns, thick = rng.integers(3, 6), rng.integers(4, 7), rng.uniform(0.05, 0.15)
+    size = np.array([columns, rows]) * rng.uniform(0.4, 0.6)
+    parts = [at(box((size[0] + 0.12, 0.12, thick)), 0, y, 0) for y in np.linspace(-0.5, 0.5, rows + 1) * size[1]]
+    parts += [at(box((0.12, size[1] + 0.12, thick)), x, 0, 0) for x in np.linspace(-0.5, 0.5, columns + 1) * size[0]]
+    hole = (rng.integers((columns, rows)) + 0.5) / (columns, rows) - 0.5
+    parts.append(at(box((*(size / (columns, rows)), thick)), *(hole * size), 0))
+    return [*parts, at(box((0.3, 0.2, 0.2)), *rng.uniform(-0.4, 0.4, 2) * size, thick / 2 + 0.05)]
+
+
+def station(rng: np.random.Generator) -> list[Mesh]:
+    """Modules in a row, a node with a module across, and panels on a truss that are equal but for their tilt."""
+    radius, lengths = rng.uniform(0.3, 0.45), rng.uniform(0.7, 1.6, 3)
+    parts, x = [box((0.8, 0.8, 0.8))], 0.4
+    for length in lengths[:2]:
+        parts.append(at(turned(cylinder(radius, length, sections=20), 90, Y), x + length / 2, 0, 0))
+        x += length - 0.02
+    parts.append(at(turned(cylinder(radius * 0.9, lengths[2], sections=20), 90, X), 0, 0.4 + lengths[2] / 2, 0))
+    parts.append(at(box((0.15, 5.0, 0.15)), -0.4, 0, 0.45))
+    for y, tilt in zip((-2.2, 2.2), rng.uniform(-40, 40, 2), strict=True):
+        parts.append(at(turned(box((1.6, 0.7, 0.04)), tilt, Y), -0.4, y, 0.6))
+    return parts
+
+
 KINDS: dict[str, Callable[[np.random.Generator], list[Mesh]]] = {
     each.__name__: each for each in (satellite, wing, bracket, chair, mug, lander, vehicle, symmetric)
 }
-
-
 THIN: dict[str, Callable[[np.random.Generator], list[Mesh]]] = {
     each.__name__: each for each in (probe, guitar, comsat, truss)
 }
+MORE = {**KINDS, **THIN, "grid": grid, "station": station}
 
 
 def body(kind: str, seed: int) -> Mesh:
-    """A body with the origin off the centre of its box."""
-    mesh = trimesh.util.concatenate((KINDS | THIN)[kind](np.random.default_rng([seed, sum(map(ord, kind))])))
+    """A body with the origin off the centre of its box; ``kind``: one of ``MORE``."""
+    mesh = trimesh.util.concatenate(MORE[kind](np.random.default_rng([seed, sum(map(ord, kind))])))
     return at(mesh, *(0.05 * np.linalg.norm(mesh.extents) * np.array([0.3, -0.2, 0.4]) - mesh.bounds.mean(axis=0)))
 
 

@@ -4,7 +4,8 @@
                                       [--points 4000] [--backend horn] [--seed 1]
 
 Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a cylinder stage (a
-cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, and mesh files by their path.
+cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, mesh files by their path, and
+bodies of bodies.py by kind and seed, as grid:51.
 Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray; "close" is
 at 0.65 extents and "closer" at 0.5, with a quarter of the noise. The scenes
 add walls, outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the
@@ -27,6 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import bodies
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
@@ -84,7 +86,10 @@ def meshes(names: list[str]) -> dict[str, Surface]:
     """The surfaces by name; files that are not there are left out with a note."""
     found: dict[str, Surface] = {}
     for name in names:
-        if name == "builtin":
+        kind, _, seed = name.partition(":")
+        if seed and kind in bodies.MORE:
+            found[name] = bodies.surface_of(bodies.body(kind, int(seed)), name)
+        elif name == "builtin":
             found[name] = builtin_surface()
         elif name == "cylinder":
             found[name] = _surface(trimesh.creation.cylinder(radius=1.8, height=9.0, sections=64), name)
@@ -207,6 +212,23 @@ def second_object(surface: Surface) -> Callable[[Pose], list]:
     return place
 
 
+def random_object(surface: Surface, seed: int) -> Callable[[Pose], list]:
+    """A body of one to three primitives, 0.2 to 0.7 extents large, anywhere next to the target."""
+    rng = np.random.Generator(np.random.PCG64([seed, 77]))
+    parts = []
+    for _ in range(rng.integers(1, 4)):
+        size = rng.uniform(0.1, 1.0, 3)
+        made = trimesh.creation.box(size) if rng.random() < 0.6 else trimesh.creation.cylinder(0.5 * size[0], size[1])
+        made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+        parts.append(made.apply_translation(rng.uniform(-0.3, 0.3, 3)))
+    mesh = trimesh.util.concatenate(parts)
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    mesh.apply_scale(rng.uniform(0.2, 0.7) * surface.extent / np.linalg.norm(mesh.extents))
+    middle, place = (surface.vertices.max(0) + surface.vertices.min(0)) / 2, rng.standard_normal(3)
+    shift = rng.uniform(0.2, 0.7) * surface.extent * place / np.linalg.norm(place)
+    return lambda T_ac: [(_surface(mesh, "object"), Pose(Pose.identity().q, T_ac.apply(middle) + shift))]
+
+
 def grown(surface: Surface, factor: float) -> Surface:
     """The surface scaled: what was measured is ``factor`` times the size of the model."""
     return replace(surface, vertices=surface.vertices * factor)
@@ -244,6 +266,16 @@ def _close(distance: float, degrees: float) -> Maker:
 def _beside(degrees: float | None) -> Maker:
     def make(surface: Surface, count: int, seed: int) -> Case:
         v = view(surface, count, seed, second_object(surface))
+        return Case(v.points, None if degrees is None else off(v, degrees, 0.01), v.T_ac)
+
+    return make
+
+
+def _among(degrees: float | None) -> Maker:
+    """Beside a random body."""
+
+    def make(surface: Surface, count: int, seed: int) -> Case:
+        v = view(surface, count, seed, random_object(surface, seed))
         return Case(v.points, None if degrees is None else off(v, degrees, 0.01), v.T_ac)
 
     return make
@@ -289,6 +321,8 @@ SCENES: dict[str, Maker] = {
     "30 % visible, search": _plain(None, 0.0, lambda v: visible_part(v, 0.3)),
     "second object, 3 deg": _beside(3.0),
     "second object, search": _beside(None),
+    "random object, 3 deg": _among(3.0),
+    "random object, search": _among(None),
     "noise 0.004, 3 deg": _noisy(0.004),
     "noise 0.008, 3 deg": _noisy(0.008),
     "noise 0.015, 3 deg": _noisy(0.015),
