@@ -12,7 +12,7 @@ from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Effort, Registrar, effort_after
-from avsreplay.register.budget import END_WORK, HEALTHY_SCANS, Budget, healthy_work
+from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.sampling import segments, without_scattered_points
@@ -174,7 +174,7 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 def test_the_budget_counts_work() -> None:
     budget = Budget(20_000)
-    budget.spend(HEALTHY_SCANS * 20_000 - END_WORK - 500)
+    budget.spend(budget.left - 500)
     assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
     assert budget.allows(500)
     assert not budget.exhausted

@@ -28,6 +28,7 @@ STAGE_WORK, CALL_WORK = 1200, 600  # cost in the interpreter of a stage of a res
 LAST_WORK = 30_000  # cost of registering a scan once more from its pose, and of the test of the result
 END_WORK = SIZE_WORK  # cost of what follows the last pose: its size
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
+LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work
 SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
 
 
@@ -103,7 +104,7 @@ class Budget:
 
     def __init__(self, healthy: int) -> None:
         self.healthy = healthy
-        self.left = HEALTHY_SCANS * healthy - END_WORK
+        self.left = int((HEALTHY_SCANS - LAST_STEP) * healthy) - END_WORK
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
@@ -120,8 +121,8 @@ class Budget:
         self.spend((fit.work or fit.iterations * found.points * share) + grade_work(graded, noisy) + free)
 
     def for_alignment(self, points: int) -> int:
-        """Return the searches that an alignment may take, so that its pose can be graded and tested."""
-        return max(1, self.left - grade_work(points) - TEST_WORK)
+        """Return the searches that an alignment may take, so that its pose can be graded (with noise) and tested."""
+        return max(1, self.left - grade_work(points, noisy=True) - TEST_WORK)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
