@@ -23,7 +23,7 @@ from fuzz_workers import Check, report, run_campaign
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = ("test_plan_cone_programme.py", "test_register_kernel.py", "test_register_surface_index.py",
-         "test_register_index_cache.py",
+         "test_register_index_cache.py", "test_register_restarts.py", "test_monitor_observability.py",
          "test_estimate_dynamics.py", "test_estimate_chart.py", "test_estimate_measurement.py")  # fmt: skip
 LIMIT_S, LIMIT_MIB, BATCH = 60, 4096, 250
 EXTREMES = np.array([0.0, -0.0, 1.0, -1.0, 1e-320, 1e-30, 1e4, 1e20, -1e38, 1e300, np.inf, -np.inf, np.nan])
