@@ -38,6 +38,7 @@ from avsreplay.register.visibility import Visibility
 
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
 LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = 2, 0.2, 0.9  # work kept, in ordinary scans; inliers: least, sure
+MANY_OFF = 0.1  # share of points off the model from which bodies with large marks are compared with their turned poses
 
 
 class Registrar:
@@ -270,15 +271,15 @@ class Registrar:
         """The pose turned by a near-symmetry, if the points off the model decide for it; DEGENERATE as of the guess."""
         unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self.index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in ACCEPTED
-        if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.turned:
+        least = LEAST_RAYS if self._symmetry.near else max(LEAST_RAYS, MANY_OFF * found.points)
+        if not accepted or not (unsure or found.points - found.inliers >= least) or not self._symmetry.turned:
             return found
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
         none = replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED)
         if not budget.allows(self._symmetry.turning_work):
             return none
         turned, screened = (None, 0) if unsure else self._symmetry.better(scan, T_ca)
-        work = self._symmetry.work(len(scan)) + TEST_WORK
-        if turned == [] or not budget.allows(work):
+        if turned == [] or not budget.allows(work := self._symmetry.work(len(scan)) + TEST_WORK):
             budget.spend(screened)
             return found if turned == [] else none
         best, rivals, extra = self._symmetry.decided(scan, T_ca, [], self._test.check(part, T_ca).covered, turned)
