@@ -15,10 +15,8 @@ from avsreplay.register.surface_index import SurfaceIndex
 HEALTHY_FIXED, HEALTHY_SEARCHED = (4200, 0.8), (7000, 1.3)  # an ordinary registration: work, and searches (per point)
 GRADE_WORK, POINTS_GRADED = 8000, 2  # the quality of a pose: point searches in all, and points of which each takes one
 NEAR_POINTS, NEAR_OF_EXTENT = 500, 0.002  # points with the noise of an ordinary scan that show the cost of a search
-SIMULATED_WORK, MOST_SIMULATED = (
-    (1000, 2),
-    3000,
-)  # of the simulated noise: point searches in all and per point, to so many
+SIMULATED_WORK = 1000, 2  # cost of the simulation of the noise: point searches in all, and of each point
+MOST_SIMULATED = 3000  # points that are simulated, at most
 LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 3, 7  # cost per point of finding whether points are scattered, and of leaving them out
@@ -26,7 +24,6 @@ TEST_WORK, SIZE_WORK = 15_000, 15_000  # cost of a test of a pose, and of fittin
 STRUCTURE_WORK, FREE_WORK = 3000, 8000  # cost of the residuals that neighbours share, and of free directions
 STAGE_WORK, CALL_WORK = 1200, 600  # cost in the interpreter of a stage of a restart, and of measuring a pose
 LAST_WORK = 30_000  # cost of registering a scan once more from its pose, and of the test of the result
-END_WORK = SIZE_WORK  # cost of what follows the last pose: its size
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work
 SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
@@ -91,7 +88,7 @@ def effort_after(failed: int) -> Effort:
 class Budget:
     """Point searches left for one scan: counted work, so that results do not depend on the machine.
 
-    ``END_WORK`` is kept for what follows the last pose.
+    The work of fitting the size, which follows the last pose, is kept.
 
     Args:
         healthy: work of an ordinary registration of the scan.
@@ -104,7 +101,7 @@ class Budget:
 
     def __init__(self, healthy: int) -> None:
         self.healthy = healthy
-        self.left = int((HEALTHY_SCANS - LAST_STEP) * healthy) - END_WORK
+        self.left = int((HEALTHY_SCANS - LAST_STEP) * healthy) - SIZE_WORK
         self.exhausted = False
 
     def spend(self, searches: int) -> None:

@@ -39,11 +39,8 @@ CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 POINTS, STEP_OF_EXTENT, STEPS = 50, 0.06, 12  # of displaced starts: points, their distance, and steps each way
-FIRST_GATE, SECOND_GATE, MOST = (
-    0.15,
-    0.075,
-    (150, 80),
-)  # rejection distances over the extent; most starts after two passes
+FIRST_GATE, SECOND_GATE = 0.15, 0.075  # rejection distances over the extent
+MOST = 150, 80  # starts that are kept after the first passes: those turned by near-symmetries, and the others
 MOST_STARTS = 1200  # with more of them their distance is larger
 SECOND, LAST = 4, 6  # passes with the distance SECOND_GATE, and of the best with more points
 COMPARED_FIRST, COMPARED = 16, 4  # poses that are compared with more points, and that are registered to the model

@@ -317,10 +317,8 @@ class Registrar:
         few = self._restarter.part(scan)
         starts = self._restarter.starts(few, first, guess, budget)
         near = [at for at in starts if first.measured and at.noise_m <= NOISE_OF_EXTENT * self.index.extent_m]
-        hopeful, tried = (
-            bool(near),
-            [self._neighbourhood.regraded(scan, few, at, budget, halves, carried) for at in near] or [first],
-        )
+        tried = [self._neighbourhood.regraded(scan, few, at, budget, halves, carried) for at in near] or [first]
+        hopeful = bool(near)
         final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         reason = self._restarter.reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final, budget)):
