@@ -1,30 +1,32 @@
-"""avsreplay: record and replay point-cloud logs through the processing chain of vision-guided capture.
+"""avsreplay: record and replay point-cloud logs through the processing chain of vision-guided
+capture.
 
 The conventions that hold in every module:
 
-Frames
-    {A} camera, assumed inertial.  {B} principal axes of the target, origin at its centre of mass.
-    {C} grapple fixture; the model file uses this frame.  ``T_ab`` takes coordinates in b to coordinates in a.
-Quaternions
-    ``[x y z w]``, unit length, active: ``matrix(q_ab)`` takes b to a.  The code uses Hamilton's product,
-    ``q_ac = multiply(q_ab, q_bc)``; the paper's product has the factors in the other order, a (x) b = multiply(b, a).
-Units
-    SI units and radians; degrees in output for people only. The names of all output values end with their unit
-    (``pos_err_m``, ``rot_err_deg``, ``t_go_s``).  Instants are integer nanoseconds ``t_ns``, durations float seconds.
-State (20 error states, always in this order)
-    dq_v 0:3 (half angle), w 3:6, rho_o 6:9, v 9:12, sigma 12:14, varrho 14:17, dmu_v 17:20 (half angle);
-    q = dq (x) q_hat and mu = mu_hat (x) dmu in the paper's product; the other errors are additive.
+Frames {A} camera, assumed inertial.  {B} principal axes of the target, origin at its centre of
+    mass. {C} grapple fixture; the model file uses this frame.  ``T_ab`` takes coordinates in b to
+    coordinates in a.
+Quaternions ``[x y z w]``, unit length, active: ``matrix(q_ab)`` takes b to a.  The code uses
+    Hamilton's product, ``q_ac = multiply(q_ab, q_bc)``; the paper's product has the factors in the
+    other order, a (x) b = multiply(b, a).
+Units SI units and radians; degrees in output for people only. The names of all output values end
+    with their unit (``pos_err_m``, ``rot_err_deg``, ``t_go_s``).  Instants are integer nanoseconds
+    ``t_ns``, durations float seconds.
+State (20 error states, always in this order) dq_v 0:3 (half angle), w 3:6, rho_o 6:9, v 9:12, sigma
+    12:14, varrho 14:17, dmu_v 17:20 (half angle); q = dq (x) q_hat and mu = mu_hat (x) dmu in the
+    paper's product; the other errors are additive.
 Alignment error
     d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d).
-Source
-    F. Aghili, "Adaptive Visual Servo Control for Autonomous Robots"; ``docs/equations.md`` lists the corrections.
+Source F. Aghili, "Adaptive Visual Servo Control for Autonomous Robots"; ``docs/equations.md`` lists
+    the corrections.
 
 Importing the package loads no other module; the public names are loaded when they are first used.
 """
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # the command starts this package twice, and the module typing would be loaded for nothing
+# the command starts this package twice, and the module typing would be loaded for nothing
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
@@ -52,7 +54,8 @@ def __getattr__(name: str) -> Any:
 
 
 def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
-    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100)``.
+    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all",
+    n_scans=100)``.
 
     Args:
         source: log, bag or folder of scans.
@@ -70,5 +73,7 @@ def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Ro
     from avsreplay.log import SourceOptions
     from avsreplay.run import Job, Run
 
-    with Run(Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)) as run:
+    with Run(
+        Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)
+    ) as run:
         yield from run.rows()

@@ -11,7 +11,7 @@ def main() -> None:
     try:
         arithmetic.pin()  # before anything imports numpy
         gc.set_threshold(10_000)  # objects between two searches for cycles, of which there are few
-        from avsreplay import cli
+        from avsreplay.cli import main as cli
     except KeyboardInterrupt:
         print("avsreplay: interrupted", file=sys.stderr)  # noqa: T201
         sys.exit(130)

@@ -1,11 +1,13 @@
-"""Binary files of unknown origin, read with checks: arrays of numpy, and the state of an interrupted run.
+"""Binary files of unknown origin, read with checks: arrays of numpy, and the state of an
+interrupted run.
 
 The sizes of arrays are compared with the size of the file before memory is allocated.
 
-The state of an interrupted run, from which the run continues with the same bits, is a pickle that is read with a
-restricted reader: it creates objects of the classes of this package that hold data, and numpy arrays, and nothing else,
-so that a file from elsewhere cannot execute code. Objects that a run builds from its input (model, stages) are not
-stored but named, and those of the continued run take their places.
+The state of an interrupted run, from which the run continues with the same bits, is a pickle that
+is read with a restricted reader: it creates objects of the classes of this package that hold data,
+and numpy arrays, and nothing else, so that a file from elsewhere cannot execute code. Objects that
+a run builds from its input (model, stages) are not stored but named, and those of the continued run
+take their places.
 """
 
 from __future__ import annotations
@@ -30,13 +32,24 @@ from avsreplay.errors import UnreadableInput
 
 _MAX_NPY_HEADER = 4096
 _MOST_STATE = 16 << 30
-_LEAST_ARRAYS, _MAX_RATIO = 96 << 20, 8  # arrays may take 96 MiB, or eight times the size of their archive
+_LEAST_ARRAYS, _MAX_RATIO = (
+    96 << 20,
+    8,
+)  # arrays may take 96 MiB, or eight times the size of their archive
 _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
 )
 _NPY_TYPE = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
-_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    NotImplementedError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+)
 
 
 class BadFile(ValueError):
@@ -62,14 +75,22 @@ def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> by
             raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
         with path.open("rb") as stream:
             # read(n) allocates n bytes, which is 16 GiB for a checkpoint
-            data = b"" if found.st_size > limit else stream.read() if regular else stream.read(limit + 1)
+            data = (
+                b""
+                if found.st_size > limit
+                else stream.read()
+                if regular
+                else stream.read(limit + 1)
+            )
         if max(found.st_size, len(data)) > limit:
             raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
         return data
     except OSError as error:
         if isinstance(error, FileNotFoundError):
             raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
-        raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint=hint) from None
+        raise UnreadableInput(
+            error.strerror or "cannot be read", where=str(path), hint=hint
+        ) from None
 
 
 def parse_npy(data: bytes) -> NDArray[Any]:
@@ -136,7 +157,8 @@ def read_npz(
 
     Args:
         path: the file.
-        shapes: for each array the kind of its numbers ("f" or "i") and its shape; None is any length.
+        shapes: for each array the kind of its numbers ("f" or "i") and its shape; None is any
+            length.
         limit: largest size of the file [bytes].
         hint: what to do about an unusable file.
         optional: arrays that a file may lack.
@@ -145,7 +167,8 @@ def read_npz(
         The arrays by name, as float64 or int64.
 
     Raises:
-        UnreadableInput: the file is missing, damaged, too large, or an array has another type or shape.
+        UnreadableInput: the file is missing, damaged, too large, or an array has another type or
+            shape.
     """
     data = read_limited(path, limit, hint)
     try:
@@ -156,11 +179,15 @@ def read_npz(
         raise UnreadableInput(str(error), where=str(path), hint=hint) from None
 
 
-def _declared(members: Mapping[str, bytes], name: str, kind: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+def _declared(
+    members: Mapping[str, bytes], name: str, kind: str, shape: tuple[int | None, ...]
+) -> NDArray[Any]:
     if f"{name}.npy" not in members:
         raise BadFile(f"the array '{name}' is missing")
     array = parse_npy(members[f"{name}.npy"])
-    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    fits = array.ndim == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, array.shape, strict=True)
+    )
     if array.dtype.kind != kind or not fits:
         raise BadFile(f"the array '{name}' has the type {array.dtype} and the shape {array.shape}")
     return array.astype(np.int64 if kind == "i" else np.float64)
@@ -178,8 +205,8 @@ _LIBRARY = {
 }
 _ACCUMULATORS = {  # classes that collect values scan by scan and are no dataclasses
     ("avsreplay.estimate.work", "Work"),
-    ("avsreplay.register", "ModelCheck"),
-    ("avsreplay.report", "SummaryFold"),
+    ("avsreplay.register.model_check", "ModelCheck"),
+    ("avsreplay.report.summary", "SummaryFold"),
     ("avsreplay.result_dir", "Beliefs"),
     ("avsreplay.viewers", "NewPaths"),
     ("avsreplay.result_dir", "ViewWriter"),
@@ -211,10 +238,12 @@ def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
     Args:
         path: the file.
         named: objects in place of their names.
-        like: a value of the same structure, whose types and names of attributes it must have; None for any.
+        like: a value of the same structure, whose types and names of attributes it must have; None
+            for any.
 
     Raises:
-        UnreadableInput: the file is missing, damaged, of another version, or contains what a checkpoint never contains.
+        UnreadableInput: the file is missing, damaged, of another version, or contains what a
+            checkpoint never contains.
     """
     try:
         found = _Unpacker(io.BytesIO(read_limited(path, _MOST_STATE, _HINT)), named).load()
@@ -226,7 +255,10 @@ def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
 
 
 def _check_alike(found: Any, like: Any) -> None:
-    """Raise ValueError where the types or the attributes of two values differ; None is like everything."""
+    """Raise ValueError where the types or the attributes of two values differ.
+
+    None is like everything.
+    """
     if like is None:
         return
     if type(found) is not type(like) or (isinstance(like, tuple) and len(found) != len(like)):
@@ -262,7 +294,9 @@ class _Unpacker(pickle.Unpickler):
 
 
 def _holds_data(found: Any, module: str) -> bool:
-    """Whether it is a class of that module and a dataclass, an enumeration or one of the accumulators."""
+    """Whether it is a class of that module and a dataclass, an enumeration or one of the
+    accumulators.
+    """
     if not isinstance(found, type) or found.__module__ != module:
         return False
     known = (module, found.__name__) in _ACCUMULATORS

@@ -1,4 +1,7 @@
-"""Creates the stages from configuration and log header: the only place where names become objects."""
+"""Creates the stages from configuration and log header.
+
+The only place where names become objects.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,16 @@ from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor import FaultDetector
 from avsreplay.monitor.convergence import Consistency, Convergence
+from avsreplay.monitor.fault_detection import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
-from avsreplay.plan import Guidance, Supervisor, TargetGeometry, hull_vertices
 from avsreplay.plan.arm import with_arm
+from avsreplay.plan.guidance import Guidance
+from avsreplay.plan.limits import TargetGeometry, hull_vertices
+from avsreplay.plan.supervisor import Supervisor
 from avsreplay.records import LogHeader, Scan, Surface, Truth
-from avsreplay.register import POSES, Registrar
+from avsreplay.register.backend import POSES
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 
 
@@ -36,8 +42,10 @@ def stages(
         header: of the log.
         surface: model of the target.
         registrar: of that model; one may serve several chains.
-        truth_of: truth at a scan; used for the first pose alone, where the configuration starts from the truth.
-        clock: instant of the first scan [ns], where a known acceleration begins, and interval of the scans [s].
+        truth_of: truth at a scan; used for the first pose alone, where the configuration starts
+            from the truth.
+        clock: instant of the first scan [ns], where a known acceleration begins, and interval of
+            the scans [s].
 
     Raises:
         UsageError: the configuration requires the start of the log, and the log contains none.
@@ -54,9 +62,16 @@ def stages(
         registrar=registrar,
         estimator=Estimator(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
-        monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
+        monitors=Monitors(
+            Consistency(config.consistency), Convergence(config.convergence, surface.extent)
+        ),
         guidance=Guidance(
-            robot.applied(config.plan), Supervisor(supervision), limits, surface.extent, robot.gripper, arm
+            robot.applied(config.plan),
+            Supervisor(supervision),
+            limits,
+            surface.extent,
+            robot.gripper,
+            arm,
         ),
         target=target_geometry(surface, config.fixture_axis_c, limits.clearance_m is not None),
         guess=config.guess,
@@ -66,7 +81,9 @@ def stages(
     )
 
 
-def target_geometry(surface: Surface, axis_c: tuple[float, float, float], clearance: bool) -> TargetGeometry:
+def target_geometry(
+    surface: Surface, axis_c: tuple[float, float, float], clearance: bool
+) -> TargetGeometry:
     """Return the geometry of the target for guidance.
 
     Args:
@@ -93,7 +110,8 @@ def first_state(ready: Stages) -> PipelineState:
     """Return the state before the first scan.
 
     Args:
-        ready: the stages of the run; their prior standard deviations scale the observability Gramian.
+        ready: the stages of the run; their prior standard deviations scale the observability
+            Gramian.
     """
     start = ready.estimator.start
     prior_1s = ready.estimator.params.start_1s if start is None else np.sqrt(np.diag(start.P))
@@ -103,7 +121,10 @@ def first_state(ready: Stages) -> PipelineState:
 def _initialise(
     config: RunConfig, header: LogHeader, truth_of: Callable[[Scan], Truth]
 ) -> Callable[[Scan], tuple[Pose | None, str]]:
-    """Where the first pose comes from: first scan -> T_ac (None: search without a guess) and the name of its source."""
+    """Where the first pose comes from: first scan -> T_ac (None.
+
+    Search without a guess) and the name of its source.
+    """
     start = header.start
     if config.init == "truth":
         return lambda scan: (_true_pose(truth_of(scan)), "truth")
@@ -120,5 +141,7 @@ def _initialise(
 def _true_pose(truth: Truth) -> Pose:
     if truth.pose is None:
         hint = "name its truth with --truth-topic or --truth, or use --init auto"
-        raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)
+        raise UsageError(
+            "the log has no true pose at its first scan", where="--init truth", hint=hint
+        )
     return truth.pose

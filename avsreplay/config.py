@@ -1,7 +1,7 @@
 """The configuration of a run: the parameter classes of all stages, one TOML table each.
 
-Precedence: option, environment variable, ``--config`` file, the log's own ``[run]`` table, default. The effective
-configuration is saved with every result.
+Precedence: option, environment variable, ``--config`` file, the log's own ``[run]`` table, default.
+The effective configuration is saved with every result.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from typing import Any
 
 from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
-from avsreplay.monitor import FaultParams
 from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
-from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
-from avsreplay.register import RegisterParams
+from avsreplay.monitor.fault_detection import FaultParams
+from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.plan.supervisor import SupervisorParams
+from avsreplay.register.params import RegisterParams
 from avsreplay.settings import SettingError, Settings, is_unit, setting
 from avsreplay.toml_document import Document, build, load, override, toml_value
 
@@ -42,23 +44,27 @@ class RunConfig(Settings):
 
     guess: Guess = setting(
         Guess.PREDICTED,
-        "Initial guess of registration: the filter's prediction (closed loop) or the last healthy pose (open loop).",
+        "Initial guess of registration: the filter's prediction (closed loop) or the last healthy"
+        " pose (open loop).",
     )
     init: str = setting(
         "log",
-        "Initial pose: the initial state in the log, else a global search (log); the true pose (truth); a global search"
-        " (auto); or the pose of {C} in {A} as x,y,z,qx,qy,qz,qw.",
+        "Initial pose: the initial state in the log, else a global search (log); the true pose"
+        " (truth); a global search (auto); or the pose of {C} in {A} as x,y,z,qx,qy,qz,qw.",
     )
     deskew: bool = setting(
-        True, "Transform points that have their own times to the instant of the scan, along the predicted motion."
+        True,
+        "Transform points that have their own times to the instant of the scan, along the predicted"
+        " motion.",
     )
     reacquire: bool = setting(
-        True, "Search globally when a scan is faulty and the prediction is too uncertain to be a guess."
+        True,
+        "Search globally when a scan is faulty and the prediction is too uncertain to be a guess.",
     )
     reference: Against = setting(
         Against.TRUTH,
-        "Reference of the errors: the log's true poses (truth), or one motion fitted to all healthy poses of a"
-        " first pass (fit).",
+        "Reference of the errors: the log's true poses (truth), or one motion fitted to all healthy"
+        " poses of a first pass (fit).",
     )
     register: RegisterParams = setting(RegisterParams, "Registration.")
     estimator: EstimatorParams = setting(EstimatorParams, "Estimation.")
@@ -70,7 +76,8 @@ class RunConfig(Settings):
     limits: Limits = setting(Limits, "Constraints of every capture plan.")
     supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
     fixture_axis_c: tuple[float, float, float] = setting(
-        (1.0, 0.0, 0.0), "Unit vector of the fixture's outward axis in {C}, along which the robot approaches."
+        (1.0, 0.0, 0.0),
+        "Unit vector of the fixture's outward axis in {C}, along which the robot approaches.",
     )
 
     @property
@@ -82,19 +89,24 @@ class RunConfig(Settings):
         """Return the limits of every plan with those of the robot.
 
         Args:
-            extent_m: diagonal of the target's bounding box [m]; lengths that are not set are proportional to it.
+            extent_m: diagonal of the target's bounding box [m]; lengths that are not set are
+                proportional to it.
         """
         return self.robot.limited(self.limits).resolved(extent_m)
 
     def check(self) -> None:
-        """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an impossible robot."""
+        """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an
+        impossible robot.
+        """
         if self.init not in ("log", "truth", "auto"):
             try:
                 parse_pose(self.init)
             except ValueError as error:
                 raise SettingError("init", str(error)) from None
         if not is_unit(self.fixture_axis_c, 1e-6):
-            raise SettingError("fixture_axis_c", f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
+            raise SettingError(
+                "fixture_axis_c", f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length"
+            )
         check_robot(self.robot, self.plan, self.limits)
 
 
@@ -118,19 +130,25 @@ def parse_pose(text: str) -> Pose:
     """Return the pose T_ac that a text states.
 
     Args:
-        text: ``x,y,z,qx,qy,qz,qw``: position of {C} in {A} [m] and quaternion q_ac, of unit length within 0.5 %.
+        text: ``x,y,z,qx,qy,qz,qw``: position of {C} in {A} [m] and quaternion q_ac, of unit length
+            within 0.5 %.
 
     Raises:
-        ValueError: the text does not contain seven finite numbers, or the quaternion is not of unit length.
+        ValueError: the text does not contain seven finite numbers, or the quaternion is not of unit
+            length.
     """
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != 7 or not all(abs(v) < float("inf") for v in values):
-        raise ValueError(f"init is '{text}', not log, truth, auto or seven numbers x,y,z,qx,qy,qz,qw")
+        raise ValueError(
+            f"init is '{text}', not log, truth, auto or seven numbers x,y,z,qx,qy,qz,qw"
+        )
     if abs(sum(v * v for v in values[3:]) - 1.0) > 1e-2:
-        raise ValueError(f"init is '{text}', its quaternion (last four numbers) is not of unit length")
+        raise ValueError(
+            f"init is '{text}', its quaternion (last four numbers) is not of unit length"
+        )
     return Pose(values[3:], values[:3])  # type: ignore[arg-type]
 
 
@@ -155,14 +173,18 @@ def pose_text(pose: Pose) -> str:
 
 
 def load_config(
-    file: Path | None, log_table: Mapping[str, Any], assignments: Sequence[str], log_folder: Path | None = None
+    file: Path | None,
+    log_table: Mapping[str, Any],
+    assignments: Sequence[str],
+    log_folder: Path | None = None,
 ) -> RunConfig:
     """Return the effective configuration.
 
     Args:
         file: TOML file, or None.
         log_table: The log's own ``[run]`` table.
-        log_folder: Folder of the log, to which relative paths in its table refer; None: the folder of the command.
+        log_folder: Folder of the log, to which relative paths in its table refer; None: the folder
+            of the command.
         assignments: ``a.b=value`` from options.
 
     Raises:
@@ -180,7 +202,8 @@ def load_config(
 
 
 def with_robot_path(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a table of settings in which the path ``robot.urdf`` refers to the folder of the command.
+    """Return a table of settings in which the path ``robot.urdf`` refers to the folder of the
+    command.
 
     Args:
         table: Settings, with a table ``robot`` or without.
@@ -235,5 +258,9 @@ def _over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in top.items():
         below = merged.get(key)
-        merged[key] = _over(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+        merged[key] = (
+            _over(below, value)
+            if isinstance(below, Mapping) and isinstance(value, Mapping)
+            else value
+        )
     return merged

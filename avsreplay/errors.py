@@ -24,8 +24,8 @@ def value_class(
 ) -> type[T] | Callable[[type[T]], type[T]]:
     """Make a data class with slots; the type checker reports an assignment to one of its fields.
 
-    Unlike ``dataclass(frozen=True)`` it does not test assignments at run time, and creates an object in a tenth of the
-    time and the class in a quarter. Arrays in its fields are read-only.
+    Unlike ``dataclass(frozen=True)`` it does not test assignments at run time, and creates an
+    object in a tenth of the time and the class in a quarter. Arrays in its fields are read-only.
 
     Args:
         cls: the class.
@@ -44,7 +44,10 @@ def value_class(
 
 
 def _described(self: Any) -> str:
-    """Name and fields of a value; one function for all classes, because each would take 0.1 ms to make."""
+    """Name and fields of a value.
+
+    One function for all classes, because each would take 0.1 ms to make.
+    """
     shown = (f"{each.name}={getattr(self, each.name)!r}" for each in fields(self) if each.repr)
     return f"{type(self).__qualname__}({', '.join(shown)})"
 
@@ -54,7 +57,9 @@ def _compared(value: Any) -> tuple[Any, ...]:
 
 
 def _equal(self: Any, other: object) -> bool:
-    return _compared(self) == _compared(other) if other.__class__ is self.__class__ else NotImplemented
+    return (
+        _compared(self) == _compared(other) if other.__class__ is self.__class__ else NotImplemented
+    )
 
 
 def _hashed(self: Any) -> int:
@@ -72,7 +77,10 @@ def counted(count: int, noun: str) -> str:
 
 
 class AvsError(Exception):
-    """An error that the user can correct; its text is one line: where, what is wrong, what to do."""
+    """An error that the user can correct; its text is one line.
+
+    Where, what is wrong, what to do.
+    """
 
     exit_code = 2
 

@@ -1,7 +1,9 @@
-"""Outputs that are complete or absent: a regular file is written beside its place and renamed when it is complete.
+"""Outputs that are complete or absent: a regular file is written beside its place and renamed when
+it is complete.
 
-A symbolic link is followed and never replaced. A device, a FIFO and ``-`` (standard output) are written directly. Names
-that cannot be written raise an error in ``check_output``, before any work is done.
+A symbolic link is followed and never replaced. A device, a FIFO and ``-`` (standard output) are
+written directly. Names that cannot be written raise an error in ``check_output``, before any work
+is done.
 """
 
 from __future__ import annotations
@@ -27,7 +29,10 @@ _CLEANED, _COUNTER = set[Path](), itertools.count()
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether an output is written directly: ``-``, a device or a FIFO, also behind a symbolic link."""
+    """Return whether an output is written directly.
+
+    ``-``, a device or a FIFO, also behind a symbolic link.
+    """
     if path == STDOUT:
         return True
     try:
@@ -37,17 +42,21 @@ def is_stream(path: Path) -> bool:
     return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode) or stat.S_ISBLK(mode)
 
 
-def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, inputs: Iterable[Path] = ()) -> None:
+def check_output(
+    path: Path, *, overwrite: bool = True, folder: bool = False, inputs: Iterable[Path] = ()
+) -> None:
     """Raise an error for an output that cannot be written, before any work is done.
 
     Args:
         path: the output.
         overwrite: whether an existing file or folder may be replaced.
         folder: whether the output is a folder; its parents are created.
-        inputs: files and folders that are read; the output must be none of them and no file of such a folder.
+        inputs: files and folders that are read; the output must be none of them and no file of such
+            a folder.
 
     Raises:
-        UsageError: the name is unusable, the output exists, is an input, or its folder does not exist.
+        UsageError: the name is unusable, the output exists, is an input, or its folder does not
+            exist.
         UnreadableInput: its folder cannot be written.
     """
     name = os.fsencode(path)
@@ -57,33 +66,48 @@ def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, in
         raise UsageError("is not a UTF-8 name", where=ascii(str(path)), hint="name another output")
     if len(os.fsencode(path.name)) > _NAME_BYTES:
         where = f"{path.name[:40]}..."
-        raise UsageError(f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output")
+        raise UsageError(
+            f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output"
+        )
     try:
-        if path.resolve().is_symlink():  # from Python 3.13 on, ``resolve`` returns a loop of links as it is
+        if (
+            path.resolve().is_symlink()
+        ):  # from Python 3.13 on, ``resolve`` returns a loop of links as it is
             raise RuntimeError("a loop of symbolic links")
         _check_place(path, overwrite, folder)
-        if not is_stream(path) and any(_replaces(path.resolve(), each.resolve()) for each in inputs):
+        if not is_stream(path) and any(
+            _replaces(path.resolve(), each.resolve()) for each in inputs
+        ):
             what = "is an input, a part of one, or another output"
             raise UsageError(what, where=str(path), hint="name another output")
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of symbolic links
-        what = f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
+        what = (
+            f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
+        )
         raise UsageError(what, where=str(path)[:200], hint="name another output") from None
 
 
 def _replaces(place: Path, source: Path) -> bool:
-    """Whether an output replaces an input, a scan in a folder that is read, or a file that its run.json lists."""
+    """Whether an output replaces an input, a scan in a folder that is read, or a file that its
+    run.json lists.
+    """
     if place == source or place.parent != source or not place.is_file():
         return place == source
     manifest = source / "run.json"
     if manifest.is_file() and place != manifest:
-        return manifest.stat().st_size > 64 << 20 or os.fsencode(f'"{place.name}"') in manifest.read_bytes()
+        return (
+            manifest.stat().st_size > 64 << 20
+            or os.fsencode(f'"{place.name}"') in manifest.read_bytes()
+        )
     return place.suffix != ".html"
 
 
 def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
     if path == STDOUT:
         if folder:
-            raise UsageError("a folder cannot be written to standard output", where="-", hint="name a folder")
+            raise UsageError(
+                "a folder cannot be written to standard output", where="-", hint="name a folder"
+            )
         return
     place = path.resolve()
     there = place.stat().st_mode if place.exists() else None
@@ -95,19 +119,26 @@ def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
     if there is not None and not folder and not stat.S_ISREG(there):
         raise UsageError("is not a regular file", where=str(path), hint="name another output")
     if there is not None and not overwrite:
-        raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
+        raise UsageError(
+            "already exists", where=str(path), hint="choose another name, or add --overwrite"
+        )
     parent = place.parent
     while folder and not parent.exists():
         parent = parent.parent
     if not parent.is_dir():
         raise UsageError("no such folder", where=str(path.parent), hint="create it first")
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise UnreadableInput("cannot be written: Permission denied", where=str(path), hint="check the folder's rights")
+        raise UnreadableInput(
+            "cannot be written: Permission denied",
+            where=str(path),
+            hint="check the folder's rights",
+        )
 
 
 @contextmanager
 def output_path(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
-    """Yield a path to write to; on success its content replaces ``path``, on failure ``path`` is unchanged.
+    """Yield a path to write to; on success its content replaces ``path``, on failure ``path`` is
+    unchanged.
 
     Args:
         path: the output.
@@ -157,14 +188,17 @@ def output_text(path: str | Path, *, overwrite: bool = True) -> Iterator[IO[str]
 
 @contextmanager
 def output_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
-    """Yield a temporary folder; on success it replaces the folder ``path``, on failure ``path`` is unchanged.
+    """Yield a temporary folder; on success it replaces the folder ``path``, on failure ``path`` is
+    unchanged.
 
     Args:
         path: the folder.
-        own: names that may be in such a folder; everything else in the former folder is kept in the new one.
+        own: names that may be in such a folder; everything else in the former folder is kept in the
+            new one.
 
     Raises:
-        UsageError: the folder cannot be written (see ``check_output``), or another process writes it.
+        UsageError: the folder cannot be written (see ``check_output``), or another process writes
+            it.
         UnreadableInput: writing failed; the text states why.
     """
     check_output(path, folder=True)
@@ -180,7 +214,9 @@ def output_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
 
 
 def _swap(part: Path, place: Path) -> None:
-    """Put ``part`` in the place of an existing folder, in one step where the system has one (Linux)."""
+    """Put ``part`` in the place of an existing folder, in one step where the system has one
+    (Linux).
+    """
     old = _beside(place)
     if place.exists():
         if _exchange(part, place):  # the former folder is removed with the temporary name
@@ -201,7 +237,9 @@ def _exchange(one: Path, other: Path) -> bool:
         rename = ctypes.CDLL(None).renameat2
     except (AttributeError, OSError, TypeError):  # macOS; Windows
         return False
-    return int(rename(-100, os.fsencode(one), -100, os.fsencode(other), 2)) == 0  # AT_FDCWD, RENAME_EXCHANGE
+    return (
+        int(rename(-100, os.fsencode(one), -100, os.fsencode(other), 2)) == 0
+    )  # AT_FDCWD, RENAME_EXCHANGE
 
 
 def _keep_others(place: Path, part: Path, own: Collection[str]) -> None:
@@ -230,7 +268,9 @@ def _publish(part: Path, place: Path, overwrite: bool) -> None:
             os.link(part, place)  # fails if another process has created the file meanwhile
             return
         except FileExistsError:
-            raise UsageError("appeared while it was written", where=str(place), hint="add --overwrite") from None
+            raise UsageError(
+                "appeared while it was written", where=str(place), hint="add --overwrite"
+            ) from None
         except OSError:  # a file system without hard links
             pass
     for left in range(40 if os.name == "nt" else 1, 0, -1):
@@ -247,20 +287,27 @@ def _unwritable(path: Path, error: OSError) -> UnreadableInput:
     if PART.fullmatch(path.parent.name):  # the final name of a folder, not the temporary one
         path = path.parent.with_name(path.parent.name[1:].rsplit(".", 3)[0]) / path.name
     hint = "nothing was changed; check the folder, its rights and its space"
-    return UnreadableInput(f"cannot be written: {error.strerror or error}", where=str(path), hint=hint)
+    return UnreadableInput(
+        f"cannot be written: {error.strerror or error}", where=str(path), hint=hint
+    )
 
 
 def _beside(place: Path) -> Path:
     """Return a name beside ``place`` that no other process or thread uses."""
-    return place.with_name(f".{os.fsdecode(os.fsencode(place.name)[:200])}.{os.getpid()}.{next(_COUNTER)}.part")
+    return place.with_name(
+        f".{os.fsdecode(os.fsencode(place.name)[:200])}.{os.getpid()}.{next(_COUNTER)}.part"
+    )
 
 
 @contextmanager
 def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Create a locked temporary file or folder beside ``place`` and remove it at the end if it is still there."""
+    """Create a locked temporary file or folder beside ``place`` and remove it at the end if it is
+    still there.
+    """
     _remove_stale(place.parent)
     part, held = _beside(place), None
-    while True:  # between its creation and its lock, another process may take it for a leftover and remove it
+    # between its creation and its lock, another process may take it for a leftover and remove it
+    while True:
         if folder:
             part.mkdir()
         else:
@@ -283,7 +330,9 @@ def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def _remove_stale(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process has ended (their lock is free), once in this process."""
+    """Remove the temporary files in a folder whose process has ended (their lock is free), once in
+    this process.
+    """
     if folder in _CLEANED:
         return
     _CLEANED.add(folder)
@@ -291,7 +340,9 @@ def _remove_stale(folder: Path) -> None:
         for entry in folder.iterdir():
             if PART.fullmatch(entry.name):
                 held = lock(entry)
-                if held is not None or (os.name == "nt" and entry.is_file()):  # it cannot remove a file that is open
+                if held is not None or (
+                    os.name == "nt" and entry.is_file()
+                ):  # it cannot remove a file that is open
                     _remove(entry)
                 if held is not None:
                     os.close(held)

@@ -1,8 +1,9 @@
 """Poses, quaternions and rotation vectors; every function takes one or a batch (leading axes).
 
-Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to coordinates in a, and
-``multiply(q_ab, q_bc)`` is ``q_ac``. The paper's product has the factors in the other order, ``a (x) b`` is
-``multiply(b, a)``. A single value is computed with scalars, ten times faster than with arrays and with the same bits.
+Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to
+coordinates in a, and ``multiply(q_ab, q_bc)`` is ``q_ac``. The paper's product has the factors in
+the other order, ``a (x) b`` is ``multiply(b, a)``. A single value is computed with scalars, ten
+times faster than with arrays and with the same bits.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
 
     Args:
         values: numbers of any shape.
-        shape: required shape, -1 for any size of a dimension; any shape is allowed if it is omitted.
+        shape: required shape, -1 for any size of a dimension; any shape is allowed if it is
+            omitted.
 
     Raises:
         ValueError: the values have another shape.
@@ -103,7 +105,9 @@ def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
     return out
 
 
-def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: Any) -> tuple[Any, Any, Any, Any]:
+def _product(
+    ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: Any
+) -> tuple[Any, Any, Any, Any]:
     return (
         aw * bx + bw * ax + (ay * bz - az * by),
         aw * by + bw * ay + (az * bx - ax * bz),
@@ -113,7 +117,10 @@ def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: 
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
-    """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4): the inverse rotations of unit quaternions."""
+    """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4).
+
+    The inverse rotations of unit quaternions.
+    """
     return np.asarray(q_ab, dtype=np.float64) * _CONJUGATE
 
 
@@ -178,7 +185,9 @@ def quaternion(R_ab: ArrayLike) -> Array:
     if R.ndim == 2:
         return np.array(_unit(*_multiple(*R.ravel().tolist())))
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
+    four_q_qT = np.empty(
+        (*R.shape[:-2], 4, 4)
+    )  # row k is 4 q_k q: the row of the largest q_k is well conditioned
     four_q_qT[..., 0, 0], four_q_qT[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
     four_q_qT[..., 2, 2], four_q_qT[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
     for i, j, value in (
@@ -199,12 +208,19 @@ def _multiple(*R: float) -> tuple[float, ...]:
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R
     squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
     a, b, c, d, e, f = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
-    rows = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))
+    rows = (
+        (squares[0], a, b, d),
+        (a, squares[1], c, e),
+        (b, c, squares[2], f),
+        (d, e, f, squares[3]),
+    )
     return rows[squares.index(max(squares))]
 
 
 def exp(rotvec: ArrayLike) -> Array:
-    """Return the unit quaternions (..., 4) ``[x y z w]`` of rotation vectors (..., 3) (full angle) [rad]."""
+    """Return the unit quaternions (..., 4) ``[x y z w]`` of rotation vectors (..., 3) (full angle)
+    [rad].
+    """
     v = np.asarray(rotvec, dtype=np.float64)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
@@ -222,11 +238,16 @@ def log(q: ArrayLike) -> Array:
     v, w = np.split(normalise(q), [3], axis=-1)
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     small = norm < 1e-8
-    return np.asarray(np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm)) * v)
+    return np.asarray(
+        np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm)) * v
+    )
 
 
 def angle(q: ArrayLike) -> Array:
-    """Return the rotation angles (...) in [0, pi] [rad] of quaternions (..., 4); their length does not matter."""
+    """Return the rotation angles (...) in [0, pi] [rad] of quaternions (..., 4).
+
+    Their length does not matter.
+    """
     a: Array = np.asarray(q, dtype=np.float64)
     if a.ndim == 1:
         x, y, z, w = a.tolist()
@@ -235,10 +256,11 @@ def angle(q: ArrayLike) -> Array:
 
 
 def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array) -> Array:
-    """Return points (n, 3) transformed by R p + t, each with the R and t of its own time ``times`` (n,).
+    """Return points (n, 3) transformed by R p + t, each with the R and t of its own time ``times``
+    (n,).
 
-    R (k, 3, 3) and t (k, 3) are given at evenly spaced ``knots`` (k,). Between two knots the point is transformed at
-    both, and the result is interpolated.
+    R (k, 3, 3) and t (k, 3) are given at evenly spaced ``knots`` (k,). Between two knots the point
+    is transformed at both, and the result is interpolated.
     """
     at = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, len(knots) - 1.0)
     low = np.minimum(at.astype(int), len(knots) - 2)
@@ -248,7 +270,10 @@ def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array)
 
 
 def across(axis: Array) -> Array:
-    """Return a unit vector (3,) at right angles to a unit vector (3,): the part of a coordinate axis across it."""
+    """Return a unit vector (3,) at right angles to a unit vector (3,).
+
+    The part of a coordinate axis across it.
+    """
     side = np.eye(3)[int(np.abs(axis).argmin())]
     side = side - (side @ axis) * axis
     return np.asarray(side / np.linalg.norm(side))
@@ -256,15 +281,19 @@ def across(axis: Array) -> Array:
 
 def bounding_diagonal(points: ArrayLike) -> float:
     """Return the diagonal [m] of the bounding box of points (n, 3) [m]."""
-    return float(np.linalg.norm(np.ptp(np.ascontiguousarray(np.asarray(points).T), axis=1)))  # numpy is slow along rows
+    return float(
+        np.linalg.norm(np.ptp(np.ascontiguousarray(np.asarray(points).T), axis=1))
+    )  # numpy is slow along rows
 
 
 @value_class
 class Pose:
-    """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
+    """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b
+    + t_ab_a``.
 
     Attributes:
-        q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.  t: (3,) origin of b in a [m].
+        q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.
+        t: (3,) origin of b in a [m].
     """
 
     q: Array
@@ -279,7 +308,10 @@ class Pose:
 
     @classmethod
     def _of(cls, q: tuple[float, ...], t: list[float]) -> Pose:
-        """The pose of a quaternion that is not zero and of a position: as the constructor, in half the time."""
+        """The pose of a quaternion that is not zero and of a position.
+
+        As the constructor, in half the time.
+        """
         pose, pose_q, pose_t = cls.__new__(cls), np.array(_unit(*q)), np.array(t)
         pose_q.flags.writeable = pose_t.flags.writeable = False
         pose.q, pose.t = pose_q, pose_t  # type: ignore[misc]
@@ -314,7 +346,9 @@ class Pose:
     def inverse(self) -> Pose:
         """Return the inverse T_ba."""
         (x, y, z, w), (u, v, s) = self.q.tolist(), self.t.tolist()
-        return self._of((-x, -y, -z, w), [-(a * u + b * v + c * s) for a, b, c in _rows(-x, -y, -z, w)])
+        return self._of(
+            (-x, -y, -z, w), [-(a * u + b * v + c * s) for a, b, c in _rows(-x, -y, -z, w)]
+        )
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: T_ab @ T_bc = T_ac."""
@@ -341,9 +375,11 @@ class Pose:
 
 @value_class
 class MeasuredPose:
-    """A pose T_ac of {C} in {A} that a tracker measured (markers, motion capture), in place of a point cloud.
+    """A pose T_ac of {C} in {A} that a tracker measured (markers, motion capture), in place of a
+    point cloud.
 
-    ``covariance`` (6, 6) is that of the error d = [theta; v] in {C} [rad, m], T_true = T_ac @ Exp(d); None: not stated.
+    ``covariance`` (6, 6) is that of the error d = [theta; v] in {C} [rad, m], T_true = T_ac @
+    Exp(d); None: not stated.
     """
 
     T_ac: Pose

@@ -1,4 +1,7 @@
-"""Locks of outputs: one process writes a file or folder at a time. The system releases them when the process ends."""
+"""Locks of outputs: one process writes a file or folder at a time.
+
+The system releases them when the process ends.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,10 @@ _WAIT = "wait for it, or name another output"
 
 
 def lock(part: Path, *, wait: bool = False) -> int | None:
-    """Lock a temporary file or folder until this process ends; None if the system cannot. ``wait`` for another lock."""
+    """Lock a temporary file or folder until this process ends; None if the system cannot.
+
+    ``wait`` for another lock.
+    """
     if os.name == "nt":  # an open file cannot be removed there
         return None
     handle = os.open(part, os.O_RDONLY)
@@ -36,7 +42,8 @@ def _hold(handle: int, wait: bool) -> None:
 
 
 def check_alone(part: Path, place: Path) -> None:
-    """Raise UsageError if another process writes the folder ``place`` and has locked its own temporary folder.
+    """Raise UsageError if another process writes the folder ``place`` and has locked its own
+    temporary folder.
 
     Args:
         part: the temporary folder of this process.
@@ -59,7 +66,8 @@ def _output_of(part: Path) -> str:
 
 
 def open_alone(path: Path) -> BinaryIO:
-    """Open a file for writing, emptied, that no other process writes; the lock ends when the file is closed.
+    """Open a file for writing, emptied, that no other process writes; the lock ends when the file
+    is closed.
 
     Args:
         path: the file; it is created if it does not exist.

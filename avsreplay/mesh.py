@@ -1,8 +1,9 @@
-"""The sides of a triangle mesh: consistent winding, outward faces, and faces of open parts that both sides show.
+"""The sides of a triangle mesh: consistent winding, outward faces, and faces of open parts that
+both sides show.
 
-Registration with a known position of the camera, signed distances and mass properties need the outer side of each face
-(right-hand rule). CAD exports often reverse single faces or mirrored parts. Parts are the sets of faces that are
-connected by edges of exactly two faces.
+Registration with a known position of the camera, signed distances and mass properties need the
+outer side of each face (right-hand rule). CAD exports often reverse single faces or mirrored parts.
+Parts are the sets of faces that are connected by edges of exactly two faces.
 """
 
 from __future__ import annotations
@@ -14,10 +15,17 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
-LEAST_VOLUME = 1e-9  # least volume of a part with an inside, times six, in units of its area to the power of 3/2
-LEAST_PART = 1e-3  # least area of an open part over that of the mesh; smaller parts are remains of meshing
-OPENING = 0.01  # area of a circle as long as the open edges of a part, over its area; parts below it have no inner side
-MERGED_OF_EXTENT = 1e-6  # vertices on the same point of a grid this fine are one: exports round 0 to 1e-17
+# least volume of a part with an inside, times six, in units of its area to the power of 3/2
+LEAST_VOLUME = 1e-9
+LEAST_PART = (
+    1e-3  # least area of an open part over that of the mesh; smaller parts are remains of meshing
+)
+# area of a circle as long as the open edges of a part, over its area; parts below it have no inner
+# side
+OPENING = 0.01
+MERGED_OF_EXTENT = (
+    1e-6  # vertices on the same point of a grid this fine are one: exports round 0 to 1e-17
+)
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
 
 Faces = NDArray[np.int32]
@@ -39,16 +47,22 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
 
 
 def numbers_with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the numbers of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared.
+    """Return the numbers of the faces whose area is above rounding: |ab x ac| > 1e-12 of the
+    longest edge squared.
 
-    ``with_area`` leaves out what has no normal at all; an index also leaves out faces whose normal is rounding.
+    ``with_area`` leaves out what has no normal at all; an index also leaves out faces whose normal
+    is rounding.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    longest2 = np.max([np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)], axis=0, initial=0.0)
+    longest2 = np.max(
+        [np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)],
+        axis=0,
+        initial=0.0,
+    )
     area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.flatnonzero(area2 > 1e-12 * longest2).astype(np.int32)
 
@@ -60,7 +74,8 @@ def distinct_rows(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         rows: (n, 3), finite.
 
     Returns:
-        The first (k,) of each set of equal rows in the order of the list, and the number (n,) of each row's set.
+        The first (k,) of each set of equal rows in the order of the list, and the number (n,) of
+        each row's set.
     """
     if not len(rows):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -87,7 +102,8 @@ def normals(vertices: Array, faces: Faces) -> Array:
 
 
 def is_closed(vertices: Array, faces: Faces) -> bool:
-    """Return whether each edge is used as often in one direction as in the other; equal vertices count as one.
+    """Return whether each edge is used as often in one direction as in the other; equal vertices
+    count as one.
 
     Args:
         vertices: (n, 3) [m].
@@ -100,9 +116,10 @@ def is_closed(vertices: Array, faces: Faces) -> bool:
 def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     """Wind the faces consistently and outwards.
 
-    Within a part that is not consistent, the fewer faces are reversed. Then closed parts with a negative volume are
-    reversed, unless they are a cavity inside another closed part. Open parts have no outer side. Faces with the same
-    vertices get one winding if their part is closed; on an open part they may be its two sides, and stay.
+    Within a part that is not consistent, the fewer faces are reversed. Then closed parts with a
+    negative volume are reversed, unless they are a cavity inside another closed part. Open parts
+    have no outer side. Faces with the same vertices get one winding if their part is closed; on an
+    open part they may be its two sides, and stay.
 
     Args:
         vertices: (n, 3) [m].
@@ -123,7 +140,9 @@ def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
 
 
 def _reversed(vertices: Array, faces: Faces) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which of distinct faces (m,) must be reversed, and which belong to a closed part with a volume."""
+    """Which of distinct faces (m,) must be reversed, and which belong to a closed part with a
+    volume.
+    """
     parts = _parts(_edges(_corners(vertices, faces)))
     wound = np.where(parts.reversed[:, None], faces[:, ::-1], faces)
     volume, area = _volumes(vertices, wound, parts.of)
@@ -155,10 +174,11 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the faces that differ, and the part of each that has openings.
 
-    The edges that no opposite half-edge meets are the rims of openings. A finely meshed bowl has few of them, and the
-    seams of patches with unequal vertices are rims as well: only the directions from which the faces of such a part are
-    seen tell its sides. Parts with less than a thousandth of the area are left out. All parts of a mesh without a
-    volume are open, as of one that lists each face with both windings; faces with equal vertices are then one.
+    The edges that no opposite half-edge meets are the rims of openings. A finely meshed bowl has
+    few of them, and the seams of patches with unequal vertices are rims as well: only the
+    directions from which the faces of such a part are seen tell its sides. Parts with less than a
+    thousandth of the area are left out. All parts of a mesh without a volume are open, as of one
+    that lists each face with both windings; faces with equal vertices are then one.
 
     Args:
         vertices: (n, 3) [m].
@@ -170,9 +190,13 @@ def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArra
     if not len(faces):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     _, either, turned = _distinct(corners := _corners(vertices, faces))
-    volume, whole = (float(each[0]) for each in _volumes(vertices, faces, np.zeros(len(faces), np.int64)))
+    volume, whole = (
+        float(each[0]) for each in _volumes(vertices, faces, np.zeros(len(faces), np.int64))
+    )
     flat = abs(volume) <= LEAST_VOLUME * whole**1.5
-    first = distinct_rows(np.column_stack([either, np.zeros_like(turned) if flat else turned]).astype(np.float64))[0]
+    first = distinct_rows(
+        np.column_stack([either, np.zeros_like(turned) if flat else turned]).astype(np.float64)
+    )[0]
     edges, few = _edges(corners[first]), faces[first]
     paired = edges.paired()
     if paired.all() and not flat:
@@ -186,22 +210,34 @@ def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArra
 
 
 def _openings(
-    vertices: Array, faces: Faces, corners: NDArray[np.int64], paired: NDArray[np.bool_], of: NDArray[np.int64]
+    vertices: Array,
+    faces: Faces,
+    corners: NDArray[np.int64],
+    paired: NDArray[np.bool_],
+    of: NDArray[np.int64],
 ) -> Array:
-    """Area of the circles that are as long as the rims of each part; ``corners``: faces with equal vertices as one."""
+    """Area of the circles that are as long as the rims of each part; ``corners``.
+
+    Faces with equal vertices as one.
+    """
     rim = np.flatnonzero(~paired)
     face, side = rim // 3, rim % 3
     start, end = corners[face, side], corners[face, (side + 1) % 3]
-    length = np.linalg.norm(vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1)
+    length = np.linalg.norm(
+        vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1
+    )
     loop = _components(int(corners.max()) + 1, start, end)[start]
     key, number = np.unique(np.column_stack([of[face], loop]), axis=0, return_inverse=True)
     around = np.bincount(number.ravel(), length, len(key))
-    return np.asarray(np.bincount(key[:, 0], around**2 / (4.0 * np.pi), int(of.max()) + 1), dtype=np.float64)
+    return np.asarray(
+        np.bincount(key[:, 0], around**2 / (4.0 * np.pi), int(of.max()) + 1), dtype=np.float64
+    )
 
 
 @value_class
 class _Edges:
-    """Number (3 m,) of the edge of each half-edge, its direction (3 m,) as 1 or -1, and the pairs with two faces.
+    """Number (3 m,) of the edge of each half-edge, its direction (3 m,) as 1 or -1, and the pairs
+    with two faces.
 
     A pair is two half-edges (k, 2) that are alone at their edge.
     """
@@ -218,7 +254,10 @@ class _Edges:
 
 @value_class
 class _Parts:
-    """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding; which parts are closed."""
+    """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding.
+
+    Which parts are closed.
+    """
 
     of: NDArray[np.int64]
     reversed: NDArray[np.bool_]
@@ -226,16 +265,26 @@ class _Parts:
 
 
 def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
-    """The faces (m, 3) with equal vertices as one. A face with two equal corners is a part of its own."""
+    """The faces (m, 3) with equal vertices as one.
+
+    A face with two equal corners is a part of its own.
+    """
     step = MERGED_OF_EXTENT * float(np.ptp(vertices, axis=0).max())
-    corners = distinct_rows(np.round((vertices - vertices.min(axis=0)) / max(step, np.finfo(float).tiny)))[1][faces]
+    corners = distinct_rows(
+        np.round((vertices - vertices.min(axis=0)) / max(step, np.finfo(float).tiny))
+    )[1][faces]
     flat = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
     corners[flat] = len(vertices) + np.arange(3 * np.count_nonzero(flat)).reshape(-1, 3)
     return corners
 
 
-def _distinct(corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Faces that differ: indices (k,), which of them (m,) each face equals, and whether its winding is the other."""
+def _distinct(
+    corners: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Faces that differ.
+
+    Indices (k,), which of them (m,) each face equals, and whether its winding is the other.
+    """
     order = np.argsort(corners, axis=1, kind="stable")
     even = (order[:, 1] - order[:, 0]) % 3 == 1
     first, number = distinct_rows(np.take_along_axis(corners, order, axis=1).astype(np.float64))
@@ -251,14 +300,17 @@ def _edges(corners: NDArray[np.int64]) -> _Edges:
     number[order] = np.cumsum(begins) - 1
     first = np.flatnonzero(begins)
     twice = first[np.diff(first, append=len(key)) == 2]
-    return _Edges(number, np.where(start < end, 1, -1), np.stack([order[twice], order[twice + 1]], axis=1))
+    return _Edges(
+        number, np.where(start < end, 1, -1), np.stack([order[twice], order[twice + 1]], axis=1)
+    )
 
 
 def _parts(edges: _Edges) -> _Parts:
     """The parts of a mesh.
 
-    Where faces must be reversed, each face is two nodes of a graph, as it is and reversed. Nodes are connected if the
-    faces share an edge and are wound consistently. A part that can be wound consistently is two components of it.
+    Where faces must be reversed, each face is two nodes of a graph, as it is and reversed. Nodes
+    are connected if the faces share an edge and are wound consistently. A part that can be wound
+    consistently is two components of it.
     """
     m = len(edges.number) // 3
     a, b = edges.pairs.T // 3
@@ -266,7 +318,9 @@ def _parts(edges: _Edges) -> _Parts:
     if not same.any():
         of, reversed_ = _components(m, a, b), np.zeros(m, bool)
     else:
-        nodes = _components(2 * m, np.append(a, a + m), np.append(b + same * m, b + ~same * m)).reshape(2, m)
+        nodes = _components(
+            2 * m, np.append(a, a + m), np.append(b + same * m, b + ~same * m)
+        ).reshape(2, m)
         _, of = np.unique(nodes.min(axis=0), return_inverse=True)
         turned = nodes[1] < nodes[0]
         most = np.bincount(of, turned) > 0.5 * np.bincount(of)
@@ -278,7 +332,8 @@ def _parts(edges: _Edges) -> _Parts:
 
 
 def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of the connected component of each node, in the order of the first nodes; edges from ``a`` to ``b``.
+    """Number of the connected component of each node, in the order of the first nodes; edges from
+    ``a`` to ``b``.
 
     Each node is linked to one of a lower number in its component until all are linked to the first.
     """
@@ -300,10 +355,16 @@ def _share(paired: NDArray[np.bool_], of: NDArray[np.int64]) -> Array:
 
 
 def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Six times the signed volume and the area of each part; tetrahedra from the centroid of its faces."""
+    """Six times the signed volume and the area of each part.
+
+    Tetrahedra from the centroid of its faces.
+    """
     corners = vertices[faces]
     middles = corners.mean(axis=1)
-    centres = np.stack([np.bincount(of, middles[:, k]) for k in range(3)], axis=1) / np.bincount(of)[:, None]
+    centres = (
+        np.stack([np.bincount(of, middles[:, k]) for k in range(3)], axis=1)
+        / np.bincount(of)[:, None]
+    )
     a, b, c = (corners[:, k] - centres[of] for k in range(3))
     volumes = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)))
     areas = np.bincount(of, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
@@ -311,22 +372,28 @@ def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Arra
 
 
 def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
-    """Whether a part is inside other closed parts: at its outermost vertices and on its largest faces.
+    """Whether a part is inside other closed parts: at its outermost vertices and on its largest
+    faces.
 
-    The solid angle of closed parts is 4 pi inside them. All vertices of a rod may be inside the parts that it joins.
+    The solid angle of closed parts is 4 pi inside them. All vertices of a rod may be inside the
+    parts that it joins.
     """
     if not len(others):
         return False
     points, corners = vertices[np.unique(part)], vertices[others]
     outermost = np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))
     a, b, c = (vertices[part[:, k]] for k in range(3))
-    largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable")[: len(_DIRECTIONS)]
+    largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable")[
+        : len(_DIRECTIONS)
+    ]
     tested = np.concatenate([((a + b + c) / 3.0)[largest], points[outermost]])
     return all(_solid_angle(corners - p) > 2.0 * np.pi for p in tested)
 
 
 def _solid_angle(corners: Array) -> float:
-    """Solid angle [sr] at the origin of outward triangles (m, 3, 3) (Van Oosterom and Strackee 1983)."""
+    """Solid angle [sr] at the origin of outward triangles (m, 3, 3) (Van Oosterom and Strackee
+    1983).
+    """
     a, b, c = (corners[:, k] for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]

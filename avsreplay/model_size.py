@@ -1,8 +1,9 @@
-"""Size of the scans against that of the model: unit, background and crop, each with the option to add.
+"""Size of the scans against that of the model: unit, background and crop, each with the option to
+add.
 
-Sizes are compared as diameters (largest distance between two points), which do not depend on the attitude. A scan shows
-one side of the target, so that its diameter is between about 0.4 and 1.1 of the model's. Where sizes permit several
-units, a search for the pose decides.
+Sizes are compared as diameters (largest distance between two points), which do not depend on the
+attitude. A scan shows one side of the target, so that its diameter is between about 0.4 and 1.1 of
+the model's. Where sizes permit several units, a search for the pose decides.
 """
 
 from __future__ import annotations
@@ -19,22 +20,27 @@ from avsreplay.log import SourceOptions
 from avsreplay.log.header import scaled
 from avsreplay.log.options import Unit
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.mirror import SeenScan, mirror_image_fits, reflected
-from avsreplay.register.params import Camera
+from avsreplay.register.params import Camera, RegisterParams
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import diameter, part_of_size
 from avsreplay.register.size import MOST_OF_MODEL
 
-_LEAST = 0.25  # diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
+# diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
+_LEAST = 0.25
 _WHOLE = 1.1  # no scan of the target alone is larger than this
 _FEW = 0.02  # share of background below which it does not explain too large a scan
 _MOST_BACKGROUND = 0.5  # share of background from which on scans are rejected for too few inliers
-_LEFT_OVER = 2.0  # below this ratio, background explains too large a scan better than feet (3.28) do
-_FEET = 0.36  # below this ratio, a model in feet explains the sizes as well as a view from a narrow side
+_LEFT_OVER = (
+    2.0  # below this ratio, background explains too large a scan better than feet (3.28) do
+)
+# below this ratio, a model in feet explains the sizes as well as a view from a narrow side
+_FEET = 0.36
 _LARGEST_TARGET_M = 500.0
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _SEARCHED, _SEARCHED_SCANS = 20_000, 3  # points of a scan in which the model is searched, and scans
-_SCENE = 0.11  # factor of a unit from which on a scan that seems to show the target only may show its surroundings
+# factor of a unit from which on a scan that seems to show the target only may show its surroundings
+_SCENE = 0.11
 _LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
 _GAPS = 0.2, 0.3  # gaps within and around a target of unknown unit, over its diameter
 _MARGIN = 0.25  # space around the target in a suggested crop, over the model's diameter
@@ -74,7 +80,10 @@ class Advice:
 
 
 def compare_sizes(
-    clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None, options: SourceOptions
+    clouds: Sequence[NDArray[Any]],
+    surface: Surface | None,
+    registrar: Registrar | None,
+    options: SourceOptions,
 ) -> list[Advice]:
     """Compare the size of scans with that of the model.
 
@@ -90,7 +99,13 @@ def compare_sizes(
     if not clouds:
         cropped = options.crop_range is not None or options.crop_box is not None
         empty = "no points are left in the examined scans; widen the crop"
-        return [Advice("check", "scans", empty if cropped else "the examined scans hold fewer than ten points")]
+        return [
+            Advice(
+                "check",
+                "scans",
+                empty if cropped else "the examined scans hold fewer than ten points",
+            )
+        ]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
         text = f"there is no model; the scans measure {_metres(scan_m)}"
@@ -109,7 +124,11 @@ def compare_sizes(
         why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
         among = Advice("ok", "size", f"{said}; {why}, among other points")
         return [_crop_advice(clouds, found, why) or among]
-    targets = [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds] if ratio > MOST_OF_MODEL else []
+    targets = (
+        [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds]
+        if ratio > MOST_OF_MODEL
+        else []
+    )
     inside = [points for points in targets if points is not None]
     if ratio > _LEFT_OVER and len(inside) * 2 <= len(clouds):
         inside = _groups(clouds, model_m)
@@ -117,20 +136,31 @@ def compare_sizes(
     if grouped and (crop := _crop_advice(clouds, inside, _of_size(model_m))):
         return [crop]
     if grouped or _WHOLE < ratio <= MOST_OF_MODEL:
-        text = f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or background is left"
+        text = (
+            f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or"
+            " background is left"
+        )
         return [Advice("check", "size", text)]
     if MOST_OF_MODEL < ratio < _LEFT_OVER:
-        text = f"{said}: points around the target seem to be left; a narrower --crop-box or --crop-range removes them"
+        text = (
+            f"{said}: points around the target seem to be left; a narrower --crop-box or"
+            " --crop-range removes them"
+        )
         return [Advice("check", "background", text)]
     units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
     if not units:
-        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (ratio > MOST_OF_MODEL)
+        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
+            ratio > MOST_OF_MODEL
+        )
         return [Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")]
     return _unit_advice(units, clouds, surface, unit, said)
 
 
 def find_model(
-    clouds: Sequence[NDArray[Any]], surface: Surface, found: Sequence[Advice], options: SourceOptions
+    clouds: Sequence[NDArray[Any]],
+    surface: Surface,
+    found: Sequence[Advice],
+    options: SourceOptions,
 ) -> list[Advice]:
     """Look for the model in some scans, which may show other objects too.
 
@@ -141,10 +171,12 @@ def find_model(
         options: how the log is read.
 
     Returns:
-        The number of scans in which the model is found, and whether the sensor is elsewhere. If the mirror image of
-        the model explains the scans better, a second finding says so.
+        The number of scans in which the model is found, and whether the sensor is elsewhere. If the
+        mirror image of the model explains the scans better, a second finding says so.
     """
-    named = [advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")]
+    named = [
+        advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")
+    ]
     scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
     model = scaled(surface, scale / options.model_unit.metres)
     few, registrar = _few(clouds), Registrar(model)
@@ -155,12 +187,17 @@ def find_model(
     if any_pose < len(few):
         anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[1]
         if anywhere > any_pose + 1:  # one scan more may be chance
-            text += f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
+            text += (
+                f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
+            )
             return [Advice("check", "sensor", text, "--set register.camera=none")]
     if not any_pose:
         doubt = ": is it the right model, and does the topic show the target?"
         return [Advice("check", "pose", text + doubt * (not mirrored)), *mirrored]
-    return [Advice("ok", "pose", text + ("" if one else ", each time in more than one pose")), *mirrored]
+    return [
+        Advice("ok", "pose", text + ("" if one else ", each time in more than one pose")),
+        *mirrored,
+    ]
 
 
 def _mirror_advice(
@@ -170,7 +207,9 @@ def _mirror_advice(
     model: Surface,
     options: SourceOptions,
 ) -> list[Advice]:
-    """What is said if the mirror image explains the scans in which the model is found, or is found where it is not."""
+    """What is said if the mirror image explains the scans in which the model is found, or is found
+    where it is not.
+    """
     seen = [
         SeenScan(np.asarray(cloud, dtype=np.float32), pose.T_ac.inverse())
         for cloud, pose in zip(clouds, poses, strict=True)
@@ -187,7 +226,14 @@ def _mirror_advice(
         text = f"the mirror image of the model is found in {found} of {len(clouds)} searched scans"
     if options.model_mirror:
         return [Advice("fail", "mirror", f"{text}: remove --model-mirror")]
-    return [Advice("fail", "mirror", f"{text}: an axis of the model or of the points is inverted", "--model-mirror")]
+    return [
+        Advice(
+            "fail",
+            "mirror",
+            f"{text}: an axis of the model or of the points is inverted",
+            "--model-mirror",
+        )
+    ]
 
 
 def _few(clouds: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
@@ -203,7 +249,10 @@ def _thinned(cloud: NDArray[Any]) -> NDArray[Any]:
 def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
     """Sizes that agree, though both may be in millimetres, or the model in feet."""
     if scan_m > _LARGEST_TARGET_M:
-        text = f"{said}: if both are in millimetres, all lengths are 1000 times too large; convert them to metres"
+        text = (
+            f"{said}: if both are in millimetres, all lengths are 1000 times too large; convert"
+            " them to metres"
+        )
         return Advice("check", "unit", text)
     feet = "; if more than a narrow side is seen, the model is in feet (--model-scale 0.3048)"
     return Advice("ok", "size", said + feet * (ratio < _FEET))
@@ -212,12 +261,17 @@ def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
 def _unit_option(scale: float, given: float) -> str:
     unit = next((unit for unit in Unit if unit.metres == scale), None)
     return (
-        f"{'--model-unit m ' * (given != 1.0)}--model-scale {scale:g}" if unit is None else f"--model-unit {unit.value}"
+        f"{'--model-unit m ' * (given != 1.0)}--model-scale {scale:g}"
+        if unit is None
+        else f"--model-unit {unit.value}"
     )
 
 
 def _units(ratio: float, given: float) -> list[float]:
-    """Units in which the model has the size of the scans, best first; ``ratio`` is that with the ``given`` unit."""
+    """Units in which the model has the size of the scans, best first.
+
+    ``ratio`` is that with the ``given`` unit.
+    """
     low, high = _ONE_SIDE
     fitting = [scale for scale in _UNITS if scale != given and low <= ratio * given / scale <= high]
     return sorted(fitting, key=lambda scale: abs(np.log(ratio * given / scale / 0.9)))
@@ -226,7 +280,9 @@ def _units(ratio: float, given: float) -> list[float]:
 def _grouped_units(
     clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, given: float, most: float = np.inf
 ) -> dict[float, Sequence[Array]]:
-    """Units, at most ``most`` times the given one, in which groups of points in most scans have the model's size."""
+    """Units, at most ``most`` times the given one, in which groups of points in most scans have the
+    model's size.
+    """
     units = dict[float, Sequence[Array]]()
     for scale in _UNITS:
         factor = scale / given
@@ -254,12 +310,17 @@ def _groups(clouds: Sequence[NDArray[Any]], size_m: float) -> list[Array]:
 
 
 def _unit_advice(
-    units: Mapping[float, Sequence[Array]], clouds: Sequence[NDArray[Any]], surface: Surface, given: float, said: str
+    units: Mapping[float, Sequence[Array]],
+    clouds: Sequence[NDArray[Any]],
+    surface: Surface,
+    given: float,
+    said: str,
 ) -> list[Advice]:
     """The unit, and the crop around its groups of points; empty if it is the given one.
 
-    The registration decides: the unit is that in which most scans fit the model, the first of equal ones. If no scan
-    fits it, the text says so, because an object of another size fits some unit, too.
+    The registration decides: the unit is that in which most scans fit the model, the first of equal
+    ones. If no scan fits it, the text says so, because an object of another size fits some unit,
+    too.
     """
     few = _few(clouds)
     once = RegisterParams(index_cache=False)  # most of the units are wrong
@@ -281,18 +342,23 @@ def _fitting(clouds: Sequence[NDArray[Any]], registrar: Registrar) -> tuple[int,
 
 
 def _counts(found: Sequence[Alignment]) -> tuple[int, int]:
-    return sum(each.status is AlignStatus.ALIGNED for each in found), sum(each.measured for each in found)
+    return sum(each.status is AlignStatus.ALIGNED for each in found), sum(
+        each.measured for each in found
+    )
 
 
 def _of_size(model_m: float) -> str:
     return f"a group of points has the size of the model ({_metres(model_m)})"
 
 
-def _located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> list[Array]:
-    """The model's vertices where a search finds them in the scans; empty if they are found in less than half of them.
+def _located(
+    clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None
+) -> list[Array]:
+    """The model's vertices where a search finds them in the scans; empty if they are found in less
+    than half of them.
 
-    The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
-    does not distinguish the target from other objects.
+    The search looks at the connected parts of the scan with the size of the model, and tests every
+    pose: size alone does not distinguish the target from other objects.
     """
     registrar, found = registrar or Registrar(surface), []
     for k, cloud in enumerate(clouds):
@@ -304,11 +370,19 @@ def _located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Regist
     return found
 
 
-def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str) -> Advice | None:
-    """The crop that keeps the target in all examined scans; None if hardly any point lies outside it."""
+def _crop_advice(
+    clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str
+) -> Advice | None:
+    """The crop that keeps the target in all examined scans.
+
+    None if hardly any point lies outside it.
+    """
     margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
-    low, high = max(min(r.min() for r in ranges) - margin, 0.0), max(r.max() for r in ranges) + margin
+    low, high = (
+        max(min(r.min() for r in ranges) - margin, 0.0),
+        max(r.max() for r in ranges) + margin,
+    )
     everything = np.concatenate([np.asarray(cloud, dtype=np.float64) for cloud in clouds])
     away = np.linalg.norm(everything, axis=1)
     by_range = (away >= low) & (away <= high)

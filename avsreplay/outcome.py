@@ -1,7 +1,7 @@
 """The typed result of one scan: plan, outcome of the pipeline, and score against ground truth.
 
-``pipeline.step`` makes the Outcome without access to ground truth; ``score.Scorer`` makes the Score afterwards;
-``rows.Row.of`` turns the two into columns.
+``pipeline.step`` makes the Outcome without access to ground truth; ``score.Scorer`` makes the Score
+afterwards; ``rows.Row.of`` turns the two into columns.
 """
 
 from __future__ import annotations
@@ -37,27 +37,33 @@ class PlanStatus(Enum):
 
 @value_class
 class Plan:
-    """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
+    """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max
+    (eq:terminal).
 
     Attributes:
-        t_ns: Instant of planning.  t_go_s: Time from it to the capture [s], NaN where there is none.
-        costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
-            ``thrust``.
-        a_max: Bound on the thrust, or its constant magnitude where the turn of the gripper delays the capture [m/s2].
+        t_ns: Instant of planning.
+        t_go_s: Time from it to the capture [s], NaN where there is none.
+        costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm;
+            NaN for a plan with ``thrust``.
+        a_max: Bound on the thrust, or its constant magnitude where the turn of the gripper delays
+            the capture [m/s2].
         lower_bound_s: Certified lower bound of t_go_s [s].
         position_error_m, velocity_error_mps: Terminal errors of the propagated plan.
         u_max: Largest |u| found along the propagated plan [m/s2].
         latency_s: Coasting time before the thrust [s].
-        thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
-        violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without constraints.
-        margin_m, binding: Smallest margin of the geometric constraints along the plan [m], and the constraint with it;
-            NaN and "" without constraints.
-        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
-            without a clearance.
+        thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate
+            defines the thrust.
+        violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without
+            constraints.
+        margin_m, binding: Smallest margin of the geometric constraints along the plan [m], and the
+            constraint with it; NaN and "" without constraints.
+        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before
+            the corridor [m]; NaN without a clearance.
         steps: Number of steps of the search.
-        attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN where not planned.
-        delayed_by: What makes the capture later than the flight alone: "attitude" (the turn of the gripper), "arm" (the
-            joints); "" where nothing does.
+        attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN
+            where not planned.
+        delayed_by: What makes the capture later than the flight alone: "attitude" (the turn of the
+            gripper), "arm" (the joints); "" where nothing does.
     """
 
     t_ns: int
@@ -96,14 +102,17 @@ class MonitorReport:
 
     Attributes:
         ogm_rank: numerical rank of the scaled observability Gramian, at most 20.
-        ogm_log10_cond, ogm_log10_cond_scaled: log10 of its condition number as it is and scaled by the prior standard
-            deviations; None below full rank.
-        consistent: the innovations agree with their covariance; None before there are enough of them.
+        ogm_log10_cond, ogm_log10_cond_scaled: log10 of its condition number as it is and scaled by
+            the prior standard deviations; None below full rank.
+        consistent: the innovations agree with their covariance; None before there are enough of
+            them.
         violations: consistency checks that the estimate has failed so far.
-        nis_mean, autocorrelation: mean NIS and lag-1 autocorrelation of white innovations in the consistency window.
+        nis_mean, autocorrelation: mean NIS and lag-1 autocorrelation of white innovations in the
+            consistency window.
         converged: the planner may rely on the estimate.
-        covariance_converged, predictive_converged: every block of the covariance (the paper's criterion), or every
-            predicted standard deviation of the grasp point, is below its limit.
+        covariance_converged, predictive_converged: every block of the covariance (the paper's
+            criterion), or every predicted standard deviation of the grasp point, is below its
+            limit.
         unconverged: blocks whose covariance is above its limit.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
@@ -127,10 +136,13 @@ class BodyParameters:
     """Parameters of the target in {C}, independent of the order of the principal axes.
 
     Attributes:
-        inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
+        inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1
+            sigma of its entries.
         moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
-        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of trace.
-        limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without any information.
+        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma
+            by root of trace.
+        limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without
+            any information.
     """
 
     inertia: Array
@@ -149,19 +161,23 @@ class Outcome:
     """Result of the pipeline for one scan.
 
     Attributes:
-        scan: the scan itself.  start_ns: instant of the first scan of the replay.
+        scan: the scan itself.
+        start_ns: instant of the first scan of the replay.
         guess: where the initial guess of the registration came from.
-        alignment: the graded pose.  innovation: None where no pose was measured.
+        alignment: the graded pose.
+        innovation: None where no pose was measured.
         verdict: gamma and its reason.
         belief: estimate after the update.
         pose: estimated T_ac.
-        pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in {B} [rad].
+        pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in
+            {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
         sigma_hits: how often a bound of the inertia ratios limited the gain.
         r_floors: how often an eigenvalue of R was raised to its floor.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
-        manoeuvres: all changes of the target's velocity found so far.  drift: constant torque or force, if any.
+        manoeuvres: all changes of the target's velocity found so far.
+        drift: constant torque or force, if any.
         monitors: observability, consistency and convergence.
         action, supervisor_rule: command of the supervisor to the robot, and the rule that gave it.
         plan: capture plan in force, None before the first.
@@ -191,7 +207,10 @@ class Outcome:
 
 @value_class(eq=True)
 class PoseError:
-    """Difference of two poses: distance of their origins [m] and angle between their attitudes [deg]."""
+    """Difference of two poses.
+
+    Distance of their origins [m] and angle between their attitudes [deg].
+    """
 
     distance_m: float
     angle_deg: float
@@ -199,7 +218,10 @@ class PoseError:
 
 @value_class(eq=True)
 class CaptureError:
-    """Gripper against true grasp point at the planned instant; NaN where the truth is not known at that instant."""
+    """Gripper against true grasp point at the planned instant.
+
+    NaN where the truth is not known at that instant.
+    """
 
     distance_m: float
     speed_mps: float
@@ -211,10 +233,13 @@ class Score:
     """An outcome compared with ground truth; None where there is no truth for it.
 
     Attributes:
-        fault: label of the injected fault.  reference: "truth", or "fit" (a motion fitted to all healthy poses).
+        fault: label of the injected fault.
+        reference: "truth", or "fit" (a motion fitted to all healthy poses).
         estimate, registration: errors of the estimated and of the measured pose.
-        nees, nees_blocks: normalised estimation error squared, for the best order of the principal axes, and by block.
-        planned: error of a plan made at this scan at its planned instant.  captured: of a capture since the last scan.
+        nees, nees_blocks: normalised estimation error squared, for the best order of the principal
+            axes, and by block.
+        planned: error of a plan made at this scan at its planned instant.
+        captured: of a capture since the last scan.
     """
 
     fault: str | None = None

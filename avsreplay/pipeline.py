@@ -1,8 +1,9 @@
 """The processing chain: one scan in, one outcome out. Read ``step`` first.
 
-scan -> registration -> innovation -> verdict (gamma) -> estimate -> monitors -> guidance -> outcome. The predicted pose
-is the initial guess of the registration; that is the only feedback, apart from the convergence flag of the previous
-scan, which lets the filter take over from the batch fit. Nothing here has access to ground truth.
+scan -> registration -> innovation -> verdict (gamma) -> estimate -> monitors -> guidance ->
+outcome. The predicted pose is the initial guess of the registration; that is the only feedback,
+apart from the convergence flag of the previous scan, which lets the filter take over from the batch
+fit. Nothing here has access to ground truth.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry, monitor
+from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
 from avsreplay.estimate import Estimator, Prediction, Track, in_doubt, with_change
@@ -23,13 +24,24 @@ from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor import FaultDetector, Gramian
-from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations
+from avsreplay.monitor.convergence import (
+    Consistency,
+    ConsistencyTrack,
+    Convergence,
+    ConvergenceTrack,
+    violations,
+)
+from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.monitor.gramian import Gramian, from_trajectory, measure, observe
+from avsreplay.monitor.gramian import gramian as empty_gramian
 from avsreplay.outcome import MonitorReport, Outcome
-from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
-from avsreplay.plan.guidance import Segment
+from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
+from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
-from avsreplay.register import Registrar, SensorFrame, effort_after, measured_alignment
+from avsreplay.register.backend import measured_alignment
+from avsreplay.register.budget import effort_after
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.sensor_frame import SensorFrame
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -39,8 +51,10 @@ class Measurement:
     """A registered scan.
 
     Attributes:
-        alignment: the graded pose.  guess: start, truth, given, predicted, last, acquired; measured: pose of the log.
-        instants: (6, 6) mean instant for each direction [s] (``Registrar.instants``); None for the scan's instant.
+        alignment: the graded pose.
+        guess: start, truth, given, predicted, last, acquired; measured: pose of the log.
+        instants: (6, 6) mean instant for each direction [s] (``Registrar.instants``); None for the
+            scan's instant.
     """
 
     alignment: Alignment
@@ -50,7 +64,10 @@ class Measurement:
 
 @value_class
 class MonitorState:
-    """What the monitors carry from scan to scan; ``motion``: trajectory of the last fit, which the Gramian follows."""
+    """What the monitors carry from scan to scan; ``motion``.
+
+    Trajectory of the last fit, which the Gramian follows.
+    """
 
     gramian: Gramian
     consistency: ConsistencyTrack
@@ -72,7 +89,9 @@ class Monitors:
         Args:
             prior_1s: (20,) prior standard deviations of the error states.
         """
-        return MonitorState(monitor.gramian(prior_1s), self.consistency.initial(), self.convergence.initial())
+        return MonitorState(
+            empty_gramian(prior_1s), self.consistency.initial(), self.convergence.initial()
+        )
 
     def observe(
         self,
@@ -95,15 +114,22 @@ class Monitors:
             track: estimate after the scan.
             belief: what is published of it.
         """
-        healthy, seen = innovation if gamma else None, self.consistency.observe(state.consistency, innovation, gamma)
+        healthy, seen = (
+            innovation if gamma else None,
+            self.consistency.observe(state.consistency, innovation, gamma),
+        )
         motion, gramian = self._gramian(state, estimator, prior, healthy, track)
-        rank, window = monitor.measure(gramian), self.consistency.judge(seen, max(track.levels.common))
+        rank, window = measure(gramian), self.consistency.judge(seen, max(track.levels.common))
         found = estimator.residual_after(track, prior, healthy) if healthy else None
         failed = violations(track.belief, *found) if found else ()
-        consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
+        consistent = window.consistent and not (
+            track.window.many_outliers or in_doubt(track) or failed
+        )
         forecast = estimator.track_forecast(track, self.convergence.times_s)
         possible = with_change(forecast, belief, track.change_P)
-        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True, possible)
+        judged = self.convergence.judge(
+            state.convergence, belief, forecast, consistent is True, possible
+        )
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,
@@ -121,13 +147,20 @@ class Monitors:
         return MonitorState(gramian, seen, judged, state.violations + len(failed), motion), report
 
     def _gramian(
-        self, state: MonitorState, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
+        self,
+        state: MonitorState,
+        estimator: Estimator,
+        prior: Prediction,
+        healthy: Innovation | None,
+        track: Track,
     ) -> tuple[FittedMotion | None, Gramian]:
-        """The Gramian with one more scan, along the trajectory of the new fit where there is one."""
+        """The Gramian with one more scan, along the trajectory of the new fit where there is
+        one.
+        """
         if (seen := estimator.refitted_rows(track)) is not None:
-            return seen[0], monitor.from_trajectory(state.gramian.scale, *seen[1])
+            return seen[0], from_trajectory(state.gramian.scale, *seen[1])
         motion, row = estimator.gramian_row(track, prior, healthy, state.motion)
-        return motion, monitor.observe(state.gramian, *row)
+        return motion, observe(state.gramian, *row)
 
 
 @value_class
@@ -158,9 +191,12 @@ class PipelineState:
     """What is carried from scan to scan.
 
     Attributes:
-        guidance: plan in force and robot.  track: the estimate.  Both are None before the first scan.
-        last_pose: last healthy measured pose, None before one.  failed: scans with points before that pose.
-        origin: where the first pose came from.  start_ns: instant of the first scan.
+        guidance: plan in force and robot.
+        track: the estimate.  Both are None before the first scan.
+        last_pose: last healthy measured pose, None before one.
+        failed: scans with points before that pose.
+        origin: where the first pose came from.
+        start_ns: instant of the first scan.
     """
 
     monitors: MonitorState
@@ -194,17 +230,25 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
     prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
     if acquired is None and not verdict.gamma and _prediction_lost(stages, scan, predicted):
-        measurement = _acquire(stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired")
+        measurement = _acquire(
+            stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired"
+        )
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
-    track, verdict = stages.estimator.step(track, prior, innovation, verdict, state.monitors.convergence.converged)
+    track, verdict = stages.estimator.step(
+        track, prior, innovation, verdict, state.monitors.convergence.converged
+    )
     gamma, used = verdict.gamma, measurement.alignment if verdict.gamma else None
-    track = track.changed(errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor))
+    track = track.changed(
+        errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor)
+    )
     seen = innovation, gamma, track, (belief := stages.estimator.published(track))
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track)
-        known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
+        known = planner_input(
+            stages.estimator, belief, stages.target, gamma, report.converged, forecast
+        )
         guidance = stages.guidance.step(guidance, known)
     outcome = Outcome(
         scan=scan,
@@ -230,10 +274,15 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     )
     pose = measurement.alignment.T_ac if gamma else state.last_pose
     failed = state.failed + (measurement.alignment.points > 0) if pose is None else 0
-    return PipelineState(monitors, guidance, track, pose, state.origin, state.start_ns, failed), outcome
+    return (
+        PipelineState(monitors, guidance, track, pose, state.origin, state.start_ns, failed),
+        outcome,
+    )
 
 
-def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterator[tuple[PipelineState, Outcome]]:
+def fold(
+    stages: Stages, state: PipelineState, scans: Iterable[Scan]
+) -> Iterator[tuple[PipelineState, Outcome]]:
     """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log."""
     for scan in scans:
         state, outcome = step(stages, state, scan)
@@ -241,7 +290,8 @@ def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterato
 
 
 def planned_segment(state: PipelineState) -> Segment | None:
-    """Return the flight of the capture plan made at the last scan; None where none was made or none is flown.
+    """Return the flight of the capture plan made at the last scan; None where none was made or none
+    is flown.
 
     Args:
         state: state after that scan.
@@ -252,82 +302,135 @@ def planned_segment(state: PipelineState) -> Segment | None:
     return guidance.segment if guidance.plan.t_ns == track.belief.t_ns else None
 
 
-def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineState, Track, Measurement | None]:
-    """The track so far, or a new one at the first scan. An acquired start is repeated until a scan is healthy."""
-    if state.track is not None and not (state.origin in ("acquired", "measured") and state.last_pose is None):
+def _track(
+    stages: Stages, state: PipelineState, scan: Scan
+) -> tuple[PipelineState, Track, Measurement | None]:
+    """The track so far, or a new one at the first scan.
+
+    An acquired start is repeated until a scan is healthy.
+    """
+    if state.track is not None and not (
+        state.origin in ("acquired", "measured") and state.last_pose is None
+    ):
         return state, state.track, None
     pose, origin = stages.initialise(scan)
     measurement = None
     if pose is None:
         measurement = _acquire(stages, state, scan, scan.points, origin)
         pose = measurement.alignment.T_ac
-    state = replace(state, origin=origin, start_ns=scan.t_ns if state.track is None else state.start_ns)
+    state = replace(
+        state, origin=origin, start_ns=scan.t_ns if state.track is None else state.start_ns
+    )
     return state, stages.estimator.initial(scan.t_ns, pose, measurement is not None), measurement
 
 
-def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> Measurement:
+def _register(
+    stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction
+) -> Measurement:
     """Register the scan from the configured guess; a measured pose is taken as it is."""
     if scan.pose is not None:
         return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
-    guess, origin = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac, "predicted"
+    guess, origin = (
+        stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac,
+        "predicted",
+    )
     if state.last_pose is None:
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
     effort, carried = effort_after(state.failed), points is not scan.points
-    unknown = None if state.track is None else stages.estimator.frame.motions_out(state.track.undetermined)
-    found = SensorFrame(stages.registrar, scan.sensor).register(points, guess, scan.seq, carried, effort, unknown)
+    unknown = (
+        None
+        if state.track is None
+        else stages.estimator.frame.motions_out(state.track.undetermined)
+    )
+    found = SensorFrame(stages.registrar, scan.sensor).register(
+        points, guess, scan.seq, carried, effort, unknown
+    )
     return _measurement(stages, scan, points, found, origin)
 
 
-def _acquire(stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
+def _acquire(
+    stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str
+) -> Measurement:
     """Register the scan without a guess."""
     found = SensorFrame(stages.registrar, scan.sensor).acquire(points, effort_after(state.failed))
     return _measurement(stages, scan, points, found, origin)
 
 
-def _measurement(stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str) -> Measurement:
+def _measurement(
+    stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str
+) -> Measurement:
     if scan.times_s is None or not (stages.deskew and alignment.measured):
         return Measurement(alignment, origin)
-    instants = SensorFrame(stages.registrar, scan.sensor).instants(points, scan.times_s, alignment.T_ac)
+    instants = SensorFrame(stages.registrar, scan.sensor).instants(
+        points, scan.times_s, alignment.T_ac
+    )
     return Measurement(alignment, origin, instants)
 
 
 def _judge(
     stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
 ) -> tuple[Prediction, Innovation | None, Verdict]:
-    """The prior at the instant of the measurement, the innovation (None: nothing measured) and the verdict."""
+    """The prior at the instant of the measurement, the innovation (None.
+
+    Nothing measured) and the verdict.
+    """
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
     alignment = measurement.alignment
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
-    return predicted, innovation, stages.faults.judge(scan.status, alignment, innovation, predicted.belief)
+    return (
+        predicted,
+        innovation,
+        stages.faults.judge(scan.status, alignment, innovation, predicted.belief),
+    )
 
 
 def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
-    """Whether 3 standard deviations of the predicted pose exceed a quarter of the registration's reach, or 15 deg."""
+    """Whether 3 standard deviations of the predicted pose exceed a quarter of the registration's
+    reach, or 15 deg.
+    """
     if not stages.reacquire or not len(scan.points):
         return False
     variance = np.diag(predicted.H @ predicted.belief.P @ predicted.H.T)
-    position, angle = 3.0 * np.sqrt(variance[:3].sum()), 6.0 * np.sqrt(variance[3:].sum())  # P holds half angles
-    return bool(position > MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m or angle > MAX_ATTITUDE_3S_RAD)
+    position, angle = (
+        3.0 * np.sqrt(variance[:3].sum()),
+        6.0 * np.sqrt(variance[3:].sum()),
+    )  # P holds half angles
+    return bool(
+        position > MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m
+        or angle > MAX_ATTITUDE_3S_RAD
+    )
 
 
-def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:
-    """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
+def _deskewed(
+    stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction
+) -> NDArray[Any]:
+    """The points at the scan's instant.
+
+    Moved by the predicted motion where they have times and a motion is known.
+    """
     if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
-    return deskew(scan.points, scan.times_s, stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns))
+    return deskew(
+        scan.points, scan.times_s, stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns)
+    )
 
 
 Forecaster = Callable[[Array], Forecast]
 """Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point without measurements."""
 
 
-def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster) -> Scene:
-    """Return the predicted target after a belief, as the planner uses it: estimate and forecast, never the truth."""
+def target_scene(
+    estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
+) -> Scene:
+    """Return the predicted target after a belief, as the planner uses it.
+
+    Estimate and forecast, never the truth.
+    """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
         return (predicted := forecast(times_s)).pos_1s_m, predicted.rot_1s_rad
@@ -344,7 +447,14 @@ def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, f
 
 
 def planner_input(
-    estimator: Estimator, belief: Belief, target: TargetGeometry, gamma: int, converged: bool, forecast: Forecaster
+    estimator: Estimator,
+    belief: Belief,
+    target: TargetGeometry,
+    gamma: int,
+    converged: bool,
+    forecast: Forecaster,
 ) -> PlannerInput:
     """Return the input of guidance after a scan."""
-    return PlannerInput(belief.t_ns, gamma, converged, target_scene(estimator, belief, target, forecast), forecast)
+    return PlannerInput(
+        belief.t_ns, gamma, converged, target_scene(estimator, belief, target, forecast), forecast
+    )

@@ -1,4 +1,7 @@
-"""Checks before a run: model, scans, truth, transforms and time stamps, each with the option to add."""
+"""Checks before a run.
+
+Model, scans, truth, transforms and time stamps, each with the option to add.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +15,31 @@ from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
 from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.model_size import Advice, compare_sizes, find_model
 from avsreplay.records import Scan, ScanStatus, Surface
-from avsreplay.register import Registrar, SensorFrame
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.sensor_frame import SensorFrame
 
 SCANS = 5
-OFF_THE_MODEL = 0.25  # distance of the grasp point from the bounding box, in extents, above which it is reported
+# distance of the grasp point from the bounding box, in extents, above which it is reported
+OFF_THE_MODEL = 0.25
 _POSES, _PAIRS = 200, 50  # measured poses, and pairs of successive ones, that are examined
 LARGEST_STEP = 0.25  # from one pose to the next, over the extent (docs/poses.md)
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 
 
 def preflight(
-    source: Source, surface: Surface | None, registrar: Registrar | None = None, *, search: bool = False
+    source: Source,
+    surface: Surface | None,
+    registrar: Registrar | None = None,
+    *,
+    search: bool = False,
 ) -> list[Advice]:
     """Check a log and a model before a run.
 
     Args:
         source: open log; at most five scans spread over it are read.
         surface: model of the target, None if there is none.
-        registrar: of the model; with it the share of points on the model is measured where the first pose is known.
+        registrar: of the model; with it the share of points on the model is measured where the
+            first pose is known.
         search: look for the model in some of the scans.
 
     Returns:
@@ -39,10 +49,18 @@ def preflight(
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
     if source.options.poses:
         return [*_poses(source, surface), *_grasp_point(surface), *general]
-    found = [*_contents(source, scans, surface, registrar, search), *_faces(surface), *_grasp_point(surface), *general]
+    found = [
+        *_contents(source, scans, surface, registrar, search),
+        *_faces(surface),
+        *_grasp_point(surface),
+        *general,
+    ]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
-        text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
+        text = (
+            f"{100 * share:.0f} % of the points of the first scan are on the model at the first"
+            " pose"
+        )
         found.insert(1, Advice("ok" if share >= 0.5 else "check", "points on the model", text))
     return found
 
@@ -58,7 +76,9 @@ def _grasp_point(surface: Surface | None) -> list[Advice]:
     """Whether the grasp point, the origin of {C}, is far outside of the model's bounding box."""
     if surface is None or not surface.sha256:
         return []
-    outside = np.maximum(np.maximum(surface.vertices.min(axis=0), -surface.vertices.max(axis=0)), 0.0)
+    outside = np.maximum(
+        np.maximum(surface.vertices.min(axis=0), -surface.vertices.max(axis=0)), 0.0
+    )
     distance = float(np.linalg.norm(outside))
     if distance <= OFF_THE_MODEL * surface.extent:
         return []
@@ -77,28 +97,47 @@ def _spread(count: int, most: int) -> list[int]:
 
 
 def _contents(
-    source: Source, scans: Sequence[Scan], surface: Surface | None, registrar: Registrar | None, search: bool
+    source: Source,
+    scans: Sequence[Scan],
+    surface: Surface | None,
+    registrar: Registrar | None,
+    search: bool,
 ) -> list[Advice]:
-    """Scans that cannot be decoded, with the reason, and the size of those with at least ten points."""
-    broken, clouds = [s for s in scans if s.status is ScanStatus.DAMAGED], list(map(source.in_own_frame, scans))
+    """Scans that cannot be decoded, with the reason, and the size of those with at least ten
+    points.
+    """
+    broken, clouds = (
+        [s for s in scans if s.status is ScanStatus.DAMAGED],
+        list(map(source.in_own_frame, scans)),
+    )
     finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
-    found = [] if broken and len(broken) == len(scans) else compare_sizes(finite, surface, registrar, source.options)
+    found = (
+        []
+        if broken and len(broken) == len(scans)
+        else compare_sizes(finite, surface, registrar, source.options)
+    )
     if not finite and (dropped := max((scan.dropped_points for scan in scans), default=0)):
         text = (
-            f"the {dropped} points of a scan are not finite or have coordinates above {MAX_COORDINATE_M:.0e} m:"
-            " transform them to a frame near the sensor"
+            f"the {dropped} points of a scan are not finite or have coordinates above"
+            f" {MAX_COORDINATE_M:.0e} m: transform them to a frame near the sensor"
         )
         return [Advice("fail", "scans", text)]
     if search and surface is not None and finite and found:
         found += find_model(finite, surface, found, source.options)
     if broken:
-        text = f"{len(broken)} of {len(scans)} examined scans cannot be used, the first: {broken[0].note}"
+        text = (
+            f"{len(broken)} of {len(scans)} examined scans cannot be used, the first:"
+            f" {broken[0].note}"
+        )
         found.insert(0, Advice("check" if found else "fail", "scans", text))
     return found
 
 
 def _poses(source: Source, surface: Surface | None) -> list[Advice]:
-    """Measured poses: how many of a sample are valid, where their covariance comes from, and the size of the target."""
+    """Measured poses.
+
+    How many of a sample are valid, where their covariance comes from, and the size of the target.
+    """
     found = [source.scan_at(seq) for seq in _spread(len(source), _POSES)]
     bad = [scan for scan in found if scan.pose is None]
     out = [Advice("ok", "poses", f"{len(source)} measured poses")]
@@ -117,7 +156,14 @@ def _poses(source: Source, surface: Surface | None) -> list[Advice]:
     if surface is not None and not surface.sha256:
         text = f"no model: limits are those of a target of {surface.extent:.3g} m"
         given = source.options.extent_m != SourceOptions().extent_m
-        out.append(Advice("ok" if given else "check", "size", text, "" if given else "--extent METRES or --model FILE"))
+        out.append(
+            Advice(
+                "ok" if given else "check",
+                "size",
+                text,
+                "" if given else "--extent METRES or --model FILE",
+            )
+        )
     return out
 
 
@@ -125,26 +171,40 @@ def _step(source: Source, surface: Surface | None) -> list[Advice]:
     """The motion from one pose to the next, where it is too large for a target of this size."""
     if surface is None:
         return []
-    pairs = [(source.scan_at(seq).pose, source.scan_at(seq + 1).pose) for seq in _spread(len(source) - 1, _PAIRS)]
-    steps = [float(np.linalg.norm(b.T_ac.t - a.T_ac.t)) for a, b in pairs if a is not None and b is not None]
+    pairs = [
+        (source.scan_at(seq).pose, source.scan_at(seq + 1).pose)
+        for seq in _spread(len(source) - 1, _PAIRS)
+    ]
+    steps = [
+        float(np.linalg.norm(b.T_ac.t - a.T_ac.t))
+        for a, b in pairs
+        if a is not None and b is not None
+    ]
     step = float(np.median(steps)) if steps else 0.0
     if step <= LARGEST_STEP * surface.extent:
         return []
     text = (
-        f"the target moves {step:.3g} m from one pose to the next, {step / surface.extent:.2g} times its size"
-        f" ({LARGEST_STEP:g} is the most): check the size and the unit; a column named 'x [mm]' is in millimetres,"
-        " all other positions in metres"
+        f"the target moves {step:.3g} m from one pose to the next, {step / surface.extent:.2g}"
+        f" times its size ({LARGEST_STEP:g} is the most): check the size and the unit; a column"
+        " named 'x [mm]' is in millimetres, all other positions in metres"
     )
     return [Advice("fail", "unit", text)]
 
 
 def _share_on_model(source: Source, registrar: Registrar) -> float | None:
-    """Share of the first scan's points on the model, registered from its known pose; None without either."""
+    """Share of the first scan's points on the model, registered from its known pose.
+
+    None without either.
+    """
     if not len(source) or len((scan := source.scan_at(0)).points) < 10:
         return None
     start, truth = source.header.start, source.truth_of(scan).pose
     pose = start.x.T_ac if start is not None else truth
-    return None if pose is None else SensorFrame(registrar, scan.sensor).register(scan.points, pose).inlier_ratio
+    return (
+        None
+        if pose is None
+        else SensorFrame(registrar, scan.sensor).register(scan.points, pose).inlier_ratio
+    )
 
 
 def _transforms(info: LogInfo, source: Source) -> list[Advice]:
@@ -158,7 +218,13 @@ def _transforms(info: LogInfo, source: Source) -> list[Advice]:
         text = f"the frame of the clouds, '{shown(frame)}', moves in '{shown(root)}'"
         return [Advice("check", "transforms", text, f"--fixed-frame {shown(root)}")]
     fixed = source.options.fixed_frame
-    return [Advice("ok", "transforms", names if fixed is None else f"{names}; clouds are moved to '{shown(fixed)}'")]
+    return [
+        Advice(
+            "ok",
+            "transforms",
+            names if fixed is None else f"{names}; clouds are moved to '{shown(fixed)}'",
+        )
+    ]
 
 
 def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]:
@@ -171,7 +237,9 @@ def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]
         others = f" (or {', '.join(names[1:3])})" if names[1:] else ""
         text = f"no truth is selected, but the log has poses{others}"
         return [Advice("ok", "truth", text, f"--truth-topic {names[0]}")]
-    return [Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")]
+    return [
+        Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")
+    ]
 
 
 def _clock(info: LogInfo) -> list[Advice]:
@@ -179,7 +247,10 @@ def _clock(info: LogInfo) -> list[Advice]:
     if clock is None:
         return []
     if not info.topics and info.notes.get("times", "").startswith(NO_TIMES):
-        text = f"the files hold no time stamps: {ASSUMED_HZ:g} Hz is assumed, on which all velocities depend"
+        text = (
+            f"the files hold no time stamps: {ASSUMED_HZ:g} Hz is assumed, on which all velocities"
+            " depend"
+        )
         return [Advice("check", "time stamps", text, "--rate HZ")]
     problems = [
         f"{count} {'jump' if (count, name) == (1, 'jumps') else name}"
@@ -187,7 +258,11 @@ def _clock(info: LogInfo) -> list[Advice]:
         if (count := getattr(clock, name))
     ]
     if not problems:
-        text = f"median period {clock.period_s:.4g} s" if clock.period_s else "no period: a single scan"
+        text = (
+            f"median period {clock.period_s:.4g} s"
+            if clock.period_s
+            else "no period: a single scan"
+        )
         return [Advice("ok", "time stamps", text)]
     text = f"time stamps of scans: {', '.join(problems)}"
     if not info.topics:  # files have no other clock

@@ -14,16 +14,11 @@ from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surf
 from avsreplay.log.options import lost_text
 from avsreplay.log.writer import ROOT_FRAME
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
-from avsreplay.simulate import (
-    EPOCH_NS,
-    Engine,
-    RecordedFault,
-    Scenario,
-    builtin_surface,
-    disturbed,
-    load_scenario,
-    simulate,
-)
+from avsreplay.simulate.rays import Engine
+from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
+from avsreplay.simulate.scenario import Scenario, load_scenario
+from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.target import builtin_surface
 
 Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
 """Shows progress: (scans, expected number or 0 if unknown) -> a context manager that yields the scans."""
@@ -31,7 +26,8 @@ Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordOptions:
-    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or source.
+    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or
+    source.
 
     Attributes:
         faults: injected into the scans, with labels.
@@ -51,12 +47,19 @@ class Recorded:
     """What a recording contains.
 
     Attributes:
-        path: the log.  scans: number of clouds.  points: total number of points.  empty: clouds without points.
+        path: the log.
+        scans: number of clouds.
+        points: total number of points.
+        empty: clouds without points.
         damaged: scans of the source that could not be used and were omitted.
-        span_s: time from first to last scan.  bytes: file size.  model: name of the model, None without.
-        faults: labels as (kind, start [s], end [s] after the first scan, harmful), without those outside of the
-            recording.  losses: of the source.
-        note: a remark for the user.  lost: what of the source could not be read.  Both are empty if there is nothing.
+        span_s: time from first to last scan.
+        bytes: file size.
+        model: name of the model, None without.
+        faults: labels as (kind, start [s], end [s] after the first scan, harmful), without those
+            outside of the recording.
+        losses: of the source.
+        note: a remark for the user.
+        lost: what of the source could not be read.  Both are empty if there is nothing.
     """
 
     path: str
@@ -86,7 +89,8 @@ def record(
     """Record a source to a log.
 
     Args:
-        source: None for the built-in scenario, a scenario (.toml), or a recorded source (bag, log, folder).
+        source: None for the built-in scenario, a scenario (.toml), or a recorded source (bag, log,
+            folder).
         output: log to write (.mcap).
         seed: replaces the seed of the scenario.
         options: how to write.
@@ -97,15 +101,23 @@ def record(
         What was written.
 
     Raises:
-        UsageError: an option does not apply to this kind of source, or a value in the scenario is invalid.
+        UsageError: an option does not apply to this kind of source, or a value in the scenario is
+            invalid.
         UnreadableInput: the scenario, the model or the source cannot be read.
     """
     options = options or RecordOptions()
     if source is None or source.suffix.lower() == ".toml":
         duration_s = None if reading is None else reading.duration_s
         if reading is not None and reading != SourceOptions(duration_s=duration_s):
-            hint = "leave out the options that read a recorded source; --duration and --seed apply to a scenario"
-            raise UsageError("a scenario has no topics or files to read", where=str(source or "record"), hint=hint)
+            hint = (
+                "leave out the options that read a recorded source; --duration and --seed apply to"
+                " a scenario"
+            )
+            raise UsageError(
+                "a scenario has no topics or files to read",
+                where=str(source or "record"),
+                hint=hint,
+            )
         return record_scenario(load_scenario(source, seed, duration_s), output, options, ticker)
     if seed is not None and not options.faults:
         hint = "leave out --seed; it is used with --fault only"
@@ -114,7 +126,8 @@ def record(
 
 
 def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = False) -> Surface:
-    """Return the model of a scenario: ``model`` if given, else the file it names, else its built-in shape.
+    """Return the model of a scenario: ``model`` if given, else the file it names, else its built-in
+    shape.
 
     Args:
         scenario: the scenario.
@@ -126,10 +139,16 @@ def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = 
         UsageError: the file holds no faces and ``cloud_ok`` is False.
     """
     path = model or scenario.model
-    return read_surface(path, cloud_ok) if path is not None else builtin_surface(scenario.params.target.shape)
+    return (
+        read_surface(path, cloud_ok)
+        if path is not None
+        else builtin_surface(scenario.params.target.shape)
+    )
 
 
-def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None) -> Recorded:
+def record_scenario(
+    scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None
+) -> Recorded:
     """Record a simulation; the ground truth is stamped with the true instants.
 
     Args:
@@ -139,26 +158,39 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
         ticker: shows progress.
     """
     meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
-    simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
+    simulation = simulate(
+        scenario, surface_for(scenario, options.model, options.cloud_model), meshes
+    )
     last_ns = EPOCH_NS + round((simulation.count - 1) * 1e9 / scenario.params.rate_hz)
-    header = _labelled(simulation.header, options, EPOCH_NS, moving=scenario.params.camera is not None)
+    header = _labelled(
+        simulation.header, options, EPOCH_NS, moving=scenario.params.camera is not None
+    )
     header, outside = _within(header, EPOCH_NS, last_ns)
     with (
         _writer(output, header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, EPOCH_NS)
-        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses)
+        tally = _fold(
+            pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses
+        )
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
     done = tally.recorded(output, writer.bytes, header)
-    return replace(done, note="; ".join(each for each in (slow if by_hand else "", outside) if each))
+    return replace(
+        done, note="; ".join(each for each in (slow if by_hand else "", outside) if each)
+    )
 
 
 def record_source(
-    source: Path, output: Path, reading: SourceOptions, options: RecordOptions, ticker: Ticker | None = None
+    source: Path,
+    output: Path,
+    reading: SourceOptions,
+    options: RecordOptions,
+    ticker: Ticker | None = None,
 ) -> Recorded:
-    """Record the scans, ground truth, labels and model of a source, stamped with the selected clock.
+    """Record the scans, ground truth, labels and model of a source, stamped with the selected
+    clock.
 
     Args:
         source: log, bag or folder of scans.
@@ -169,22 +201,30 @@ def record_source(
 
     Raises:
         UsageError: the output is the source or cannot be written, or an option is invalid.
-        UnreadableInput: the source or the model cannot be read, a part is lost and ``reading`` is strict, or the output
-            cannot be written.
+        UnreadableInput: the source or the model cannot be read, a part is lost and ``reading`` is
+            strict, or the output cannot be written.
     """
     if output != STDOUT and output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
     reading = replace(
-        reading, model=options.model or reading.model, cloud_model=options.cloud_model or reading.cloud_model
+        reading,
+        model=options.model or reading.model,
+        cloud_model=options.cloud_model or reading.cloud_model,
     )
     with open_source(source, reading) as opened:
         epoch_ns = opened.scan_at(0).log_ns if len(opened) else 0
         moved = opened.options.fixed_frame is not None or opened.options.sensor_topic is not None
         header, due = _labelled(opened.header, options, epoch_ns, moving=moved), opened.info().scans
         header = replace(header, sensor_at_stamp=moved)
-        header, outside = _within(header, epoch_ns, opened.scan_at(len(opened) - 1).log_ns if len(opened) else 0)
-        with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
-            # registration and faults need the position of the sensor: a log holds its frame and its poses
+        header, outside = _within(
+            header, epoch_ns, opened.scan_at(len(opened) - 1).log_ns if len(opened) else 0
+        )
+        with (
+            _writer(output, header, options) as writer,
+            _ticked(ticker, opened.scans(), due) as scans,
+        ):
+            # registration and faults need the position of the sensor: a log holds its frame and its
+            # poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
             tally = _fold(
@@ -195,9 +235,16 @@ def record_source(
                 camera_of=lambda s: [(0, s.sensor)] if s.sensor else [],
             )
         lost = lost_text(opened.losses, opened.damaged, len(opened))
-        done = replace(tally.recorded(output, writer.bytes, header, tuple(opened.losses)), lost=lost)
-        frame = f"scans are in the frame of the sensor, which moves in '{ROOT_FRAME}'; a replay transforms them to it"
-        return replace(done, note="; ".join(each for each in (frame if moved else "", outside) if each))
+        done = replace(
+            tally.recorded(output, writer.bytes, header, tuple(opened.losses)), lost=lost
+        )
+        frame = (
+            f"scans are in the frame of the sensor, which moves in '{ROOT_FRAME}'; a replay"
+            " transforms them to it"
+        )
+        return replace(
+            done, note="; ".join(each for each in (frame if moved else "", outside) if each)
+        )
 
 
 @dataclass(slots=True)
@@ -219,7 +266,9 @@ class _Tally:
         self.points += len(scan.points)
         self.empty += not len(scan.points)
 
-    def recorded(self, output: Path, size: int, header: LogHeader, losses: tuple[Loss, ...] = ()) -> Recorded:
+    def recorded(
+        self, output: Path, size: int, header: LogHeader, losses: tuple[Loss, ...] = ()
+    ) -> Recorded:
         return Recorded(
             path=str(output),
             scans=self.scans,
@@ -246,7 +295,8 @@ def _fold(
     true_clock: bool,
     camera_of: Callable[[Scan], list[tuple[int, Pose]]],
 ) -> _Tally:
-    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or None).
+    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or
+    None).
 
     ``camera_of`` gives the poses of a moving camera, each with the time after the stamp [ns].
     """
@@ -261,7 +311,9 @@ def _fold(
         writer.write(scan)
         truth = truth_of(before)
         if truth.pose is not None:
-            writer.write_truth(before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state)
+            writer.write_truth(
+                before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state
+            )
         for after_ns, camera in camera_of(before):
             stamp_ns = before.log_ns if true_clock else before.t_ns
             writer.write_camera(before.log_ns + after_ns, stamp_ns + after_ns, camera)
@@ -269,17 +321,24 @@ def _fold(
     return tally
 
 
-def _labelled(header: LogHeader, options: RecordOptions, epoch_ns: int, *, moving: bool) -> LogHeader:
-    """The header with the labels of the injected faults, the seed of their random numbers, and the fixed frame."""
+def _labelled(
+    header: LogHeader, options: RecordOptions, epoch_ns: int, *, moving: bool
+) -> LogHeader:
+    """The header with the labels of the injected faults, the seed of their random numbers, and the
+    fixed frame.
+    """
     header = replace(header, fixed_frame=ROOT_FRAME if moving else "")
     if not options.faults:
         return header
     labels = (*header.labels, *(fault.label(epoch_ns) for fault in options.faults))
-    return replace(header, labels=labels, notes={**header.notes, "fault_seed": str(options.fault_seed)})
+    return replace(
+        header, labels=labels, notes={**header.notes, "fault_seed": str(options.fault_seed)}
+    )
 
 
 def _within(header: LogHeader, first_ns: int, last_ns: int) -> tuple[LogHeader, str]:
-    """Return the header without the faults that begin after the last scan or end before the first, and a remark.
+    """Return the header without the faults that begin after the last scan or end before the first,
+    and a remark.
 
     Args:
         header: header with the labels of all faults.
@@ -291,7 +350,10 @@ def _within(header: LogHeader, first_ns: int, last_ns: int) -> tuple[LogHeader, 
     if not left:
         return header, ""
     kept = tuple(label for label, kept in zip(header.labels, inside, strict=True) if kept)
-    return replace(header, labels=kept), f"faults outside of the recording are left out: {', '.join(left)}"
+    return (
+        replace(header, labels=kept),
+        f"faults outside of the recording are left out: {', '.join(left)}",
+    )
 
 
 def _with_faults(
@@ -307,5 +369,7 @@ def _writer(output: Path, header: LogHeader, options: RecordOptions) -> LogWrite
     return LogWriter(output, header, overwrite=options.overwrite, compression=options.compression)
 
 
-def _ticked(ticker: Ticker | None, scans: Iterable[Scan], due: int) -> AbstractContextManager[Iterator[Scan]]:
+def _ticked(
+    ticker: Ticker | None, scans: Iterable[Scan], due: int
+) -> AbstractContextManager[Iterator[Scan]]:
     return ticker(scans, due) if ticker else nullcontext(iter(scans))

@@ -1,7 +1,8 @@
 """The data types that the stages exchange: value classes with read-only float64 arrays.
 
-Frames: {A} camera (inertial), {B} principal axes at the target's centre of mass, {C} grapple fixture, which is
-also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and radians; instants are ``t_ns`` [ns].
+Frames: {A} camera (inertial), {B} principal axes at the target's centre of mass, {C} grapple
+fixture, which is also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and
+radians; instants are ``t_ns`` [ns].
 """
 
 from __future__ import annotations
@@ -27,8 +28,19 @@ BLOCKS: Mapping[str, slice] = {
     "varrho": slice(14, 17),  # [m], {B}
     "mu": slice(17, 20),  # dmu_v, half angle, {B}
 }  # the 20 error states by name, in the order of every covariance
-_SIZES = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}  # parts of a state
-_STATE = {name: (end - n, end) for (name, n), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)}
+_SIZES = {
+    "q_ab": 4,
+    "w_b": 3,
+    "r_a": 3,
+    "v_a": 3,
+    "sigma": 2,
+    "c_b": 3,
+    "q_bc": 4,
+}  # parts of a state
+_STATE = {
+    name: (end - n, end)
+    for (name, n), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)
+}
 
 
 class ScanStatus(Enum):
@@ -52,7 +64,9 @@ class AlignStatus(Enum):
     AMBIGUOUS = "ambiguous"  # global search: a second pose fits as well
     FAILED = "failed"  # the back end raised an error or its pose is not finite
     IMPLAUSIBLE = "implausible"  # the scan contradicts the pose (register.plausibility)
-    BUDGET_EXHAUSTED = "budget_exhausted"  # implausible, and the work allowed for one scan was spent
+    BUDGET_EXHAUSTED = (
+        "budget_exhausted"  # implausible, and the work allowed for one scan was spent
+    )
 
 
 class Reason(Enum):
@@ -64,10 +78,16 @@ class Reason(Enum):
     NOT_CONVERGED = "not_converged"
     FEW_INLIERS = "few_inliers"
     FIT_ERROR = "fit_error"  # rms_m >= threshold
-    HALVES_DIFFER = "halves_differ"  # the poses from two halves of the scan differ by more than their errors
+    HALVES_DIFFER = (
+        "halves_differ"  # the poses from two halves of the scan differ by more than their errors
+    )
     POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
-    DOUBTFUL = "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
-    SENSOR_BIAS = "sensor_bias"  # the measured poses have a constant offset that motion does not explain
+    DOUBTFUL = (
+        "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
+    )
+    SENSOR_BIAS = (
+        "sensor_bias"  # the measured poses have a constant offset that motion does not explain
+    )
     CLOCK = "clock"  # the stamp steps back or jumps
 
 
@@ -76,8 +96,10 @@ class Surface:
     """A target model in {C}: a triangle mesh, or a point cloud if ``faces`` is empty.
 
     Attributes:
-        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, int32; outwards where they form a closed part.
-        name, sha256, data: of the file.  reversed: faces that were reversed on reading.
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices, int32; outwards where they form a closed part.
+        name, sha256, data: of the file.
+        reversed: faces that were reversed on reading.
     """
 
     vertices: Array
@@ -98,10 +120,15 @@ class State:
     """Motion and parameters of a target (eq:x): the mean to which the 20 error states refer.
 
     Attributes:
-        q_ab: (4,) attitude of {B}.  w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
-        r_a: (3,) centre of mass, rho_o [m].  v_a: (3,) its velocity [m/s].
-        sigma: (2,) inertia ratios.  c_b: (3,) fixture in {B}, varrho [m].  q_bc: (4,) mu, {C} to {B}.
-        flat: (22,) these numbers one after the other, of which the others are views: the state of the extension.
+        q_ab: (4,) attitude of {B}.
+        w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
+        r_a: (3,) centre of mass, rho_o [m].
+        v_a: (3,) its velocity [m/s].
+        sigma: (2,) inertia ratios.
+        c_b: (3,) fixture in {B}, varrho [m].
+        q_bc: (4,) mu, {C} to {B}.
+        flat: (22,) these numbers one after the other, of which the others are views: the state of
+            the extension.
     """
 
     q_ab: Array
@@ -115,7 +142,9 @@ class State:
     _T_ac: Pose | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._view(np.concatenate([frozen(getattr(self, name), b - a) for name, (a, b) in _STATE.items()]))
+        self._view(
+            np.concatenate([frozen(getattr(self, name), b - a) for name, (a, b) in _STATE.items()])
+        )
 
     @classmethod
     def of(cls, flat: Array) -> State:
@@ -132,7 +161,10 @@ class State:
 
     @property
     def T_ac(self) -> Pose:
-        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho; it is computed once."""
+        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho.
+
+        It is computed once.
+        """
         pose = self._T_ac or Pose.composed(self.q_ab, self.r_a, self.q_bc, self.c_b)
         object.__setattr__(self, "_T_ac", pose)
         return pose
@@ -159,10 +191,17 @@ class Scan:
     """One point cloud, or one measured pose, as the reader returns it.
 
     Attributes:
-        seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
-        points: (n, 3) finite, possibly strided, in {A} [m].  sensor: its pose in {A}; None: {A} is its own frame.
-        times_s, intensities, places: (n,) instant after ``t_ns`` [s], intensity, share of the message before; or None.
-        dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of them.
+        seq: index in the replay, from 0.
+        t_ns: instant on the selected clock.
+        log_ns: time of reception.
+        points: (n, 3) finite, possibly strided, in {A} [m].
+        sensor: its pose in {A}; None: {A} is its own frame.
+        times_s, intensities, places: (n,) instant after ``t_ns`` [s], intensity, share of the
+            message before; or None.
+        dropped_points: non-finite ones.
+        frame: of the message, or "".
+        note: what was wrong.
+        pose: in place of them.
     """
 
     seq: int
@@ -182,7 +221,10 @@ class Scan:
 
 @value_class
 class Truth:
-    """Ground truth at a scan, for scoring only: T_ac, full state and label of the injected fault, None if unknown."""
+    """Ground truth at a scan, for scoring only.
+
+    T_ac, full state and label of the injected fault, None if unknown.
+    """
 
     pose: Pose | None = None
     state: State | None = None
@@ -193,9 +235,10 @@ class Truth:
 class LogHeader:
     """The metadata of a log; with them it can be replayed without options.
 
-    Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults ``labels``, initial
-    belief ``start``, ``truth`` at the first scan, ``notes`` by name, ``fixed_frame`` of start, truth, poses ("": that
-    of clouds). ``sensor_at_stamp``: points with times are in the frame of the sensor at the stamp of their cloud.
+    Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults
+    ``labels``, initial belief ``start``, ``truth`` at the first scan, ``notes`` by name,
+    ``fixed_frame`` of start, truth, poses ("": that of clouds). ``sensor_at_stamp``: points with
+    times are in the frame of the sensor at the stamp of their cloud.
     """
 
     surface: Surface | None = None
@@ -214,8 +257,12 @@ class Fit:
     """What a back end returns.
 
     Attributes:
-        T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.  converged: its own flag.
-        matches: of ``IcpResult`` or None.  work: in point searches, 0: unknown.  rough: of a part of the scan only.
+        T_ca: pose that takes the scan {A} into the model {C}.
+        iterations: passes made.
+        converged: its own flag.
+        matches: of ``IcpResult`` or None.
+        work: in point searches, 0: unknown.
+        rough: of a part of the scan only.
     """
 
     T_ca: Pose
@@ -231,11 +278,17 @@ class Alignment:
     """A pose with its quality, measured in the same way for every back end (register.quality).
 
     Attributes:
-        T_ac: measured; ICP iterates its inverse.  well_off: of 1,000 points, those over two gates from the model.
-        info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
-        covariance: (6, 6) of d; None if degenerate.  dof: of it.  systematic: its part from errors of model and ranges.
-        message: why it failed or is not accepted.  free_directions: not determined, in words; free: columns d (6, k).
-        split_nis, size: see ``quality``; with the 1 sigma of the size.  size_1s: error of the size, until it is fitted.
+        T_ac: measured; ICP iterates its inverse.
+        well_off: of 1,000 points, those over two gates from the model.
+        info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d);
+            possibly singular.
+        covariance: (6, 6) of d; None if degenerate.
+        dof: of it.
+        systematic: its part from errors of model and ranges.
+        message: why it failed or is not accepted.
+        free_directions: not determined, in words; free: columns d (6, k).
+        split_nis, size: see ``quality``; with the 1 sigma of the size.
+        size_1s: error of the size, until it is fitted.
     """
 
     T_ac: Pose
@@ -271,7 +324,10 @@ class Alignment:
 
 @value_class
 class Belief:
-    """Mean x and covariance P (20, 20) of the error states at an instant; dq_v and dmu_v are HALF-angle vectors."""
+    """Mean x and covariance P (20, 20) of the error states at an instant.
+
+    Dq_v and dmu_v are HALF-angle vectors.
+    """
 
     t_ns: int
     x: State
@@ -286,9 +342,17 @@ class Innovation:
     """Innovation alpha = z - h(x-) of z = (rho, deta_v) [m, half angle] and its covariance.
 
     Attributes:
-        alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.  nis: alpha' S^-1 alpha.  distance_m: |d rho|.
-        angle_rad: rotation.  weight: Cauchy weight.  share: correlated part of R.  rms_m, free: of the alignment.
-        dof: degrees of freedom of R as an estimate, inf if known.  chi2: the NIS, T^2 of Hotelling, as chi-square.
+        alpha: (6,).
+        S: (6, 6) = H P H' + R.
+        R: (6, 6) noise used.
+        nis: alpha' S^-1 alpha.
+        distance_m: |d rho|.
+        angle_rad: rotation.
+        weight: Cauchy weight.
+        share: correlated part of R.
+        rms_m, free: of the alignment.
+        dof: degrees of freedom of R as an estimate, inf if known.
+        chi2: the NIS, T^2 of Hotelling, as chi-square.
     """
 
     alpha: Array
@@ -318,8 +382,11 @@ class Manoeuvre:
     """A change of the target's velocity that free motion does not explain.
 
     Attributes:
-        t_ns, t_1s_s: most likely instant, 1 sigma [s].  detected_ns: of the decision.  P: (6, 6) of (rate, velocity).
-        velocity, rate: (3,) change of the mass centre's velocity in {A} [m/s], and of the angular rate in {B} [rad/s].
+        t_ns, t_1s_s: most likely instant, 1 sigma [s].
+        detected_ns: of the decision.
+        P: (6, 6) of (rate, velocity).
+        velocity, rate: (3,) change of the mass centre's velocity in {A} [m/s], and of the angular
+            rate in {B} [rad/s].
     """
 
     t_ns: int
@@ -331,14 +398,19 @@ class Manoeuvre:
 
 
 class Drift(Manoeuvre):
-    """A constant acceleration since ``t_ns``: ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force."""
+    """A constant acceleration since ``t_ns``.
+
+    ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force.
+    """
 
 
 @value_class
 class Forecast:
-    """Predicted standard deviations (n,) of the grasp point, each the root of the trace of its 3x3 covariance.
+    """Predicted standard deviations (n,) of the grasp point, each the root of the trace of its 3x3
+    covariance.
 
-    ``times_s`` [s after now]; ``pos_1s_m``, ``vel_1s_mps``, ``rot_1s_rad``: position, velocity, attitude (full angle).
+    ``times_s`` [s after now]; ``pos_1s_m``, ``vel_1s_mps``, ``rot_1s_rad``: position, velocity,
+    attitude (full angle).
     """
 
     times_s: Array
@@ -347,4 +419,6 @@ class Forecast:
     rot_1s_rad: Array
 
 
-Trajectory = Callable[[Array], tuple[Array, Array]]  # times (n,) [s] -> r (n, 3) [m], v (n, 3) [m/s] of {C} in {A}
+Trajectory = Callable[
+    [Array], tuple[Array, Array]
+]  # times (n,) [s] -> r (n, 3) [m], v (n, 3) [m/s] of {C} in {A}

@@ -1,8 +1,9 @@
-"""The result directory of a run: written scan by scan, complete or not at all; beliefs are read back here.
+"""The result directory of a run: written scan by scan, complete or not at all; beliefs are read
+back here.
 
-``rows.jsonl``, ``estimate.tum``, ``registration.tum``, ``truth.tum``, ``beliefs.npz``, ``view.npz`` and ``result.mcap``
-depend on the input alone, byte for byte; ``run.json`` also names the versions. An interrupted run also leaves its
-checkpoint, ``resume.bin``.
+``rows.jsonl``, ``estimate.tum``, ``registration.tum``, ``truth.tum``, ``beliefs.npz``, ``view.npz``
+and ``result.mcap`` depend on the input alone, byte for byte; ``run.json`` also names the versions.
+An interrupted run also leaves its checkpoint, ``resume.bin``.
 """
 
 from __future__ import annotations
@@ -34,12 +35,30 @@ from avsreplay.settings import dump
 from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
 CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
-OWN = frozenset({"rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "view.npz", "run.json",
-                 "result.mcap", "result.layout.json", "report.html", CHECKPOINT})  # fmt: skip
+OWN = frozenset(
+    {
+        "rows.jsonl",
+        "estimate.tum",
+        "registration.tum",
+        "truth.tum",
+        "beliefs.npz",
+        "view.npz",
+        "run.json",
+        "result.mcap",
+        "result.layout.json",
+        "report.html",
+        CHECKPOINT,
+    }
+)
 _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
-_DRIVEN = ("driven", "u", "P_u", "cross")  # arrays of beliefs.npz about beliefs with a constant acceleration
+_DRIVEN = (
+    "driven",
+    "u",
+    "P_u",
+    "cross",
+)  # arrays of beliefs.npz about beliefs with a constant acceleration
 _SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
     "t_ns": ("i", (None,)),
     "x": ("f", (None, len(MEAN_COLUMNS))),
@@ -80,7 +99,9 @@ def read_beliefs(path: Path) -> list[Belief]:
         for k, u, P_u, cross in zip(*(data.get(name, ()) for name in _DRIVEN), strict=True):
             if not 0 <= k < len(beliefs):
                 raise UnreadableInput(
-                    f"it has no belief {k}, to which an acceleration belongs", where=str(path), hint=hint
+                    f"it has no belief {k}, to which an acceleration belongs",
+                    where=str(path),
+                    hint=hint,
                 )
             plain = beliefs[k]
             beliefs[k] = DrivenBelief(plain.t_ns, plain.x, plain.P, u, P_u, cross)
@@ -106,7 +127,11 @@ def _defect(belief: Belief) -> str:
         return "has an inertia ratio that is not below 1"
     if P.diagonal().min() < 0.0:
         return f"has a covariance that is not positive (a variance of {P.diagonal().min():.3g})"
-    return "has a covariance that is not symmetric" if np.abs(P - P.T).max() > 1e-9 * np.abs(P).max() else ""
+    return (
+        "has a covariance that is not symmetric"
+        if np.abs(P - P.T).max() > 1e-9 * np.abs(P).max()
+        else ""
+    )
 
 
 class Beliefs:
@@ -131,12 +156,17 @@ class Beliefs:
             self.truth.append((scan.row.t_ns, scan.truth.pose))
 
     def write(self, path: Path) -> None:
-        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20), and of those with a constant acceleration more.
+        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20), and of those with a constant
+        acceleration more.
 
-        For k scans with one: driven (k,) their numbers, u (k, 6), P_u (k, 6, 6) and cross (k, 20, 6), see
-        :class:`~avsreplay.estimate.driven.DrivenBelief`.
+        For k scans with one: driven (k,) their numbers, u (k, 6), P_u (k, 6, 6) and cross (k, 20,
+        6), see :class:`~avsreplay.estimate.driven.DrivenBelief`.
         """
-        arrays: dict[str, Any] = {"t_ns": np.array(self.t_ns, np.int64), "x": np.array(self.x), "P": np.array(self.P)}
+        arrays: dict[str, Any] = {
+            "t_ns": np.array(self.t_ns, np.int64),
+            "x": np.array(self.x),
+            "P": np.array(self.P),
+        }
         for name, values in zip(_DRIVEN, zip(*self.driven, strict=True), strict=False):
             arrays[name] = np.array(values)
         np.savez(path, **arrays)
@@ -154,7 +184,9 @@ class ViewWriter:
         """Take one scan: the points that are shown; times and positions of a new flight, if any."""
         self._clouds.append(thin_cloud(cloud.seq, cloud.points, cloud.residual_m, cloud.intensity))
         if path is not None:
-            self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))
+            self._plans.append(
+                PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m)
+            )
 
     def correct(self, rows: Sequence[Row]) -> None:
         """Take the errors of the plans from corrected rows."""
@@ -168,35 +200,49 @@ class ViewWriter:
 
 
 class ResultDirectory:
-    """The folder of a result; it appears when the ``with`` block ends without an error, and not otherwise."""
+    """The folder of a result.
+
+    It appears when the ``with`` block ends without an error, and not otherwise.
+    """
 
     def __init__(self, path: Path, *, overwrite: bool = False, inputs: Iterable[Path] = ()) -> None:
         """Check that the folder can be written.
 
         Args:
             path: the folder.
-            overwrite: whether an existing result may be replaced; files that are not ``OWN`` are kept.
+            overwrite: whether an existing result may be replaced; files that are not ``OWN`` are
+                kept.
             inputs: files that the run reads; none of them may be a file of the result.
 
         Raises:
-            UsageError: the folder exists, is not a result, contains an input, or its name cannot be used.
+            UsageError: the folder exists, is not a result, contains an input, or its name cannot be
+                used.
         """
         self.path, self._stack = path, ExitStack()
         check_output(path, folder=True)
         if path.exists() and not overwrite and any(path.iterdir()):
-            raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
+            raise UsageError(
+                "already exists", where=str(path), hint="choose another name, or add --overwrite"
+            )
         if path.exists() and not _replaceable(path):
-            raise UsageError("is not a result directory", where=str(path), hint="name another; it is left alone")
+            raise UsageError(
+                "is not a result directory", where=str(path), hint="name another; it is left alone"
+            )
         for each in inputs:
             if each.resolve().parent == path.resolve() and each.name in OWN:
-                raise UsageError("contains an input of this run", where=str(path), hint="name another output")
+                raise UsageError(
+                    "contains an input of this run", where=str(path), hint="name another output"
+                )
 
     def __enter__(self) -> ResultDirectory:
         self._part = self._stack.enter_context(output_folder(self.path, OWN))
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         self._stack.__exit__(kind, error, traceback)
 
@@ -245,7 +291,10 @@ class ResultWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         with suppress(OSError):  # reported by ``finish``; after an error the folder is removed
             self._log.close()
@@ -276,7 +325,11 @@ class ResultWriter:
             hint = "leave out --resume; only a run that was interrupted can be resumed"
             raise UsageError("no interrupted run", where=f"--resume {folder}", hint=hint)
         record = load_result(folder).header
-        different = [name for name, value in facts.items() if record.get(name) != json.loads(json.dumps(dump(value)))]
+        different = [
+            name
+            for name, value in facts.items()
+            if record.get(name) != json.loads(json.dumps(dump(value)))
+        ]
         if different:
             hint = "give the same options as at first, or start anew with --overwrite"
             what = f"the interrupted run differs in: {', '.join(different)}"
@@ -294,19 +347,24 @@ class ResultWriter:
             changed: indices of those that have other values than the scans that were taken.
         """
         self._log.close()
-        first = self._directory.file("result.mcap").rename(self._directory.file("result.first.mcap"))
+        first = self._directory.file("result.mcap").rename(
+            self._directory.file("result.first.mcap")
+        )
         self._log = ResultLogWriter(self._directory.file("result.mcap"), self._run)
         self._log.take_over(first, rows, changed)
         first.unlink()
         self._view.correct(rows)
 
-    def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, resumable: bool = False) -> None:
+    def finish(
+        self, rows: Sequence[Row], record: Mapping[str, Any], *, resumable: bool = False
+    ) -> None:
         """Write what needs the whole run.
 
         Args:
             rows: one per scan.
             record: content of ``run.json``.
-            resumable: the run was interrupted: write the checkpoint, too, from which ``resume`` continues.
+            resumable: the run was interrupted: write the checkpoint, too, from which ``resume``
+                continues.
         """
         self._log.close()
         self._directory.write(rows, self._beliefs)

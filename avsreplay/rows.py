@@ -1,7 +1,9 @@
-"""The row of a scan. Each column is declared once: value, unit, format and golden tolerance; columns.toml describes it.
+"""The row of a scan. Each column is declared once: value, unit, format and golden tolerance;
+columns.toml describes it.
 
-JSONL, CSV and Parquet files, tables, golden comparisons, docs/columns.md and the JSON schema are made from these two
-files. A row holds results only, no wall clock, host, version or path: the same input gives the same bytes.
+JSONL, CSV and Parquet files, tables, golden comparisons, docs/columns.md and the JSON schema are
+made from these two files. A row holds results only, no wall clock, host, version or path: the same
+input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -81,7 +83,9 @@ def _seconds(value: Value[T], table: bool = False) -> T:
     return column(value, "s", ".2f", 1e-4, 1e-3, table)
 
 
-def _number(value: Value[T], unit: str = "", fmt: str = ".4g", table: bool = False, atol: float = 1e-6) -> T:
+def _number(
+    value: Value[T], unit: str = "", fmt: str = ".4g", table: bool = False, atol: float = 1e-6
+) -> T:
     return column(value, unit, fmt, 1e-4, atol, table)
 
 
@@ -111,7 +115,9 @@ def _if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
 
 
 def _change(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | None], ...]:
-    """Instant [s] and sizes of the linear and the angular part of a change, each followed by its standard deviation."""
+    """Instant [s] and sizes of the linear and the angular part of a change, each followed by its
+    standard deviation.
+    """
 
     def of(value: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
         return lambda o, s: None if (change := get(o)) is None else float(value(o, change))
@@ -126,12 +132,16 @@ def _change(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | N
     )
 
 
-def _of_error(get: Callable[[Score], PoseError | CaptureError | None], name: str) -> Value[float | None]:
+def _of_error(
+    get: Callable[[Score], PoseError | CaptureError | None], name: str
+) -> Value[float | None]:
     return lambda o, s: None if (error := get(s)) is None else finite(getattr(error, name))
 
 
 def _full_angle_deg(variance: float) -> float:
-    """Standard deviation of a full angle [deg] from the variance of the half angle [rad2], at least 0."""
+    """Standard deviation of a full angle [deg] from the variance of the half angle [rad2], at least
+    0.
+    """
     return math.degrees(2.0 * math.sqrt(max(variance, 0.0)))
 
 
@@ -151,7 +161,10 @@ def _status(outcome: Outcome) -> str:
     return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value
 
 
-_PUSH, _DRIFT = _change(lambda o: o.manoeuvres[-1] if o.manoeuvres else None), _change(lambda o: o.drift)
+_PUSH, _DRIFT = (
+    _change(lambda o: o.manoeuvres[-1] if o.manoeuvres else None),
+    _change(lambda o: o.drift),
+)
 
 
 def _nees(block: str) -> float | None:
@@ -161,11 +174,16 @@ def _nees(block: str) -> float | None:
 
 @value_class(eq=True)
 class Row:
-    """The result of one scan. None: does not apply (no truth, no measurement, no plan, no fault)."""
+    """The result of one scan. None.
+
+    Does not apply (no truth, no measurement, no plan, no fault).
+    """
 
     seq: int = _exact(lambda o, s: o.scan.seq, table=True)
     t_ns: int = _exact(lambda o, s: o.scan.t_ns)
-    t_s: float = column(lambda o, s: _since_start_s(o, o.scan.t_ns), "s", ".2f", 0.0, 1e-09, table=True)
+    t_s: float = column(
+        lambda o, s: _since_start_s(o, o.scan.t_ns), "s", ".2f", 0.0, 1e-09, table=True
+    )
     status: str = _exact(lambda o, s: _status(o), table=True)
     gamma: int = _exact(lambda o, s: o.verdict.gamma, table=True)
     reason: str = _exact(lambda o, s: o.verdict.reason.value, table=True)
@@ -178,9 +196,13 @@ class Row:
     inlier_ratio: float | None = column(
         _if_points(lambda o: o.alignment.inlier_ratio), "", ".3f", 0.001, 0.001, table=True
     )
-    rms_m: float | None = column(_if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True)
+    rms_m: float | None = column(
+        _if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True
+    )
     free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None)
-    split_nis: float | None = _number(_if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f")
+    split_nis: float | None = _number(
+        _if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f"
+    )
     reg_dof: float | None = _number(_if_points(lambda o: finite(o.alignment.dof)), fmt=".0f")
     reg_x_m: float | None = _metres(_if_measured(lambda T: T.t[0]))
     reg_y_m: float | None = _metres(_if_measured(lambda T: T.t[1]))
@@ -189,7 +211,9 @@ class Row:
     reg_qy: float | None = _number(_if_measured(lambda T: T.q[1]))
     reg_qz: float | None = _number(_if_measured(lambda T: T.q[2]))
     reg_qw: float | None = _number(_if_measured(lambda T: T.q[3]))
-    nis: float | None = column(_if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True)
+    nis: float | None = column(
+        _if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True
+    )
     cauchy_weight: float | None = _number(_if_innovation(lambda i: i.weight), atol=0.0001)
     innov_m: float | None = _metres(_if_innovation(lambda i: finite(i.distance_m)))
     innov_deg: float | None = column(
@@ -203,8 +227,12 @@ class Row:
     qy: float | None = _number(lambda o, s: float(o.pose.q[1]))
     qz: float | None = _number(lambda o, s: float(o.pose.q[2]))
     qw: float | None = _number(lambda o, s: float(o.pose.q[3]))
-    pos_1s_m: float | None = _number(lambda o, s: math.sqrt(max(_traces(o.pose_covariance)[0], 0.0)), "m")
-    rot_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(_traces(o.pose_covariance)[1]), "deg")
+    pos_1s_m: float | None = _number(
+        lambda o, s: math.sqrt(max(_traces(o.pose_covariance)[0], 0.0)), "m"
+    )
+    rot_1s_deg: float | None = _number(
+        lambda o, s: _full_angle_deg(_traces(o.pose_covariance)[1]), "deg"
+    )
     wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "rad/s")
     wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "rad/s")
     wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "rad/s")
@@ -226,7 +254,9 @@ class Row:
     muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]))
     muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]))
     muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]))
-    mu_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(o.body.limited_1s[3] ** 2), "deg")
+    mu_1s_deg: float | None = _number(
+        lambda o, s: _full_angle_deg(o.body.limited_1s[3] ** 2), "deg"
+    )
     com_x_m: float | None = _metres(lambda o, s: float(o.body.centre_c[0]))
     com_y_m: float | None = _metres(lambda o, s: float(o.body.centre_c[1]))
     com_z_m: float | None = _metres(lambda o, s: float(o.body.centre_c[2]))
@@ -259,8 +289,12 @@ class Row:
     nees_sigma: float | None = _nees("sigma")
     nees_varrho: float | None = _nees("varrho")
     nees_mu: float | None = _nees("mu")
-    r_pos_m: float | None = _number(_if_innovation(lambda i: math.sqrt(max(_traces(i.R)[0] / 3.0, 0.0))), "m")
-    r_rot_deg: float | None = _number(_if_innovation(lambda i: _full_angle_deg(_traces(i.R)[1] / 3.0)), "deg")
+    r_pos_m: float | None = _number(
+        _if_innovation(lambda i: math.sqrt(max(_traces(i.R)[0] / 3.0, 0.0))), "m"
+    )
+    r_rot_deg: float | None = _number(
+        _if_innovation(lambda i: _full_angle_deg(_traces(i.R)[1] / 3.0)), "deg"
+    )
     sigma_hits: int | None = _exact(lambda o, s: o.sigma_hits)
     r_floors: int | None = _exact(lambda o, s: o.r_floors)
     reinitialised: int | None = _exact(lambda o, s: o.reinitialised)
@@ -277,8 +311,12 @@ class Row:
     drift_1s_mps2: float | None = _number(_DRIFT[3], "m/s2", atol=1e-09)
     drift_radps2: float | None = _number(_DRIFT[4], "rad/s2", atol=1e-09)
     drift_1s_radps2: float | None = _number(_DRIFT[5], "rad/s2", atol=1e-09)
-    ogm_log10_cond: float | None = column(lambda o, s: o.monitors.ogm_log10_cond, "", ".1f", 0.001, 0.01, table=True)
-    ogm_log10_cond_scaled: float | None = column(lambda o, s: o.monitors.ogm_log10_cond_scaled, "", ".1f", 0.001, 0.01)
+    ogm_log10_cond: float | None = column(
+        lambda o, s: o.monitors.ogm_log10_cond, "", ".1f", 0.001, 0.01, table=True
+    )
+    ogm_log10_cond_scaled: float | None = column(
+        lambda o, s: o.monitors.ogm_log10_cond_scaled, "", ".1f", 0.001, 0.01
+    )
     ogm_rank: int | None = _exact(lambda o, s: o.monitors.ogm_rank, table=True)
     nis_mean: float | None = _number(lambda o, s: o.monitors.nis_mean, fmt=".2f", atol=0.0001)
     autocorrelation: float | None = _number(lambda o, s: o.monitors.autocorrelation, atol=0.0001)
@@ -288,23 +326,41 @@ class Row:
     covariance_converged: bool | None = _exact(lambda o, s: o.monitors.covariance_converged)
     predictive_converged: bool | None = _exact(lambda o, s: o.monitors.predictive_converged)
     unconverged_blocks: str | None = _exact(lambda o, s: ", ".join(o.monitors.unconverged) or None)
-    grasp_pos_1s_m: float | None = _number(lambda o, s: float(o.monitors.forecast.pos_1s_m.max()), "m")
-    grasp_vel_1s_mps: float | None = _number(lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()), "m/s")
-    grasp_rot_1s_deg: float | None = _number(lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()), "deg")
+    grasp_pos_1s_m: float | None = _number(
+        lambda o, s: float(o.monitors.forecast.pos_1s_m.max()), "m"
+    )
+    grasp_vel_1s_mps: float | None = _number(
+        lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()), "m/s"
+    )
+    grasp_rot_1s_deg: float | None = _number(
+        lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()), "deg"
+    )
     plan_status: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.status.value)
-    capture_time_s: float | None = _seconds(_if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s), table=True)
-    t_go_s: float | None = _seconds(_if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09))
+    capture_time_s: float | None = _seconds(
+        _if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s), table=True
+    )
+    t_go_s: float | None = _seconds(
+        _if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09)
+    )
     earliest_capture_s: float | None = _seconds(
-        lambda o, s: None if o.plan is None else _since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s
+        lambda o, s: (
+            None if o.plan is None else _since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s
+        )
     )
     plan_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.margin_m), "m", ".4f", 0.0, 0.01
     )
     plan_limit: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.binding or None)
     abort_margin_m: float | None = column(
-        lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m), "m", ".4f", 0.0, 0.01
+        lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
+        "m",
+        ".4f",
+        0.0,
+        0.01,
     )
-    gripper_ready_s: float | None = _seconds(_if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)))
+    gripper_ready_s: float | None = _seconds(
+        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s))
+    )
     plan_delay: str | None = _exact(_if_planned(lambda o, p: p.delayed_by or None))
     plan_miss_m: float | None = _error_m(_of_error(lambda s: s.planned, "distance_m"))
     plan_miss_mps: float | None = _error_m(_of_error(lambda s: s.planned, "speed_mps"), "m/s")
@@ -323,7 +379,9 @@ class Row:
             outcome: result of the pipeline for the scan.
             score: its comparison with the ground truth.
         """
-        return cls(*[value(outcome, score) for value in _VALUES])  # by place: 150 names take as long as the values
+        return cls(
+            *[value(outcome, score) for value in _VALUES]
+        )  # by place: 150 names take as long as the values
 
     def rescored(self, score: Score) -> Row:
         """Return the row with the errors of planned and flown captures of another score.
@@ -345,4 +403,6 @@ _VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 def columns() -> tuple[Column, ...]:
     """Every column in order."""
     names = [f.name for f in dataclasses.fields(Column) if f.name != "name"]
-    return tuple(Column(f.name, **{n: f.metadata[n] for n in names}) for f in dataclasses.fields(Row))
+    return tuple(
+        Column(f.name, **{n: f.metadata[n] for n in names}) for f in dataclasses.fields(Row)
+    )

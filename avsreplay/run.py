@@ -1,4 +1,7 @@
-"""One run, for command line, API and sweeps: opens the log, builds the stages, folds the scans and scores them."""
+"""One run, for command line, API and sweeps.
+
+Opens the log, builds the stages, folds the scans and scores them.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +25,22 @@ from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
 from avsreplay.log.streams import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
-from avsreplay.plan import Motion
+from avsreplay.plan.flights import Motion
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
-from avsreplay.register import POSES, ModelCheck, Registrar
-from avsreplay.report import Summary, SummaryFold
+from avsreplay.register.backend import POSES
+from avsreplay.register.model_check import ModelCheck
+from avsreplay.register.registrar import Registrar
+from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
 
 if TYPE_CHECKING:
-    from avsreplay.reconstruct import Reconstruction
+    from avsreplay.reconstruct.model import Reconstruction
 
-RECONSTRUCTED, MOST_LOSSES = Path("auto"), 100  # a model built from the log; losses listed one by one in run.json
+RECONSTRUCTED, MOST_LOSSES = (
+    Path("auto"),
+    100,
+)  # a model built from the log; losses listed one by one in run.json
 
 
 @value_class
@@ -57,10 +65,12 @@ class Job:
     """What to run.
 
     Attributes:
-        source: log, bag or folder of scans.  options: how to read it.
+        source: log, bag or folder of scans.
+        options: how to read it.
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
-        prefetch: scans decoded ahead on a thread; the pipeline then has one, too. 0: one thread. Same result.
+        prefetch: scans decoded ahead on a thread; the pipeline then has one, too. 0: one thread.
+            Same result.
         growing: the log, if it is still written; a scan is replayed when it is there.
     """
 
@@ -76,8 +86,11 @@ class Run:
     """An open run; a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        config: effective configuration.  surface: model of the target.  registrar: registers scans against that model.
-        model_check: check of the model by the rows so far.  done: number of scans processed so far.
+        config: effective configuration.
+        surface: model of the target.
+        registrar: registers scans against that model.
+        model_check: check of the model by the rows so far.
+        done: number of scans processed so far.
         acceleration: fitted to the poses, None where it is given.
     """
 
@@ -96,15 +109,29 @@ class Run:
         unknown = job.options.model == RECONSTRUCTED
         poses = load_config(job.config_file, {}, job.assignments).register.backend == POSES
         if poses and unknown:
-            raise UsageError("poses contain no model", where="--model auto", hint="leave out --model, or name a file")
+            raise UsageError(
+                "poses contain no model",
+                where="--model auto",
+                hint="leave out --model, or name a file",
+            )
         options = replace(job.options, poses=poses, model=None if unknown else job.options.model)
-        self._opened = job.growing.open(options) if job.growing else open_source(job.source, options)
+        self._opened = (
+            job.growing.open(options) if job.growing else open_source(job.source, options)
+        )
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
-            own: Mapping[str, Any] = tomllib.loads(header.scenario).get("run", {}) if header.scenario else {}
-            self.config: RunConfig = load_config(job.config_file, own, job.assignments, job.source.parent)
-            if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
+            own: Mapping[str, Any] = (
+                tomllib.loads(header.scenario).get("run", {}) if header.scenario else {}
+            )
+            self.config: RunConfig = load_config(
+                job.config_file, own, job.assignments, job.source.parent
+            )
+            if (
+                self._made is not None
+                and self.config.init == "log"
+                and self._made.poses[0][0] == self._first_ns
+            ):
                 self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
@@ -128,7 +155,10 @@ class Run:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         self.source.close()
 
@@ -142,7 +172,8 @@ class Run:
         return len(self.source)
 
     def fit_reference(self, progress: Progress | None = None) -> Reference:
-        """Replay the log once and fit one motion to all healthy poses; errors are then computed against this motion.
+        """Replay the log once and fit one motion to all healthy poses; errors are then computed
+        against this motion.
 
         ``rows`` calls this method if ``reference`` is "fit" and it was not called before.
 
@@ -165,7 +196,9 @@ class Run:
         self._reference_instants = sorted(instants)
         return self._reference
 
-    def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Generator[Row]:
+    def rows(
+        self, listeners: Iterable[Listener] = (), progress: Progress | None = None
+    ) -> Generator[Row]:
         """Replay the log row by row, after ``restore`` from the first scan that was not processed.
 
         Args:
@@ -186,7 +219,9 @@ class Run:
             self.fit_reference(progress)
         listeners, self._scored = tuple(listeners), self._scored or self._scorer()
         outcomes = self._outcomes(self._stages, progress, "replaying", self._state, self.done)
-        if self.job.prefetch:  # the pipeline has a thread of its own; scoring and writing stay in this one
+        if (
+            self.job.prefetch
+        ):  # the pipeline has a thread of its own; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)
@@ -204,7 +239,8 @@ class Run:
             yield row
 
     def rescore(self, rows: list[Row]) -> list[int]:
-        """Score the plans of a log that grew with all its true poses; return the indices of the rows that changed.
+        """Score the plans of a log that grew with all its true poses; return the indices of the
+        rows that changed.
 
         Args:
             rows: of all scans; those whose score changes are replaced.
@@ -244,30 +280,59 @@ class Run:
         return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
-        """Objects that a checkpoint refers to by name; the interpolation of the truth is made again."""
-        return {"surface": self.surface, "registrar": self.registrar, "estimator": self.estimator, "motion": motion}
+        """Objects that a checkpoint refers to by name.
+
+        The interpolation of the truth is made again.
+        """
+        return {
+            "surface": self.surface,
+            "registrar": self.registrar,
+            "estimator": self.estimator,
+            "motion": motion,
+        }
 
     @property
     def truth(self) -> State | None:
-        """True state at the last scan that has one, its principal axes in the order of the estimate's."""
+        """True state at the last scan that has one, its principal axes in the order of the
+        estimate's.
+        """
         return self.header.truth if self._end is None else matched_truth(*self._end)
 
     def summary(self) -> Summary:
         """Summarise the rows taken so far."""
         clock, losses = self.source.clock, self.source.losses
-        counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
-        stamps = {"unset": clock.unset, "jumped": clock.jumps, "equal": clock.equal, "back": clock.back}
+        counts = {
+            "losses": len(losses),
+            "lost_messages": sum(loss.messages or 0 for loss in losses),
+        }
+        stamps = {
+            "unset": clock.unset,
+            "jumped": clock.jumps,
+            "equal": clock.equal,
+            "back": clock.back,
+        }
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         text = acceleration_text(self.config.estimator, self.acceleration)
         return replace(self._fold.result(self.truth), counts=counts, acceleration=text)
 
     def facts(self) -> dict[str, Any]:
-        """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
+        """Return what ``run.json`` holds besides versions.
+
+        Effective configuration and hashes of what was read.
+        """
         surface, losses = self.surface, self.source.losses
         return {
             "arithmetic": arithmetic.state(),
-            "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
-            "model": {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent},
+            "log": {
+                "name": self.job.source.name,
+                "sha256": self.source.sha256,
+                "scans": len(self.source),
+            },
+            "model": {
+                "name": Path(surface.name).name,
+                "sha256": surface.sha256,
+                "extent_m": surface.extent,
+            },
             "clock": settings.dump(self.source.clock),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
@@ -287,48 +352,81 @@ class Run:
             return None
         self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))
         ready = self._new_stages()
-        outcomes = [outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))]
+        outcomes = [
+            outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
+        ]
         measured = [(o.scan.t_ns, o.alignment) for o in outcomes if o.scan.status is ScanStatus.OK]
         found = fit_acceleration(measured, ready.estimator.params)
         self.config = with_acceleration(self.config, found.mean.tolist())
         return found
 
     def _outcomes(
-        self, ready: Stages, progress: Progress | None, what: str, state: PipelineState, first: int = 0
+        self,
+        ready: Stages,
+        progress: Progress | None,
+        what: str,
+        state: PipelineState,
+        first: int = 0,
     ) -> Iterator[tuple[PipelineState, Outcome]]:
-        """The pipeline over the scans, which are decoded ahead on a thread that ends with this generator."""
+        """The pipeline over the scans, which are decoded ahead on a thread that ends with this
+        generator.
+        """
         growing, prefetch = self.job.growing, self.job.prefetch
-        scans = ahead(growing.scans(), prefetch or 1) if growing else self.source.scans(prefetch, first)
+        scans = (
+            ahead(growing.scans(), prefetch or 1) if growing else self.source.scans(prefetch, first)
+        )
         try:
-            shown = progress(scans, 0 if growing else len(self.source) - first, what) if progress else scans
+            shown = (
+                progress(scans, 0 if growing else len(self.source) - first, what)
+                if progress
+                else scans
+            )
             yield from pipeline.fold(ready, state, shown)
         finally:
             scans.close()
 
     def _scorer(self) -> Scorer:
-        return Scorer(self.estimator, self._true_poses(), self.config.reference.value, growing=bool(self.job.growing))
+        return Scorer(
+            self.estimator,
+            self._true_poses(),
+            self.config.reference.value,
+            growing=bool(self.job.growing),
+        )
 
     def _true_poses(self) -> list[tuple[int, Pose]]:
         """True poses of the log, or of the reference within its span."""
         reference, poses = self._reference, list(self.source.truth_poses())
         if self._made is not None:
-            poses = [] if self._T_cr is None else [(t_ns, pose @ self._T_cr) for t_ns, pose in poses]
+            poses = (
+                [] if self._T_cr is None else [(t_ns, pose @ self._T_cr) for t_ns, pose in poses]
+            )
         if reference is not None:
-            inside = [t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns]
+            inside = [
+                t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns
+            ]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
         return poses
 
     def _truth_of(self, scan: Scan) -> Truth:
-        """Return the truth at a scan; the pose is that of the reference motion if one was fitted."""
+        """Return the truth at a scan.
+
+        The pose is that of the reference motion if one was fitted.
+        """
         truth, fitted = self._true(scan), self._reference
         if fitted is None:
             return truth
-        inside = fitted.epoch_ns <= scan.t_ns <= fitted.end_ns  # from the first to the last healthy pose
+        inside = (
+            fitted.epoch_ns <= scan.t_ns <= fitted.end_ns
+        )  # from the first to the last healthy pose
         return replace(truth, pose=fitted.at(scan.t_ns).T_ac if inside else None, state=None)
 
     def _without_model(self) -> LogHeader:
-        """Reconstruct the model; start and true state of the log refer to another frame {C} and are dropped."""
-        from avsreplay.reconstruct import at_grasp, reconstruct, surface_of, true_frame
+        """Reconstruct the model.
+
+        Start and true state of the log refer to another frame {C} and are dropped.
+        """
+        from avsreplay.reconstruct.model import at_grasp, surface_of
+        from avsreplay.reconstruct.reconstruction import reconstruct, true_frame
 
         self._first_ns = self.source.scan_at(0).t_ns if len(self.source) else 0
         self._made = at_grasp(reconstruct(self.source.scans))
@@ -336,7 +434,10 @@ class Run:
         return replace(self.source.header, surface=surface_of(self._made), start=None, truth=None)
 
     def _true(self, scan: Scan) -> Truth:
-        """The truth of the log; with a reconstructed model its pose, as that of the reconstructed frame."""
+        """The truth of the log.
+
+        With a reconstructed model its pose, as that of the reconstructed frame.
+        """
         truth = self.source.truth_of(scan)
         if self._made is None:
             return truth

@@ -1,4 +1,7 @@
-"""The part of a saved result from which planning starts again: rows, beliefs, ground truth and settings."""
+"""The part of a saved result from which planning starts again.
+
+Rows, beliefs, ground truth and settings.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from avsreplay import plan, settings, toml_document
+from avsreplay import settings, toml_document
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
+from avsreplay.plan.flights import Motion, interpolated
+from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.plan.supervisor import SupervisorParams
 from avsreplay.records import Belief, Surface
 from avsreplay.report.result import load_result, motion_samples
 from avsreplay.result_dir import read_beliefs
@@ -50,7 +56,7 @@ class Saved:
     name: str
     rows: Sequence[Row]
     beliefs: Sequence[Belief]
-    truth: plan.Motion | None
+    truth: Motion | None
     estimator: Estimator
     plan: PlanParams
     supervisor: SupervisorParams
@@ -70,7 +76,8 @@ class Saved:
         """Return the index of the scan from which to plan.
 
         Args:
-            at_s: the last scan not after this time is taken [s after the first scan]; None: the first converged scan.
+            at_s: the last scan not after this time is taken [s after the first scan]; None: the
+                first converged scan.
 
         Raises:
             UsageError: the time is outside the result, or the estimate never converged.
@@ -78,12 +85,20 @@ class Saved:
         if at_s is None:
             converged = [k for k, row in enumerate(self.rows) if row.converged]
             if not converged:
-                raise UsageError("the estimate never converged", where=self.name, hint="plan all the same with --at T")
+                raise UsageError(
+                    "the estimate never converged",
+                    where=self.name,
+                    hint="plan all the same with --at T",
+                )
             return converged[0]
         before = [k for k, row in enumerate(self.rows) if row.t_s <= at_s + 1e-9]
         if not before or at_s > self.rows[-1].t_s + 1e-9:
             last = self.rows[-1].t_s
-            raise UsageError(f"{at_s} s is outside the result", where="--at", hint=f"it runs from 0 to {last:.2f} s")
+            raise UsageError(
+                f"{at_s} s is outside the result",
+                where="--at",
+                hint=f"it runs from 0 to {last:.2f} s",
+            )
         return before[-1]
 
 
@@ -107,7 +122,7 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     extent = extent_m or result.extent_m(path)
     since_ns = result.rows[0].t_ns
     times, poses = motion_samples(result.poses, since_ns)
-    truth = plan.interpolated(times, poses) if len(poses) >= 4 else None
+    truth = interpolated(times, poses) if len(poses) >= 4 else None
     return Saved(
         name=str(path),
         rows=result.rows,
@@ -168,7 +183,9 @@ def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
     tables: dict[str, Any] = {}
     for name, values in (("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)):
         tables[name] = {k: v for k, v in settings.dump(values).items() if v is not None}
-    tables["supervisor"] = {k: v for k, v in settings.dump(saved.supervisor).items() if v is not None}
+    tables["supervisor"] = {
+        k: v for k, v in settings.dump(saved.supervisor).items() if v is not None
+    }
     changed = toml_document.override(toml_document.Document("run.json", tables), assignments)
     made = toml_document.build(PlanningConfig, changed)
     return replace(

@@ -1,6 +1,8 @@
-"""Every value that needs ground truth: errors, NEES and plan misses. ``pipeline.step`` has none of it.
+"""Every value that needs ground truth: errors, NEES and plan misses. ``pipeline.step`` has none of
+it.
 
-The reference is the truth in the log, or a motion fitted to all healthy poses of the log (``run.fit_reference``).
+The reference is the truth in the log, or a motion fitted to all healthy poses of the log
+(``run.fit_reference``).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
 from avsreplay.pipeline import PipelineState, planned_segment
-from avsreplay.plan import Motion, interpolated, miss
+from avsreplay.plan.flights import Motion, interpolated, miss
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Truth
 from avsreplay.rows import Row
@@ -32,13 +34,19 @@ class Scorer:
     """
 
     def __init__(
-        self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str, *, growing: bool = False
+        self,
+        estimator: Estimator,
+        poses: Sequence[tuple[int, Pose]],
+        reference: str,
+        *,
+        growing: bool = False,
     ) -> None:
         """Interpolate the true poses.
 
         Args:
             estimator: predicts the attitude at the end of a planned flight.
-            poses: true poses T_ac by instant, ascending; with fewer than four, plans are not scored.
+            poses: true poses T_ac by instant, ascending; with fewer than four, plans are not
+                scored.
             reference: what the errors are taken against, "truth" or "fit".
             growing: keep the flights for ``rescore``, because true poses are recorded after them.
         """
@@ -73,7 +81,10 @@ class Scorer:
         errors = [self._error_of(segment, attitude) for _, segment, attitude in flights]
         planned = {at: error for (at, _, _), error in zip(flights, errors, strict=True)}
         captured = {at: errors[number - 1] for at, number in self._captures if number}
-        scores = {at: Score(planned=planned.get(at), captured=captured.get(at)) for at in {*planned, *captured}}
+        scores = {
+            at: Score(planned=planned.get(at), captured=captured.get(at))
+            for at in {*planned, *captured}
+        }
         found = {at: rows[at].rescored(score) for at, score in sorted(scores.items())}
         changed = [at for at, row in found.items() if row != rows[at]]
         for at in changed:
@@ -101,7 +112,9 @@ class Scorer:
             fault=truth.fault,
             reference=self._reference,
             estimate=pose_error(outcome.pose, truth.pose),
-            registration=pose_error(outcome.alignment.T_ac, truth.pose) if outcome.alignment.measured else None,
+            registration=pose_error(outcome.alignment.T_ac, truth.pose)
+            if outcome.alignment.measured
+            else None,
             nees=total,
             nees_blocks=blocks,
             planned=planned,
@@ -178,11 +191,14 @@ def pose_error(pose: Pose, truth: Pose) -> PoseError:
         truth: true pose T_ac.
     """
     turn = geometry.multiply(geometry.conjugate(truth.q), pose.q)
-    return PoseError(float(np.linalg.norm(pose.t - truth.t)), float(np.degrees(geometry.angle(turn))))
+    return PoseError(
+        float(np.linalg.norm(pose.t - truth.t)), float(np.degrees(geometry.angle(turn)))
+    )
 
 
 def matched_truth(belief: Belief, truth: State) -> State:
-    """Return the true state with its principal axes in the order that is nearest to that of the estimate.
+    """Return the true state with its principal axes in the order that is nearest to that of the
+    estimate.
 
     Args:
         belief: the estimate and its covariance.
@@ -192,7 +208,10 @@ def matched_truth(belief: Belief, truth: State) -> State:
 
 
 def _nees(outcome: Outcome, truth: State | None) -> tuple[float | None, Mapping[str, float]]:
-    """NEES of all states and of each block. A cold start's first poses have none: their belief is not normal."""
+    """NEES of all states and of each block. A cold start's first poses have none.
+
+    Their belief is not normal.
+    """
     if truth is None or outcome.estimator == "start":
         return None, {}
     return nees_by_block(outcome.belief, truth)

@@ -1,8 +1,10 @@
-"""Settings, each declared once: default, unit, range, scaling with the target's extent, and meaning.
+"""Settings, each declared once: default, unit, range, scaling with the target's extent, and
+meaning.
 
-A parameter class is a frozen dataclass that derives from ``Settings`` and declares each field with ``setting``. The
-validation, the values taken from the target's extent, the help texts, the printed configuration and docs/settings.md
-are derived from these declarations. ``toml_document`` reads such a class from TOML and writes it.
+A parameter class is a frozen dataclass that derives from ``Settings`` and declares each field with
+``setting``. The validation, the values taken from the target's extent, the help texts, the printed
+configuration and docs/settings.md are derived from these declarations. ``toml_document`` reads such
+a class from TOML and writes it.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ class Setting:
         high: Upper bound that is allowed.
         infinite: Whether infinite values are allowed.
         of_extent: Where the setting is not given: its value as a fraction of the target's extent.
-        unset: Where the setting is not given and does not scale with the extent: what applies instead.
+        unset: Where the setting is not given and does not scale with the extent: what applies
+            instead.
     """
 
     doc: str
@@ -68,25 +71,36 @@ class Setting:
     def automatic(self) -> str:
         """Return what applies if the setting is not given, "" if it always has a value."""
         per_second = " per second" if self.unit == "m/s" else ""
-        return self.unset if self.of_extent is None else f"{self.of_extent:g} of the target's extent{per_second}"
+        return (
+            self.unset
+            if self.of_extent is None
+            else f"{self.of_extent:g} of the target's extent{per_second}"
+        )
 
     def check(self, name: str, value: Any) -> None:
         """Check that a value is in the range.
 
         Args:
             name: Name of the field, for the error message.
-            value: The value; a tuple is checked number by number, anything else but a number is accepted.
+            value: The value; a tuple is checked number by number, anything else but a number is
+                accepted.
 
         Raises:
             SettingError: A number is outside the range.
         """
         several = isinstance(value, tuple)
         for number in value if several else (value,):
-            if isinstance(number, (int, float)) and not isinstance(number, bool) and not self._allows(number):
+            if (
+                isinstance(number, (int, float))
+                and not isinstance(number, bool)
+                and not self._allows(number)
+            ):
                 unit = f" [{self.unit}]" if self.unit else ""
                 each = "each value " if several else ""
                 shown = list(value) if several else value
-                raise SettingError(name, f"{name} is {shown}, {each}must be {self.range or 'finite'}{unit}")
+                raise SettingError(
+                    name, f"{name} is {shown}, {each}must be {self.range or 'finite'}{unit}"
+                )
 
     def _allows(self, number: float) -> bool:
         inside = (
@@ -96,7 +110,9 @@ class Setting:
             and (self.high is None or number <= self.high)
         )
         return inside and (
-            isinstance(number, int) or math.isfinite(number) or (self.infinite and not math.isnan(number))
+            isinstance(number, int)
+            or math.isfinite(number)
+            or (self.infinite and not math.isnan(number))
         )
 
 
@@ -119,8 +135,12 @@ def is_unit(values: Sequence[float], tolerance: float = 1e-3) -> bool:
     return math.isclose(math.hypot(*values), 1.0, abs_tol=tolerance)
 
 
-def are_orthonormal(first: Sequence[float], other: Sequence[float], tolerance: float = 1e-6) -> bool:
-    """Return whether two vectors have the length 1 and are perpendicular, each within ``tolerance``."""
+def are_orthonormal(
+    first: Sequence[float], other: Sequence[float], tolerance: float = 1e-6
+) -> bool:
+    """Return whether two vectors have the length 1 and are perpendicular, each within
+    ``tolerance``.
+    """
     cosine = sum(a * b for a, b in zip(first, other, strict=True))
     return is_unit(first, tolerance) and is_unit(other, tolerance) and abs(cosine) <= tolerance
 
@@ -129,8 +149,8 @@ def setting(default: Any = dataclasses.MISSING, doc: str = "", **declared: Any) 
     """A field of a ``Settings`` class.
 
     Args:
-        default: Default value; a class (a nested table, ``dict`` or ``list``) is called for each object. A field
-            without one must be given.
+        default: Default value; a class (a nested table, ``dict`` or ``list``) is called for each
+            object. A field without one must be given.
         doc: Its meaning, one plain sentence.
         **declared: The other attributes of ``Setting``.
     """
@@ -141,7 +161,10 @@ def setting(default: Any = dataclasses.MISSING, doc: str = "", **declared: Any) 
 
 
 class Settings:
-    """Base of every parameter class. Creating one checks every range; it raises ValueError naming the field."""
+    """Base of every parameter class. Creating one checks every range.
+
+    It raises ValueError naming the field.
+    """
 
     __slots__ = ()
 
@@ -151,7 +174,10 @@ class Settings:
         self.check()
 
     def check(self) -> None:
-        """Raise ValueError where values do not fit together; a class with such conditions overrides this."""
+        """Raise ValueError where values do not fit together.
+
+        A class with such conditions overrides this.
+        """
 
     def resolved(self, extent_m: float) -> Self:
         """The same with every setting that scales with the target filled in.
@@ -192,13 +218,18 @@ def given(value: float | None) -> float:
         ValueError: The value is None.
     """
     if value is None:
-        raise ValueError("a setting that scales with the target has no value yet: call resolved(extent_m) first")
+        raise ValueError(
+            "a setting that scales with the target has no value yet: call resolved(extent_m) first"
+        )
     return value
 
 
 @value_class(eq=True)
 class Entry:
-    """One setting of a tree of tables: full dotted key, declaration, type and default (MISSING: must be given)."""
+    """One setting of a tree of tables: full dotted key, declaration, type and default (MISSING.
+
+    Must be given).
+    """
 
     key: str
     declared: Setting
@@ -209,7 +240,11 @@ class Entry:
     def choices(self) -> tuple[str, ...]:
         """The values of an enumeration, () of anything else."""
         kind = _inner(self.hint)
-        return tuple(m.value for m in kind) if isinstance(kind, type) and issubclass(kind, enum.Enum) else ()
+        return (
+            tuple(m.value for m in kind)
+            if isinstance(kind, type) and issubclass(kind, enum.Enum)
+            else ()
+        )
 
 
 def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
@@ -225,7 +260,11 @@ def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
         if dataclasses.is_dataclass(inner):
             yield from entries(inner, f"{key}.")
         else:
-            default = each.default if each.default_factory is dataclasses.MISSING else each.default_factory()
+            default = (
+                each.default
+                if each.default_factory is dataclasses.MISSING
+                else each.default_factory()
+            )
             yield Entry(key, declared_of(each), hints[each.name], default)
 
 
@@ -238,7 +277,8 @@ def _inner(hint: Any) -> Any:
 
 
 def dump(value: Any) -> Any:
-    """Return a value as plain JSON or TOML values: tables as dicts, enums by value, tuples as lists; None is kept.
+    """Return a value as plain JSON or TOML values: tables as dicts, enums by value, tuples as
+    lists; None is kept.
 
     Args:
         value: A dataclass, or a value inside one.

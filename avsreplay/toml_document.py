@@ -1,6 +1,8 @@
-"""TOML documents: reading one into a parameter class (``settings``), overriding keys, and writing one.
+"""TOML documents: reading one into a parameter class (``settings``), overriding keys, and writing
+one.
 
-An unknown key, a missing one, a wrong type or a value out of range is a UsageError that names the file and the line.
+An unknown key, a missing one, a wrong type or a value out of range is a UsageError that names the
+file and the line.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ class Document:
     origins: Mapping[tuple[str, ...], str] = dataclasses.field(default_factory=dict)
 
     def where(self, path: Sequence[str | int]) -> str:
-        """Return ``name:line`` of a key, ``name`` if it has no line, or where an assignment replaced it.
+        """Return ``name:line`` of a key, ``name`` if it has no line, or where an assignment
+        replaced it.
 
         Args:
             path: the keys from the root to the key; the entries of an array of tables by index.
@@ -65,7 +68,9 @@ def load(path: str | Path) -> Document:
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)  # a pipe or a device has no size
         if len(data) > MAX_BYTES:
-            raise UnreadableInput("larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file")
+            raise UnreadableInput(
+                "larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file"
+            )
         text = data.decode("utf-8")
     except FileNotFoundError:
         raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
@@ -91,14 +96,17 @@ def parse(text: str, name: str) -> Document:
         return Document(name, tomllib.loads(text), text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         message = str(error) or "nested too deeply"
-        raise UsageError(f"not valid TOML: {message}", where=name, hint="correct the syntax") from None
+        raise UsageError(
+            f"not valid TOML: {message}", where=name, hint="correct the syntax"
+        ) from None
 
 
 class Assignment(str):
     """An assignment ``a.b=value`` that an option other than ``--set`` stands for.
 
     Attributes:
-        given: option or environment variable with its value, as the user wrote it; error messages name it.
+        given: option or environment variable with its value, as the user wrote it; error messages
+            name it.
     """
 
     __slots__ = ("given",)
@@ -116,7 +124,8 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
 
     Args:
         document: the document; it is not changed.
-        assignments: each ``a.b=value`` or an ``Assignment``; a value that is not TOML is taken as text.
+        assignments: each ``a.b=value`` or an ``Assignment``; a value that is not TOML is taken as
+            text.
 
     Raises:
         UsageError: an assignment has another form, or a part of its key is not a table.
@@ -127,7 +136,9 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
         given = assignment.given if isinstance(assignment, Assignment) else f"--set {assignment}"
         if not sep or not key.strip():
             hint = "for example --set register.gate_m=0.2"
-            raise UsageError(f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint)
+            raise UsageError(
+                f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint
+            )
         try:
             value = tomllib.loads(f"v = {raw}")["v"]
         except (tomllib.TOMLDecodeError, RecursionError):
@@ -158,7 +169,8 @@ def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T
         path: the keys from the root to the table; an absent table gives the defaults.
 
     Raises:
-        UsageError: a key is unknown or missing, a type is wrong, or a value is invalid for the class.
+        UsageError: a key is unknown or missing, a type is wrong, or a value is invalid for the
+            class.
     """
     table: Any = document.table
     for part in path:
@@ -183,7 +195,9 @@ class _Builder:
         if unknown is not None:
             hint = self.nearest(path, unknown, table[unknown], known)
             raise self.error((*path, unknown), f"unknown key '{_dotted((*path, unknown))}'", hint)
-        required = (n for n, f in known.items() if f.default is f.default_factory is dataclasses.MISSING)
+        required = (
+            n for n, f in known.items() if f.default is f.default_factory is dataclasses.MISSING
+        )
         missing = next((name for name in required if name not in table), None)
         if missing:
             raise self.error(path, f"missing key '{_dotted((*path, missing))}'", "add it")
@@ -200,50 +214,76 @@ class _Builder:
         """A value of the type that a field declares."""
         origin, args = typing.get_origin(hint), typing.get_args(hint)
         if origin in (typing.Union, types.UnionType):
-            return None if value is None else self.value(next(a for a in args if a is not type(None)), value, path)
+            return (
+                None
+                if value is None
+                else self.value(next(a for a in args if a is not type(None)), value, path)
+            )
         if dataclasses.is_dataclass(hint):
             return self.table(hint, value, path)
         if origin is tuple and isinstance(value, (list, tuple)):
             return self._tuple(args, value, path)
         if isinstance(hint, type) and issubclass(hint, enum.Enum):
             return self._member(hint, value, path)
-        if hint is float and isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 1 << 1023:
+        if (
+            hint is float
+            and isinstance(value, int)
+            and not isinstance(value, bool)
+            and abs(value) <= 1 << 1023
+        ):
             return float(value)
         if hint is Path and isinstance(value, str):
             return Path(value)
         if hint is Any or (
-            isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+            isinstance(hint, type)
+            and isinstance(value, hint)
+            and isinstance(value, bool) == (hint is bool)
         ):
             return value
         shown = repr(value) if len(repr(value)) <= 60 else f"{repr(value)[:57]}..."
-        raise self.error(path, f"'{_dotted(path)}' must be {_type_name(hint)}, not {shown}", "correct the value")
+        raise self.error(
+            path, f"'{_dotted(path)}' must be {_type_name(hint)}, not {shown}", "correct the value"
+        )
 
     def _member(self, kind: type[enum.Enum], value: Any, path: _Path) -> enum.Enum:
         allowed = [member.value for member in kind]
         if value in allowed:
             return kind(value)
-        raise self.error(path, f"'{_dotted(path)}' is {value!r}", f"one of: {', '.join(map(str, allowed))}")
+        raise self.error(
+            path, f"'{_dotted(path)}' is {value!r}", f"one of: {', '.join(map(str, allowed))}"
+        )
 
     def _tuple(self, args: tuple[Any, ...], value: Sequence[Any], path: _Path) -> tuple[Any, ...]:
         if len(args) == 2 and args[1] is Ellipsis:
             args = (args[0],) * len(value)
         if len(args) != len(value):
             raise self.error(
-                path, f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}", "correct the value"
+                path,
+                f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}",
+                "correct the value",
             )
-        return tuple(self.value(a, v, (*path, i)) for i, (a, v) in enumerate(zip(args, value, strict=True)))
+        return tuple(
+            self.value(a, v, (*path, i)) for i, (a, v) in enumerate(zip(args, value, strict=True))
+        )
 
     def nearest(self, path: _Path, key: str, value: Any, known: Mapping[str, Any]) -> str:
-        """A hint that names the known key most like an unknown one, of this table or of any other."""
+        """A hint that names the known key most like an unknown one, of this table or of any
+        other.
+        """
         inside: _Path = (key,)
-        while isinstance(value, Mapping) and value:  # an unknown table: its content determines the suggestion
+        while (
+            isinstance(value, Mapping) and value
+        ):  # an unknown table: its content determines the suggestion
             name, value = next(iter(value.items()))
             inside = (*inside, name)
         whole, leaf = _dotted((*path, *inside)), str(inside[-1])
 
         def likeness(entry: str) -> tuple[float, float]:
             in_full = difflib.SequenceMatcher(None, whole, entry).ratio()
-            return max(in_full, difflib.SequenceMatcher(None, leaf, entry.rpartition(".")[2]).ratio()), in_full
+            return (
+                max(in_full, difflib.SequenceMatcher(None, leaf, entry.rpartition(".")[2]).ratio()),
+                in_full,
+            )
 
         here = [_dotted((*path, name)) for name in known]
         best = max([*here, *(entry.key for entry in entries(self.cls, self.prefix))], key=likeness)
@@ -287,7 +327,8 @@ def _line_of(text: str, path: Sequence[str | int]) -> int | None:
 
 
 def to_toml(value: Any, name: str = "") -> str:
-    """A parameter object as commented TOML that ``build`` reads back; a setting without a value is a comment.
+    """A parameter object as commented TOML that ``build`` reads back; a setting without a value is
+    a comment.
 
     Args:
         value: The object.
@@ -295,7 +336,9 @@ def to_toml(value: Any, name: str = "") -> str:
     """
     lines = [f"# {name}"] if name else []
     table = ""
-    for entry in sorted(entries(type(value)), key=lambda each: "." in each.key):  # a key after a table is the table's
+    for entry in sorted(
+        entries(type(value)), key=lambda each: "." in each.key
+    ):  # a key after a table is the table's
         parent, _, leaf = entry.key.rpartition(".")
         if parent != table:
             lines += ["", f"[{parent}]"]
@@ -319,7 +362,9 @@ def _commented(entry: Entry) -> list[str]:
         facts.append(f"default {toml_value(entry.default)}")
     unit = f" [{declared.unit}]" if declared.unit else ""
     text = f"{declared.doc}{unit}" + (f" ({'; '.join(facts)})" if facts else "")
-    return textwrap.wrap(text, 118, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return textwrap.wrap(
+        text, 118, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
+    )
 
 
 def _assignment(leaf: str, value: Any, entry: Entry) -> str:

@@ -1,4 +1,7 @@
-"""Listeners that show a run in viewers: ``result.mcap`` for Foxglove, Lichtblick and rosbags, and Rerun."""
+"""Listeners that show a run in viewers.
+
+``result.mcap`` for Foxglove, Lichtblick and rosbags, and Rerun.
+"""
 
 from __future__ import annotations
 
@@ -30,32 +33,45 @@ from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
-SHOWN_POINTS = 2000  # most points of a scan that a viewer gets; the log of the scans has all of them
+SHOWN_POINTS = (
+    2000  # most points of a scan that a viewer gets; the log of the scans has all of them
+)
 RESIDUAL_REACH = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-_IN_MESSAGES = {"seq", "t_ns", *_POSE_COLUMNS, *(f"reg_{name}" for name in _POSE_COLUMNS)}  # what other messages hold
+_IN_MESSAGES = {
+    "seq",
+    "t_ns",
+    *_POSE_COLUMNS,
+    *(f"reg_{name}" for name in _POSE_COLUMNS),
+}  # what other messages hold
 _NUMERIC = ("float", "int", "bool")  # types of columns, as declared, without "| None"
-_COLUMNS = tuple(f.name for f in fields(Row) if str(f.type).split()[0] in _NUMERIC and f.name not in _IN_MESSAGES)
+_COLUMNS = tuple(
+    f.name for f in fields(Row) if str(f.type).split()[0] in _NUMERIC and f.name not in _IN_MESSAGES
+)
 _VALUES = attrgetter(*_COLUMNS)
 RERUN_PORT = 9876  # port of a Rerun viewer
 
 
 def message_covariance(outcome: Outcome) -> Array:
-    """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad].
+    """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A}
+    [rad].
 
     Args:
         outcome: result of a scan, with the covariance of its pose in metres and half angles in {B}.
     """
     to_a = np.eye(6)
-    to_a[3:, 3:] = 2.0 * geometry.matrix(outcome.belief.x.q_ab)  # half angle in {B} -> full angle in {A}
+    to_a[3:, 3:] = 2.0 * geometry.matrix(
+        outcome.belief.x.q_ab
+    )  # half angle in {B} -> full angle in {A}
     return np.asarray(to_a @ outcome.pose_covariance @ to_a.T)
 
 
 def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
     """Return at most 2000 points of a scan with their distances to the model at the estimate.
 
-    The points have an even stride in their order, and the distances are at most 5 % of the model's extent.
+    The points have an even stride in their order, and the distances are at most 5 % of the model's
+    extent.
 
     Args:
         run: the open run.
@@ -63,7 +79,9 @@ def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
     """
     source, pose = scan.outcome.scan, scan.outcome.pose
     cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=SHOWN_POINTS)
-    distances = run.registrar.distance(cloud.points, pose, RESIDUAL_REACH * run.registrar.index.extent_m)
+    distances = run.registrar.distance(
+        cloud.points, pose, RESIDUAL_REACH * run.registrar.index.extent_m
+    )
     return CloudView(cloud.seq, cloud.points, np.asarray(distances, np.float32), cloud.intensity)
 
 
@@ -74,7 +92,9 @@ class NewPaths:
         self._known: Segment | None = None
 
     def of(self, state: PipelineState) -> tuple[Array, Array] | None:
-        """Times (n,) [s] and positions (n, 3) [m] of a flight not seen before, None where there is none."""
+        """Times (n,) [s] and positions (n, 3) [m] of a flight not seen before, None where there is
+        none.
+        """
         segment = planned_segment(state)
         if segment is None or segment is self._known or segment.path is None:
             return None
@@ -93,7 +113,9 @@ class ResultLogWriter:
         self._log = ResultLog(path, run.surface, facts, approach_cones(run), _COLUMNS)
 
     def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int] = ()) -> None:
-        """Take over the messages of an earlier log of the same run, with the columns of the rows that have changed."""
+        """Take over the messages of an earlier log of the same run, with the columns of the rows
+        that have changed.
+        """
         self._log.copy(written, rows[-1].reason, {k: _numbers(rows[k]) for k in changed})
 
     def close(self) -> None:
@@ -103,7 +125,9 @@ class ResultLogWriter:
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
         """Take one scan: the points that are shown; times and positions of a new flight, if any."""
         row, outcome = scan.row, scan.outcome
-        values = {name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None}
+        values = {
+            name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None
+        }
         self._log.write(
             ResultFrame(
                 t_ns=row.t_ns,
@@ -129,7 +153,8 @@ def _numbers(row: Row) -> list[float]:
 
 
 def approach_cones(run: Run) -> Array | None:
-    """Return the ends (m, 3) of line pieces in {C} [m] that outline the cones of the approach; None without a cone.
+    """Return the ends (m, 3) of line pieces in {C} [m] that outline the cones of the approach; None
+    without a cone.
 
     Args:
         run: its configuration gives angles, lengths and the axis of the fixture.
@@ -141,18 +166,22 @@ def approach_cones(run: Run) -> Array | None:
 
 
 class RerunStream:
-    """A listener that shows a run in a Rerun viewer, or writes it to a file for one (extra ``rerun``)."""
+    """A listener that shows a run in a Rerun viewer, or writes it to a file for one (extra
+    ``rerun``).
+    """
 
     def __init__(self, run: Run, target: str) -> None:
         """Open the viewer or the file, and send what does not change.
 
         Args:
             run: the run that is shown.
-            target: "view" starts a viewer, "connect" uses one that runs on this computer; else an .rrd file to write.
+            target: "view" starts a viewer, "connect" uses one that runs on this computer; else an
+                .rrd file to write.
 
         Raises:
             MissingBackend: rerun-sdk is not installed.
-            UsageError: there is no display, no viewer to connect to, or the file has another suffix.
+            UsageError: there is no display, no viewer to connect to, or the file has another
+                suffix.
         """
         _check_target(target)
         try:
@@ -177,7 +206,9 @@ class RerunStream:
             rerun.log(f"camera/{name}/model", model, static=True)
         cones = approach_cones(run)
         if cones is not None:
-            rerun.log("camera/estimate/cone", rerun.LineStrips3D(cones.reshape(-1, 2, 3)), static=True)
+            rerun.log(
+                "camera/estimate/cone", rerun.LineStrips3D(cones.reshape(-1, 2, 3)), static=True
+            )
 
     def __call__(self, scan: ReplayedScan) -> None:
         """Take one scan of a run."""
@@ -229,13 +260,17 @@ class RerunStream:
 def _colours(share: Array) -> Array:
     """Colours (n, 3) from blue (on the model) to yellow (far from it); ``share`` (n,) is 0 to 1."""
     near, far = np.array([0.0, 114.0, 178.0]), np.array([240.0, 228.0, 66.0])
-    return np.asarray(near + np.clip(np.nan_to_num(share, nan=1.0), 0.0, 1.0)[:, None] * (far - near), np.uint8)
+    return np.asarray(
+        near + np.clip(np.nan_to_num(share, nan=1.0), 0.0, 1.0)[:, None] * (far - near), np.uint8
+    )
 
 
 def _check_target(target: str) -> None:
     """Raise UsageError where nothing can be shown."""
     if target == "view":
-        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        if sys.platform.startswith("linux") and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        ):
             hint = "write a file with --rerun FILE.rrd, or start 'rerun' and use --rerun connect"
             raise UsageError("there is no display", where="--rerun view", hint=hint)
     elif target == "connect":
@@ -243,8 +278,14 @@ def _check_target(target: str) -> None:
             socket.create_connection(("127.0.0.1", RERUN_PORT), 1.0).close()
         except OSError:
             what = f"no viewer listens on port {RERUN_PORT} of this computer"
-            raise UsageError(what, where="--rerun connect", hint="start one with the command 'rerun'") from None
+            raise UsageError(
+                what, where="--rerun connect", hint="start one with the command 'rerun'"
+            ) from None
     elif not target.endswith(".rrd"):
-        raise UsageError("neither view, connect nor a file .rrd", where=f"--rerun {target}", hint="name a file .rrd")
+        raise UsageError(
+            "neither view, connect nor a file .rrd",
+            where=f"--rerun {target}",
+            hint="name a file .rrd",
+        )
     else:
         check_output(Path(target))

@@ -1,9 +1,10 @@
-"""Makes the pictures of the documentation from the tool's own output: ``python docs/pictures.py [LOG [FULL]]``.
+"""Makes the pictures of the documentation from the tool's own output: ``python docs/pictures.py
+[LOG [FULL]]``.
 
-Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of the fixtures; with
-FULL, a recording of the built-in scenario, it also makes the plots of the results page.
-The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390 pixels, a comparison,
-and an animation.
+Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of
+the fixtures; with FULL, a recording of the built-in scenario, it also makes the plots of the
+results page. The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390
+pixels, a comparison, and an animation.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ IMAGES = ROOT / "docs" / "images"
 MOST_BYTES = 1_500_000
 COLOURS = 128
 FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--use-gl=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ),
     *("--hide-scrollbars", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--virtual-time-budget=8000"),
 )
@@ -35,7 +42,13 @@ def terminal(columns: int, *words: str, cwd: Path) -> Text:
     """What a command prints on a terminal of this width, with its colours."""
     reader, writer = pty.openpty()
     os.set_blocking(reader, True)
-    env = {**os.environ, "COLUMNS": str(columns), "LINES": "60", "TERM": "xterm-256color", "COLORTERM": "truecolor"}
+    env = {
+        **os.environ,
+        "COLUMNS": str(columns),
+        "LINES": "60",
+        "TERM": "xterm-256color",
+        "COLORTERM": "truecolor",
+    }
     process = subprocess.Popen(
         [sys.executable, "-m", "avsreplay", *words],
         cwd=cwd,
@@ -57,13 +70,18 @@ def terminal(columns: int, *words: str, cwd: Path) -> Text:
 
 def screen(text: Text, columns: int, lines: int, to: Path, folder: Path, command: str) -> None:
     """A picture of the first lines of a terminal."""
-    console = Console(record=True, width=columns, file=(folder / "unused").open("w"), force_terminal=True)
+    console = Console(
+        record=True, width=columns, file=(folder / "unused").open("w"), force_terminal=True
+    )
     console.print(Text(f"$ {command}", style="bold"))
     for line in text.split("\n")[:lines]:
         console.print(line, no_wrap=True, crop=True)
     page = folder / "terminal.html"
     style = "<style>body{background:#14181d!important;color:#e6e6e6!important;margin:14px}pre{font-size:14px}</style>"
-    page.write_text(console.export_html(inline_styles=True).replace("</head>", style + "</head>"), encoding="utf-8")
+    page.write_text(
+        console.export_html(inline_styles=True).replace("</head>", style + "</head>"),
+        encoding="utf-8",
+    )
     shot(page, to, round(8.45 * columns) + 30, round(16.05 * (lines + 1)) + 30)
 
 
@@ -79,9 +97,15 @@ def shot(page: Path, to: Path, width: int, height: int) -> None:
 
 
 def phone(page: Path, to: Path, folder: Path) -> None:
-    """A screenshot at 390 pixels: Chromium's window is at least 500 wide, so the page is shown in a frame."""
+    """A screenshot at 390 pixels.
+
+    Chromium's window is at least 500 wide, so the page is shown in a frame.
+    """
     frame = folder / "phone.html"
-    inner = f'<iframe src="{page.resolve().as_uri()}" style="width:390px;height:1500px;border:0"></iframe>'
+    inner = (
+        f'<iframe src="{page.resolve().as_uri()}"'
+        ' style="width:390px;height:1500px;border:0"></iframe>'
+    )
     frame.write_text(f'<body style="margin:0">{inner}</body>', encoding="utf-8")
     shot(frame, to, 390, 1500)
 
@@ -100,15 +124,27 @@ def animation(frames: list[Path], to: Path) -> None:
     images = []
     for path in frames:
         image = Image.open(path).convert("RGB")
-        image = image.resize((720, round(image.height * 720 / image.width)), Image.Resampling.LANCZOS)
+        image = image.resize(
+            (720, round(image.height * 720 / image.width)), Image.Resampling.LANCZOS
+        )
         canvas = Image.new("RGB", (720, 540), (20, 24, 29))
         canvas.paste(image.crop((0, 0, 720, 540)), (0, 0))
         images.append(canvas.quantize(COLOURS, dither=Image.Dither.NONE))
-    images[0].save(to, save_all=True, append_images=images[1:], duration=[1800, 3500, 4500], loop=0, optimize=True)
+    images[0].save(
+        to,
+        save_all=True,
+        append_images=images[1:],
+        duration=[1800, 3500, 4500],
+        loop=0,
+        optimize=True,
+    )
 
 
 def main(log: Path, full: Path | None = None) -> None:
-    """Make all pictures; ``full`` is the recording of the built-in scenario, for the page of results."""
+    """Make all pictures.
+
+    ``full`` is the recording of the built-in scenario, for the page of results.
+    """
     IMAGES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -126,10 +162,15 @@ def main(log: Path, full: Path | None = None) -> None:
             shutil.copy(full, folder / "full.mcap")
             terminal(80, "run", "full.mcap", "-o", "full", "--report", cwd=folder)
             plots(folder / "full" / "report.html", IMAGES / "results.png", folder)
-        terminal(80, "run", "tumble.mcap", "-o", "other", "--set", "estimator.adapt=off", cwd=folder)
+        terminal(
+            80, "run", "tumble.mcap", "-o", "other", "--set", "estimator.adapt=off", cwd=folder
+        )
         terminal(80, "compare", "results", "other", "-o", "compare.html", cwd=folder)
         shot(folder / "compare.html", IMAGES / "comparison.png", 1400, 1000)
-        animation([folder / "typed.png", IMAGES / "verdict-80.png", IMAGES / "page.png"], IMAGES / "demo.gif")
+        animation(
+            [folder / "typed.png", IMAGES / "verdict-80.png", IMAGES / "page.png"],
+            IMAGES / "demo.gif",
+        )
     total = sum(path.stat().st_size for path in IMAGES.iterdir())
     print(f"{IMAGES}: {total / 1e6:.2f} MB")
     if total > MOST_BYTES:

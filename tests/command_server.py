@@ -1,8 +1,10 @@
-"""A process that has imported the package and runs each command in a fork of itself: 20 ms instead of 0.7 s.
+"""A process that has imported the package and runs each command in a fork of itself: 20 ms instead
+of 0.7 s.
 
-A command is run as in a process of its own: own standard streams, working directory, environment and exit code. What
-must be known when a process starts (variables of Python and of the arithmetic) is compared with that of the server; the
-test then starts a process. Modules that a command imports are imported by the server, too, for the following commands.
+A command is run as in a process of its own: own standard streams, working directory, environment
+and exit code. What must be known when a process starts (variables of Python and of the arithmetic)
+is compared with that of the server; the test then starts a process. Modules that a command imports
+are imported by the server, too, for the following commands.
 """
 
 from __future__ import annotations
@@ -18,7 +20,17 @@ import tempfile
 import traceback
 from pathlib import Path
 
-START_ONLY = ("PYTHON", "LD_", "LC_", "LANG", "OPENBLAS", "OMP_", "NPY_", "GLIBC_", "AVSREPLAY_ARITHMETIC")
+START_ONLY = (
+    "PYTHON",
+    "LD_",
+    "LC_",
+    "LANG",
+    "OPENBLAS",
+    "OMP_",
+    "NPY_",
+    "GLIBC_",
+    "AVSREPLAY_ARITHMETIC",
+)
 KEPT = (
     "avsreplay",
     "scipy",
@@ -51,13 +63,22 @@ class CommandServer:
         self._environment = fixed(os.environ)
 
     def run(self, args, cwd, environment, timeout):
-        """Run a command; exit code, standard output and error, or None where it needs a process of its own."""
+        """Run a command.
+
+        Exit code, standard output and error, or None where it needs a process of its own.
+        """
         if not hasattr(os, "fork") or fixed(environment) != self._environment:
             return None
         if self._process is None:
             self._start()
         names = [str(Path(self._folder.name) / name) for name in ("out", "err")]
-        request = {"args": args, "cwd": str(cwd or Path.cwd()), "env": environment, "files": names, "limit": timeout}
+        request = {
+            "args": args,
+            "cwd": str(cwd or Path.cwd()),
+            "env": environment,
+            "files": names,
+            "limit": timeout,
+        }
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         code, self.spent_s = json.loads(self._process.stdout.readline())
@@ -70,7 +91,9 @@ class CommandServer:
         environment = {**os.environ, **pins, arithmetic.THREADS: "1"}
         self._folder = tempfile.TemporaryDirectory()
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        self._process = subprocess.Popen([sys.executable, __file__], env=environment, text=True, **pipes)
+        self._process = subprocess.Popen(
+            [sys.executable, __file__], env=environment, text=True, **pipes
+        )
 
     def close(self):
         """End the server."""
@@ -114,7 +137,10 @@ def serve():
 
 
 def exit_code(args):
-    """Run a command in this process, which must be a fork that ends after it; other exceptions are not caught."""
+    """Run a command in this process, which must be a fork that ends after it.
+
+    Other exceptions are not caught.
+    """
     sys.argv = ["avsreplay", *args]
     from avsreplay.__main__ import main
 

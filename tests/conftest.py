@@ -1,4 +1,7 @@
-"""Shared fixtures: the command line, built-in cases, real data if it is available, constructed rows."""
+"""Shared fixtures.
+
+The command line, built-in cases, real data if it is available, constructed rows.
+"""
 
 from __future__ import annotations
 
@@ -38,13 +41,22 @@ class Done:
 
 
 def avsreplay(*args, cwd=None, env=None, timeout=300):
-    """Run the command line as a user does: in a fork of a process that has imported it, or in one of its own."""
+    """Run the command line as a user does.
+
+    In a fork of a process that has imported it, or in one of its own.
+    """
     words, environment = [*map(str, args)], {**os.environ, **(env or {})}
     done = SERVER.run(words, cwd, environment, timeout)
     if done is None:
         command = [sys.executable, "-m", "avsreplay", *words]
         ended = subprocess.run(
-            command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+            command,
+            cwd=cwd,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
         )
         done = ended.returncode, ended.stdout, ended.stderr
     return Done(*done)
@@ -65,7 +77,9 @@ def scan(surface: Surface) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def cli():
-    avsreplay("run", ROOT / "fixtures" / "tumble.mcap", "--n-scans", "1", "--json")  # the server keeps the imports
+    avsreplay(
+        "run", ROOT / "fixtures" / "tumble.mcap", "--n-scans", "1", "--json"
+    )  # the server keeps the imports
     yield avsreplay
     SERVER.close()
 
@@ -83,12 +97,17 @@ def shared_data():
 
 
 SLOW = ROOT / "tests" / "slow.txt"
-MOST_S, MOST_FIXTURE_S = 0.2, 1.0  # processor time of a quick test, and of a fixture of a module with quick tests
+MOST_S, MOST_FIXTURE_S = (
+    0.2,
+    1.0,
+)  # processor time of a quick test, and of a fixture of a module with quick tests
 SPENT: dict[object, float] = {}  # largest processor time of each test and fixture
 
 
 def pytest_addoption(parser):
-    parser.addoption("--write-slow", action="store_true", help="write the tests that are slow to tests/slow.txt")
+    parser.addoption(
+        "--write-slow", action="store_true", help="write the tests that are slow to tests/slow.txt"
+    )
 
 
 def pytest_collection_modifyitems(items):
@@ -137,7 +156,9 @@ def pytest_sessionfinish(session):
         return
     table = {name: spent for name, spent in listed_as_slow().items() if name not in SPENT}
     for item in session.items:
-        definitions = [d for found in item._fixtureinfo.name2fixturedefs.values() for d in found[-1:]]
+        definitions = [
+            d for found in item._fixtureinfo.name2fixturedefs.values() for d in found[-1:]
+        ]
         fixture = max((SPENT.get(d, 0.0) for d in definitions if d.scope == "module"), default=0.0)
         spent = max(SPENT.get(named(item), 0.0), fixture if fixture > MOST_FIXTURE_S else 0.0)
         if named(item) in SPENT and spent > MOST_S:
@@ -152,9 +173,14 @@ START_NS = 1_700_000_000_123_456_789
 
 @pytest.fixture(scope="session")
 def make_rows() -> Callable[..., list[Row]]:
-    """``make_rows(n, seed=0, blackout=range(...), **columns)``: a seeded run whose blackout has no scan to use."""
+    """``make_rows(n, seed=0, blackout=range(...), **columns)``.
 
-    def build(n: int = 40, seed: int = 0, blackout: range = range(20, 26), **changes: object) -> list[Row]:
+    A seeded run whose blackout has no scan to use.
+    """
+
+    def build(
+        n: int = 40, seed: int = 0, blackout: range = range(20, 26), **changes: object
+    ) -> list[Row]:
         rng = np.random.Generator(np.random.PCG64(seed))
         return [_row(k, rng, k in blackout, changes) for k in range(n)]
 

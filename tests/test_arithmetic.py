@@ -1,4 +1,6 @@
-"""The variants of arithmetic that libraries choose by the processor are pinned before they are loaded."""
+"""The variants of arithmetic that libraries choose by the processor are pinned before they are
+loaded.
+"""
 
 import json
 import os
@@ -9,18 +11,27 @@ import pytest
 
 from avsreplay import arithmetic
 
-needs_variants = pytest.mark.skipif(not arithmetic.has_variants(), reason="only glibc on x86-64 has these variants")
+needs_variants = pytest.mark.skipif(
+    not arithmetic.has_variants(), reason="only glibc on x86-64 has these variants"
+)
 OTHER = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4", "GLIBC_TUNABLES": ""}
 
 
 @needs_variants
 def test_emulated_processors_give_the_same_bytes(cli, fixtures_folder, tmp_path):
-    """Without the pin, more than 2,000 cells of these rows differ between two kernels of OpenBLAS."""
+    """Without the pin, more than 2,000 cells of these rows differ between two kernels of
+    OpenBLAS.
+    """
     log, rows = fixtures_folder / "spin-raster.mcap", []
     for number, variables in enumerate(({"OPENBLAS_CORETYPE": "Prescott"}, OTHER)):
-        assert cli("run", log, "-o", tmp_path / f"{number}", "--n-scans", "12", env=variables).code == 0
+        assert (
+            cli("run", log, "-o", tmp_path / f"{number}", "--n-scans", "12", env=variables).code
+            == 0
+        )
         rows.append((tmp_path / f"{number}" / "rows.jsonl").read_bytes())
-        assert json.loads((tmp_path / f"{number}" / "run.json").read_bytes())["arithmetic"] == "pinned"
+        assert (
+            json.loads((tmp_path / f"{number}" / "run.json").read_bytes())["arithmetic"] == "pinned"
+        )
     assert rows[0] == rows[1]
 
 
@@ -33,7 +44,11 @@ def test_the_record_of_a_run_states_that_the_arithmetic_is_native(cli, fixtures_
 def test_an_unknown_choice_is_one_line(cli):
     done = cli("backends", env={arithmetic.VARIABLE: "fast"})
     assert done.code == 2
-    assert done.err == f"avsreplay: environment {arithmetic.VARIABLE}: 'fast' is unknown; use pinned or native\n"
+    assert (
+        done.err
+        == f"avsreplay: environment {arithmetic.VARIABLE}: 'fast' is unknown; use pinned or"
+        " native\n"
+    )
 
 
 SCRIPT = """
@@ -51,7 +66,9 @@ def pinned_script(before: str, **variables: str) -> list[str]:
     """Lines printed by a script that pins the arithmetic."""
     env = {k: v for k, v in os.environ.items() if k not in arithmetic.PINS} | variables
     script = [sys.executable, "-c", SCRIPT.format(before=before)]
-    return subprocess.run(script, env=env, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
+    return subprocess.run(
+        script, env=env, capture_output=True, text=True, check=True, timeout=60
+    ).stdout.splitlines()
 
 
 @needs_variants
@@ -59,7 +76,9 @@ def test_the_process_starts_once_more_and_keeps_other_tunables():
     lines = pinned_script("", GLIBC_TUNABLES="glibc.malloc.check=0:glibc.cpu.hwcaps=-AVX512F")
     assert lines[:-1] == ["start", "start"]
     assert lines[-1] == f"pinned glibc.malloc.check=0:{arithmetic.PINS['GLIBC_TUNABLES']}"
-    assert len(pinned_script("", **arithmetic.PINS)) == 2, "nothing is started again if the variables are set already"
+    assert len(pinned_script("", **arithmetic.PINS)) == 2, (
+        "nothing is started again if the variables are set already"
+    )
 
 
 def test_a_process_that_has_imported_numpy_is_not_replaced():
@@ -77,12 +96,16 @@ for row in avsreplay.replay(sys.argv[1], n_scans=12):
 
 
 @needs_variants
-def test_a_script_that_pins_its_arithmetic_has_the_rows_of_the_command_on_any_processor(cli, fixtures_folder, tmp_path):
+def test_a_script_that_pins_its_arithmetic_has_the_rows_of_the_command_on_any_processor(
+    cli, fixtures_folder, tmp_path
+):
     log, script = fixtures_folder / "spin-raster.mcap", tmp_path / "script.py"
     script.write_text(API)
     assert cli("run", log, "-o", tmp_path / "r", "--n-scans", "12").code == 0
     rows = (tmp_path / "r" / "rows.jsonl").read_text(encoding="utf-8")
     for variables in ({"OPENBLAS_CORETYPE": "Prescott"}, OTHER):
         env = {k: v for k, v in os.environ.items() if k not in arithmetic.PINS} | variables
-        done = subprocess.run([sys.executable, script, log], env=env, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, script, log], env=env, capture_output=True, text=True, check=True
+        )
         assert done.stdout == rows

@@ -1,4 +1,7 @@
-"""A continued run gives the bytes of an uninterrupted run; a checkpoint of unknown origin executes no code."""
+"""A continued run gives the bytes of an uninterrupted run.
+
+A checkpoint of unknown origin executes no code.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ def job(log, *assignments, **options):
 
 
 def replay(work, folder, count=None, resume=False):
-    """Replay ``count`` scans (None: all that are left) into a result directory; return the number of rows in it."""
+    """Replay ``count`` scans (None: all that are left) into a result directory.
+
+    Return the number of rows in it.
+    """
     with Run(work) as run, ResultWriter(ResultDirectory(folder, overwrite=resume), run) as writer:
         rows = writer.resume({"config": run.facts()["config"]}) if resume else []
         rows += islice(run.rows(writer.listeners), count)
@@ -41,7 +47,9 @@ def files(folder):
     ("assignments", "stops"),
     [((), (1, 20)), (("reference=fit", "estimator.start=cold"), (12,)), (("init=auto",), (2,))],
 )
-def test_a_continued_run_has_the_bytes_of_a_run_without_interruption(fixtures_folder, tmp_path, assignments, stops):
+def test_a_continued_run_has_the_bytes_of_a_run_without_interruption(
+    fixtures_folder, tmp_path, assignments, stops
+):
     work = job(fixtures_folder / "tumble.mcap", *assignments, n_scans=26)
     assert replay(work, tmp_path / "whole") == 26
     done = 0
@@ -57,7 +65,11 @@ def test_other_settings_are_refused(fixtures_folder, tmp_path):
     replay(job(fixtures_folder / "tumble.mcap", n_scans=4), tmp_path / "r", 2)
     before = files(tmp_path / "r")
     with pytest.raises(UsageError, match="differs in: config"):
-        replay(job(fixtures_folder / "tumble.mcap", "faults.policy=all", n_scans=4), tmp_path / "r", resume=True)
+        replay(
+            job(fixtures_folder / "tumble.mcap", "faults.policy=all", n_scans=4),
+            tmp_path / "r",
+            resume=True,
+        )
     assert files(tmp_path / "r") == before
 
 
@@ -96,18 +108,36 @@ def test_objects_of_the_run_are_named_and_not_stored(tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [("os", "unlink"), ("avsreplay.files", "is_stream"), ("avsreplay.log.writer", "os.unlink"), ("builtins", "eval")],
+    [
+        ("os", "unlink"),
+        ("avsreplay.files", "is_stream"),
+        ("avsreplay.log.writer", "os.unlink"),
+        ("builtins", "eval"),
+    ],
 )
 def test_a_checkpoint_from_elsewhere_runs_no_code(tmp_path, module, name):
     path, victim = tmp_path / "c", tmp_path / "victim"
     victim.write_text("x")
-    path.write_bytes(f"c{module}\n{name}\n(V{victim}\ntR.".encode())  # protocol 0: call it with the path
+    path.write_bytes(
+        f"c{module}\n{name}\n(V{victim}\ntR.".encode()
+    )  # protocol 0: call it with the path
     with pytest.raises(UnreadableInput, match="cannot be read"):
         unpack(path, {})
     assert victim.exists()
     head = pickle.PROTO + b"\x05"
-    words = [b"\x8c" + bytes([len(word)]) + word.encode() for word in (module, name, str(victim)[-200:])]
-    path.write_bytes(head + words[0] + words[1] + pickle.STACK_GLOBAL + words[2] + pickle.TUPLE1 + pickle.REDUCE + b".")
+    words = [
+        b"\x8c" + bytes([len(word)]) + word.encode() for word in (module, name, str(victim)[-200:])
+    ]
+    path.write_bytes(
+        head
+        + words[0]
+        + words[1]
+        + pickle.STACK_GLOBAL
+        + words[2]
+        + pickle.TUPLE1
+        + pickle.REDUCE
+        + b"."
+    )
     with pytest.raises(UnreadableInput, match="not allowed"):
         unpack(path, {})
     assert victim.exists()

@@ -1,4 +1,7 @@
-"""The source of the first pose of a replay: not the ground truth, unless the configuration names it."""
+"""The source of the first pose of a replay.
+
+Not the ground truth, unless the configuration names it.
+"""
 
 from __future__ import annotations
 
@@ -42,12 +45,19 @@ def test_a_given_pose_begins_the_replay():
 
 
 def test_a_log_without_a_start_is_searched_and_the_rows_say_so():
-    """The fixture without its initial state, with its true poses: the same as a search without a guess."""
+    """The fixture without its initial state, with its true poses.
+
+    The same as a search without a guess.
+    """
     rows = {}
     for init in ("log", "auto"):
-        with Run(Job(source=LOG, options=SourceOptions(n_scans=1), assignments=(f"init={init}",))) as run:
+        with Run(
+            Job(source=LOG, options=SourceOptions(n_scans=1), assignments=(f"init={init}",))
+        ) as run:
             header = replace(run.source.header, start=None)
-            run._stages = build.stages(run.config, header, run.surface, run.registrar, run.source.truth_of)
+            run._stages = build.stages(
+                run.config, header, run.surface, run.registrar, run.source.truth_of
+            )
             (rows[init],) = run.rows()
     assert rows["log"] == rows["auto"]
     assert rows["log"].guess == "acquired"

@@ -57,7 +57,9 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_missing_library_is_said_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),))
+    monkeypatch.setattr(
+        "avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),)
+    )
     with pytest.raises(MissingBackend):
         benchmark_backends(["kiss"], boxes(), _scans(1))
 

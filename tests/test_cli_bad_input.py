@@ -1,11 +1,19 @@
-"""Bad input gives one line (what, where, what to do), the documented exit code, no traceback and no partial output."""
+"""Bad input gives one line (what, where, what to do), the documented exit code, no traceback and no
+partial output.
+"""
 
 import struct
 
 import pytest
 
-GOOD_PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-FACES = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 %s\n3 0 1 2\n"
+GOOD_PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty"
+    b" float z\n"
+)
+FACES = (
+    b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 %s\n3 0"
+    b" 1 2\n"
+)
 
 
 def check_one_line(done, code, *words):
@@ -111,7 +119,8 @@ def test_an_invalid_option(flags, word, cli, log):
 
 
 @pytest.mark.parametrize(
-    ("scale", "word"), [("1e-320", "the model spans"), ("1e300", "a vertex is at"), ("1.7e308", "not finite")]
+    ("scale", "word"),
+    [("1e-320", "the model spans"), ("1e300", "a vertex is at"), ("1.7e308", "not finite")],
 )
 @pytest.mark.parametrize("command", ["run", "info"])
 def test_a_model_of_an_extreme_scale_is_one_line(command, scale, word, cli, log):
@@ -152,7 +161,9 @@ def test_a_selection_without_a_scan_is_shown_and_not_replayed(option, cli, log):
 
 @pytest.mark.parametrize("size", ["nan", "inf", "0", "-1", "1e-7", "1e7", "1e-320"])
 def test_a_size_that_no_target_has_is_one_line(size, cli, log, tmp_path):
-    check_one_line(cli("odometry", log, "-o", tmp_path / "a.tum", "--n-scans", 2, "--size", size), 2, "--size")
+    check_one_line(
+        cli("odometry", log, "-o", tmp_path / "a.tum", "--n-scans", 2, "--size", size), 2, "--size"
+    )
 
 
 def test_a_config_file_with_a_wrong_key(cli, log, tmp_path):
@@ -231,7 +242,9 @@ def test_an_impossible_robot_is_one_line(tmp_path, text, what):
     ("command", "output", "format_"),
     [("record", "x.bag", "MCAP"), ("model", "m.obj", "PLY"), ("model", "m.STL", "PLY")],
 )
-def test_a_name_that_states_another_format_is_refused(cli, tmp_path, fixtures_folder, command, output, format_):
+def test_a_name_that_states_another_format_is_refused(
+    cli, tmp_path, fixtures_folder, command, output, format_
+):
     done = cli(command, fixtures_folder / "tumble.mcap", "-o", tmp_path / output)
     assert done.code == 2
     assert f"the format is {format_}" in done.err
@@ -241,7 +254,9 @@ def test_a_name_that_states_another_format_is_refused(cli, tmp_path, fixtures_fo
 def test_a_scenario_and_a_result_are_no_logs(cli, tmp_path, fixtures_folder):
     scenario = cli("run", fixtures_folder / "tumble.toml")
     assert (scenario.code, "make a log of it: avsreplay record" in scenario.err) == (3, True)
-    assert cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "-o", tmp_path / "r").code == 0
+    assert (
+        cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "-o", tmp_path / "r").code == 0
+    )
     result = cli("info", tmp_path / "r")
     assert (result.code, "is the result of a run, not a log" in result.err) == (3, True)
 

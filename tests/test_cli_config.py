@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from avsreplay import settings, toml_document
-from avsreplay.cli import SUMMARIES, group
 from avsreplay.cli.config import SECTIONS, SettingOption, declared, reference_page
+from avsreplay.cli.main import SUMMARIES, group
 from avsreplay.config import PAPER, RunConfig, load_config
-from avsreplay.monitor import pose_limit
+from avsreplay.monitor.fault_detection import pose_limit
 from avsreplay.records import Innovation
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,7 +41,10 @@ def test_the_reference_page_holds_every_setting():
 
 
 def test_a_printed_configuration_gives_the_same_run(cli, fixtures_folder, tmp_path):
-    log, chosen = fixtures_folder / "tumble.mcap", ["--set", "register.gate_m=0.05", "--policy", "all"]
+    log, chosen = (
+        fixtures_folder / "tumble.mcap",
+        ["--set", "register.gate_m=0.05", "--policy", "all"],
+    )
     printed = cli("config", log, *chosen)
     assert printed.code == 0, printed.err
     (tmp_path / "c.toml").write_text(printed.out, encoding="utf-8")
@@ -57,7 +60,8 @@ def test_a_printed_configuration_gives_the_same_run(cli, fixtures_folder, tmp_pa
 def test_the_log_brings_its_own_table(cli, tmp_path):
     scenario = tmp_path / "s.toml"
     scenario.write_text(
-        "duration_s = 1.0\n[scanner]\nrays = [16, 16]\n[run.faults]\npolicy = 'all'\n", encoding="utf-8"
+        "duration_s = 1.0\n[scanner]\nrays = [16, 16]\n[run.faults]\npolicy = 'all'\n",
+        encoding="utf-8",
     )
     assert cli("record", scenario, "-o", tmp_path / "s.mcap").code == 0
     assert tomllib.loads(config(str(tmp_path / "s.mcap")))["faults"]["policy"] == "all"
@@ -74,14 +78,21 @@ def test_a_relative_path_of_an_arm_refers_to_the_file_that_states_it(cli, tmp_pa
     assert cli("record", folder / "s.toml", "-o", folder / "s.mcap").code == 0
     stated = str(Path("robots") / "arm.urdf")
     given = {
-        stated: (["--config", "robots/robot.toml"], ["--robot", "robots/robot.toml"], ["robots/s.mcap"]),
+        stated: (
+            ["--config", "robots/robot.toml"],
+            ["--robot", "robots/robot.toml"],
+            ["robots/s.mcap"],
+        ),
         "arm.urdf": (["--set", "robot.urdf=arm.urdf"],),
     }
     for path, options in given.items():
         for option in options:
             assert tomllib.loads(config(*option))["robot"]["urdf"] == path, option
     (folder / "robot.toml").write_text(f"[robot]\nurdf = '{tmp_path}/arm.urdf'\n", encoding="utf-8")
-    assert tomllib.loads(config("--robot", "robots/robot.toml"))["robot"]["urdf"] == f"{tmp_path}/arm.urdf"
+    assert (
+        tomllib.loads(config("--robot", "robots/robot.toml"))["robot"]["urdf"]
+        == f"{tmp_path}/arm.urdf"
+    )
 
 
 def test_json_is_the_configuration_of_a_run():
@@ -91,16 +102,26 @@ def test_json_is_the_configuration_of_a_run():
 
 
 def test_environment_variables_are_those_of_run_and_options_come_before_them():
-    environment = {"AVSREPLAY_RUN_POLICY": "all", "AVSREPLAY_RUN_SET": "register.n_max=7 deskew=false"}
+    environment = {
+        "AVSREPLAY_RUN_POLICY": "all",
+        "AVSREPLAY_RUN_SET": "register.n_max=7 deskew=false",
+    }
     table = tomllib.loads(config(env=environment))
-    assert (table["faults"]["policy"], table["register"]["n_max"], table["deskew"]) == ("all", 7, False)
+    assert (table["faults"]["policy"], table["register"]["n_max"], table["deskew"]) == (
+        "all",
+        7,
+        False,
+    )
     table = tomllib.loads(config("--set", "faults.policy=any", env=environment))
     assert (table["faults"]["policy"], table["register"]["n_max"]) == ("any", 200)
 
 
 def test_a_configuration_file_may_come_from_the_environment(tmp_path):
     (tmp_path / "c.toml").write_text("guess = 'last'\n", encoding="utf-8")
-    assert tomllib.loads(config(env={"AVSREPLAY_RUN_CONFIG": str(tmp_path / "c.toml")}))["guess"] == "last"
+    assert (
+        tomllib.loads(config(env={"AVSREPLAY_RUN_CONFIG": str(tmp_path / "c.toml")}))["guess"]
+        == "last"
+    )
 
 
 @pytest.mark.parametrize("command", [["config"], ["run", "x.mcap"]])
@@ -117,7 +138,10 @@ def test_an_unknown_environment_variable_is_an_error(command, cli):
     [
         (("--policy", "most"), "'most' is not one of any, all"),
         (("--set", "regster.gate_m=1"), "did you mean 'register.gate_m'"),
-        (("--set", "register.gate_m=-1"), "--set register.gate_m=-1: register.gate_m is -1.0, must be above 0 [m]"),
+        (
+            ("--set", "register.gate_m=-1"),
+            "--set register.gate_m=-1: register.gate_m is -1.0, must be above 0 [m]",
+        ),
     ],
 )
 def test_a_wrong_value_is_one_line_that_names_the_option(arguments, words, cli):
@@ -149,9 +173,17 @@ def test_every_setting_is_written_with_its_meaning():
     ("words", "env", "begins"),
     [
         (("--init", "foo"), {}, "--init foo: init is 'foo', not log, truth, auto or seven numbers"),
-        (("--init", "foo", "--set", "register.gate_m=0.2", "--policy", "all"), {}, "--init foo: init is"),
+        (
+            ("--init", "foo", "--set", "register.gate_m=0.2", "--policy", "all"),
+            {},
+            "--init foo: init is",
+        ),
         (("--init", "5"), {}, "--init 5: init is '5'"),
-        (("--init", "0,0,1,0,0,0,9"), {}, "--init 0,0,1,0,0,0,9: init is '0,0,1,0,0,0,9', its quaternion"),
+        (
+            ("--init", "0,0,1,0,0,0,9"),
+            {},
+            "--init 0,0,1,0,0,0,9: init is '0,0,1,0,0,0,9', its quaternion",
+        ),
         (("--set", "init=foo"), {}, "--set init=foo: init is 'foo'"),
         ((), {"AVSREPLAY_RUN_INIT": "foo"}, "environment AVSREPLAY_RUN_INIT=foo: init is 'foo'"),
     ],
@@ -164,7 +196,9 @@ def test_an_error_names_the_option_that_was_given(words, env, begins):
 
 def test_an_initial_pose_of_another_command_is_named_as_given(fixtures_folder):
     words = ["observability", str(fixtures_folder / "tumble.mcap"), "--init", "1,2,3"]
-    assert str(CliRunner().invoke(group, words).exception).startswith("--init 1,2,3: init is '1,2,3'")
+    assert str(CliRunner().invoke(group, words).exception).startswith(
+        "--init 1,2,3: init is '1,2,3'"
+    )
 
 
 def test_the_method_of_the_paper_has_none_of_the_additions():
@@ -174,5 +208,7 @@ def test_the_method_of_the_paper_has_none_of_the_additions():
     assert not found.estimator.robust
     assert found.convergence.criterion.value == "covariance"
     seen = Innovation(np.full(6, 0.1), np.eye(6), np.eye(6), 1.0, 1.0, 0.1, 0.1)
-    assert pose_limit(seen, 0.05, 1.0, found.faults.sigmas) == 0.05  # constant, whatever the covariance S
+    assert (
+        pose_limit(seen, 0.05, 1.0, found.faults.sigmas) == 0.05
+    )  # constant, whatever the covariance S
     assert pose_limit(seen, 0.05, 1.0, RunConfig().faults.sigmas) > 1.0

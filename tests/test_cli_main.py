@@ -17,7 +17,9 @@ AVSREPLAY = [sys.executable, "-m", "avsreplay"]
 
 
 def with_stdout(handle: int, *args: object) -> tuple[int, str]:
-    done = subprocess.run([*AVSREPLAY, *map(str, args)], stdout=handle, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        [*AVSREPLAY, *map(str, args)], stdout=handle, stderr=subprocess.PIPE, text=True, check=False
+    )
     return done.returncode, done.stderr
 
 
@@ -40,7 +42,9 @@ def with_closed_pipe(*args: object) -> tuple[int, str]:
         ("record", "tumble.mcap", "-o", "-"),
     ],
 )
-def test_a_closed_pipe_is_not_a_failed_check(args: tuple[object, ...], fixtures_folder: Path) -> None:
+def test_a_closed_pipe_is_not_a_failed_check(
+    args: tuple[object, ...], fixtures_folder: Path
+) -> None:
     code, err = with_closed_pipe(args[0], fixtures_folder / str(args[1]), *args[2:])
     assert code == 141
     assert "Traceback" not in err
@@ -53,14 +57,23 @@ def test_a_closed_pipe_loses_no_output(fixtures_folder: Path, tmp_path: Path) ->
     log, result = fixtures_folder / "tumble.mcap", tmp_path / "result"
     whole, campaign = tmp_path / "whole", tmp_path / "campaign.toml"
     campaign.write_text('[set]\n"scenario.duration_s" = 1.0\n', encoding="utf-8")
-    assert with_stdout(subprocess.DEVNULL, "run", log, "--n-scans", 3, "-o", whole, "--report")[0] == 0
+    assert (
+        with_stdout(subprocess.DEVNULL, "run", log, "--n-scans", 3, "-o", whole, "--report")[0] == 0
+    )
     outputs = {
         result / "report.html": ("run", log, "--n-scans", 3, "-o", result, "--report"),
         tmp_path / "page.html": ("report", whole, "-o", tmp_path / "page.html"),
         tmp_path / "compared.html": ("compare", whole, whole, "-o", tmp_path / "compared.html"),
         tmp_path / "rows.csv": ("export", whole, "--to", "csv", "-o", tmp_path / "rows.csv"),
         tmp_path / "model.ply": ("model", log, "-o", tmp_path / "model.ply"),
-        tmp_path / "swept" / "report.html": ("sweep", campaign, "-o", tmp_path / "swept", "--workers", 0),
+        tmp_path / "swept" / "report.html": (
+            "sweep",
+            campaign,
+            "-o",
+            tmp_path / "swept",
+            "--workers",
+            0,
+        ),
     }
     for output, command in outputs.items():
         code, err = with_closed_pipe(*command)
@@ -72,7 +85,9 @@ def test_a_closed_pipe_loses_no_output(fixtures_folder: Path, tmp_path: Path) ->
 @posix
 def test_a_failed_check_is_reported_though_the_pipe_is_closed(fixtures_folder: Path) -> None:
     golden = fixtures_folder / "spin-raster.rows.jsonl"
-    code, _ = with_closed_pipe("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, "--golden", golden)
+    code, _ = with_closed_pipe(
+        "run", fixtures_folder / "tumble.mcap", "--n-scans", 3, "--golden", golden
+    )
     assert code == 1
 
 
@@ -84,10 +99,14 @@ def test_standard_output_that_the_shell_has_closed(fixtures_folder: Path) -> Non
 
 
 @posix
-def test_results_are_complete_though_standard_output_is_full(fixtures_folder: Path, tmp_path: Path) -> None:
+def test_results_are_complete_though_standard_output_is_full(
+    fixtures_folder: Path, tmp_path: Path
+) -> None:
     log, page = fixtures_folder / "tumble.mcap", tmp_path / "report.html"
     with Path("/dev/full").open("w", encoding="utf-8") as full:
-        code, err = with_stdout(full.fileno(), "run", log, "--n-scans", 3, "-o", tmp_path, "--overwrite", "--report")
+        code, err = with_stdout(
+            full.fileno(), "run", log, "--n-scans", 3, "-o", tmp_path, "--overwrite", "--report"
+        )
     assert code == 3
     assert err.strip().endswith("avsreplay: standard output: No space left on device")
     assert page.stat().st_size > 0
@@ -120,7 +139,9 @@ def test_an_unexpected_error_is_one_line_and_a_report(
     assert "ZeroDivisionError" in report.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(28, "No space left on device", "x")])
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RecursionError("deep"), OSError(28, "No space left on device", "x")]
+)
 def test_no_error_exits_with_the_code_of_a_failed_check(
     error: Exception, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -135,7 +156,9 @@ def test_no_error_exits_with_the_code_of_a_failed_check(
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
-def test_characters_that_the_output_cannot_encode_are_escaped(cli, fixtures_folder, tmp_path, encoding):
+def test_characters_that_the_output_cannot_encode_are_escaped(
+    cli, fixtures_folder, tmp_path, encoding
+):
     """As on Windows, whose standard output has a code page where it is not a terminal."""
     log = tmp_path / "π.mcap"
     log.write_bytes((fixtures_folder / "tumble.mcap").read_bytes())

@@ -1,4 +1,7 @@
-"""Shared parts of the commands: options, progress without a terminal, interruption, a reader that stops reading."""
+"""Shared parts of the commands.
+
+Options, progress without a terminal, interruption, a reader that stops reading.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,16 @@ def test_each_option_is_a_field_of_source_options_and_off_by_default(parse):
 
 
 def test_values_reach_the_source(parse):
-    args = ["--crop-box", "-1,-2,-3,1,2,3", "--crop-range", "0.5,9", "--fixed-frame", "map", "--truth-gap", "0.3"]
+    args = [
+        "--crop-box",
+        "-1,-2,-3,1,2,3",
+        "--crop-range",
+        "0.5,9",
+        "--fixed-frame",
+        "map",
+        "--truth-gap",
+        "0.3",
+    ]
     code, seen = parse(*args, "--clock", "log")
     options = read_options(seen)
     assert code == 0
@@ -97,7 +109,9 @@ def test_an_interrupt_before_the_first_row_ends_the_run():
 def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
     program, log = f"{sys.executable} -m avsreplay", fixtures_folder / "tumble.mcap"
     pipe = f"{program} record {log} -o - --n-scans 6 | {program} run - -o {tmp_path / 'piped'}"
-    done = subprocess.run(["bash", "-c", f"set -o pipefail; {pipe}"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {pipe}"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "-: 6 scans" in done.stderr
     assert cli("record", log, "-o", tmp_path / "log.mcap", "--n-scans", 6).code == 0
@@ -109,7 +123,11 @@ def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
 def test_a_pipe_without_data_is_named(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "avsreplay", "run", "-"], input="", capture_output=True, text=True, check=False
+        [sys.executable, "-m", "avsreplay", "run", "-"],
+        input="",
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 3
     assert done.stderr.startswith("avsreplay: standard input: no data; ")
@@ -133,7 +151,9 @@ def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_fo
     log, result = tmp_path / "growing.mcap", tmp_path / "result"
     log.write_bytes(whole[: len(whole) * 9 // 10])
     command = [sys.executable, "-m", "avsreplay", "run", str(log), "--follow", "-o", str(result)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         seen = []
         for line in process.stdout:  # ends only if the replay did
             seen.append(line)
@@ -155,20 +175,36 @@ def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_fo
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_sigterm_keeps_the_scans_so_far_and_leaves_no_temporary_file(fixtures_folder, tmp_path):
     result = tmp_path / "result"
-    command = [sys.executable, "-m", "avsreplay", "run", str(fixtures_folder / "spin-raster.mcap"), "-o", str(result)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "avsreplay",
+        "run",
+        str(fixtures_folder / "spin-raster.mcap"),
+        "-o",
+        str(result),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         while process.poll() is None and not any(tmp_path.glob(".result.*.part/result.mcap")):
             time.sleep(0.01)
         process.send_signal(signal.SIGTERM)
         _, err = process.communicate(timeout=120)
     assert process.returncode == 143, err
     assert err.splitlines()[-1] == "avsreplay: interrupted"
-    assert [path.name for path in tmp_path.iterdir()] in ([], ["result"])  # nothing before the first scan
+    assert [path.name for path in tmp_path.iterdir()] in (
+        [],
+        ["result"],
+    )  # nothing before the first scan
     if result.exists():
         assert json.loads((result / "run.json").read_text())["interrupted_after"] >= 1
 
 
 def test_a_closed_standard_input_is_one_line(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)  # as Python sets it where the descriptor is closed
-    with pytest.raises(UnreadableInput, match="standard input: it is closed"), shared.log_file(Path("-")):
+    with (
+        pytest.raises(UnreadableInput, match="standard input: it is closed"),
+        shared.log_file(Path("-")),
+    ):
         pass

@@ -42,31 +42,60 @@ def states():
         return np.r_[spin, ratios * w[[1, 0, 0]] * w[[2, 2, 1]]]
 
     times = STEP_S * np.arange(SCANS)
-    y = solve_ivp(flow, [0, times[-1]], np.r_[BODY.q_ab, BODY.w_b], "DOP853", times, rtol=1e-12, atol=1e-13).y.T
+    y = solve_ivp(
+        flow, [0, times[-1]], np.r_[BODY.q_ab, BODY.w_b], "DOP853", times, rtol=1e-12, atol=1e-13
+    ).y.T
     for t, v in zip(times, y, strict=True):
-        yield State(v[:4], v[4:], BODY.r_a + t * BODY.v_a, BODY.v_a, BODY.sigma, BODY.c_b, BODY.q_bc)
+        yield State(
+            v[:4], v[4:], BODY.r_a + t * BODY.v_a, BODY.v_a, BODY.sigma, BODY.c_b, BODY.q_bc
+        )
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    """A run whose estimate is the truth, with small and honest covariances; converged from 5 s on."""
+    """A run whose estimate is the truth, with small and honest covariances.
+
+    Converged from 5 s on.
+    """
     folder = tmp_path_factory.mktemp("made") / "result"
     folder.mkdir()
     bodies = list(states())
     stamps = [1_700_000_000_000_000_000 + round(k * STEP_S * 1e9) for k in range(SCANS)]
     rows = [
-        Row(seq=k, t_ns=t, t_s=k * STEP_S, status="aligned", gamma=1, reason="ok", guess="predicted", points=1,
-            estimator="filter", converged=k >= 10, action="stand_still", supervisor_rule="not_converged")
+        Row(
+            seq=k,
+            t_ns=t,
+            t_s=k * STEP_S,
+            status="aligned",
+            gamma=1,
+            reason="ok",
+            guess="predicted",
+            points=1,
+            estimator="filter",
+            converged=k >= 10,
+            action="stand_still",
+            supervisor_rule="not_converged",
+        )
         for k, t in enumerate(stamps)
-    ]  # fmt: skip
+    ]
     write_rows(folder / "rows.jsonl", rows)
     write_tum(folder / "truth.tum", [(t, x.T_ac) for t, x in zip(stamps, bodies, strict=True)])
-    P = np.diag([1e-4] * 3 + [1e-5] * 3 + [1e-3] * 3 + [1e-5] * 3 + [1e-4] * 2 + [1e-3] * 3 + [1e-4] * 3) ** 2
+    P = (
+        np.diag(
+            [1e-4] * 3 + [1e-5] * 3 + [1e-3] * 3 + [1e-5] * 3 + [1e-4] * 2 + [1e-3] * 3 + [1e-4] * 3
+        )
+        ** 2
+    )
     np.savez(
-        folder / "beliefs.npz", t_ns=np.array(stamps), x=np.array([mean_vector(x) for x in bodies]),
+        folder / "beliefs.npz",
+        t_ns=np.array(stamps),
+        x=np.array([mean_vector(x) for x in bodies]),
         P=np.tile(P, (SCANS, 1, 1)),
-    )  # fmt: skip
-    header = {"model": {"name": "m.ply", "sha256": "", "extent_m": 8.0}, "config": {"plan": {"a_max_mps2": 0.06}}}
+    )
+    header = {
+        "model": {"name": "m.ply", "sha256": "", "extent_m": 8.0},
+        "config": {"plan": {"a_max_mps2": 0.06}},
+    }
     (folder / "run.json").write_text(json.dumps(header))
     return folder
 
@@ -89,7 +118,9 @@ def test_plan_spread_hindsight_and_flight(result):
     assert [h["made_at_s"] for h in document["hindsight"]] == [5.0 + 10 * k for k in range(7)]
     seen = [h["miss"] for h in document["hindsight"] if h["miss"]]
     assert len(seen) >= 3
-    assert max(m["distance_m"] for m in seen) < 1e-4  # the estimate is the truth; the truth is a spline through poses
+    assert (
+        max(m["distance_m"] for m in seen) < 1e-4
+    )  # the estimate is the truth; the truth is a spline through poses
     assert document["execution"]["outcome"] == "captured"
     assert document["execution"]["miss"]["speed_mps"] < 1e-3
 
@@ -112,9 +143,24 @@ def test_tables_name_what_they_show(result):
 
 
 def test_flags_override_the_run(result):
-    slow = json.loads(run(result, "--json", "--samples", 2, "--every", 99, "--a-max", 0.03, "--at", 6).stdout)
+    slow = json.loads(
+        run(result, "--json", "--samples", 2, "--every", 99, "--a-max", 0.03, "--at", 6).stdout
+    )
     limited = json.loads(
-        run(result, "--json", "--samples", 2, "--every", 99, "--speed-max", 0.25, "--at", 6, "--period", 20).stdout
+        run(
+            result,
+            "--json",
+            "--samples",
+            2,
+            "--every",
+            99,
+            "--speed-max",
+            0.25,
+            "--at",
+            6,
+            "--period",
+            20,
+        ).stdout
     )
     free = json.loads(run(result, "--json", "--samples", 2, "--every", 99, "--at", 6).stdout)
     assert slow["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
@@ -157,7 +203,14 @@ def test_a_start_inside_the_target_and_a_turn_that_is_too_slow_are_stated(result
 
 def test_settings_of_supervisor_and_robot_can_be_changed(result):
     args = (result, "--json", "--samples", 4, "--every", 99, "--at", 6)
-    robot = ("--set", "robot.mass_kg=100", "--set", "robot.thrust_max_n=3", "--set", "robot.thrust_noise=0.5")
+    robot = (
+        "--set",
+        "robot.mass_kg=100",
+        "--set",
+        "robot.thrust_max_n=3",
+        "--set",
+        "robot.thrust_noise=0.5",
+    )
     free, heavy = (json.loads(run(*args, *more).stdout) for more in ((), robot))
     assert heavy["plan"]["a_max_mps2"] == pytest.approx(0.03)
     assert heavy["robot"]["mass_kg"] == 100
@@ -172,7 +225,8 @@ def test_settings_of_supervisor_and_robot_can_be_changed(result):
 def test_whole_flights_are_counted_with_intervals(result):
     args = (result, "--json", "--samples", 2, "--every", 99, "--at", 12, "--flights", 6)
     calm, rough = (
-        json.loads(run(*args, "--set", f"robot.thrust_noise={noise}").stdout)["flights"] for noise in (0.0, 2.0)
+        json.loads(run(*args, "--set", f"robot.thrust_noise={noise}").stdout)["flights"]
+        for noise in (0.0, 2.0)
     )
     for counts in (calm, rough):
         assert counts["count"] == 6
@@ -211,19 +265,27 @@ def test_the_page_of_the_flight_holds_the_plan_in_the_frame_of_the_fixture(resul
     done = run(result, *asked, "--json", "--animate", page)
     assert done.exit_code == 0, done.output
     plan = json.loads(done.stdout)["plan"]
-    data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())[1])
-    path = np.frombuffer(base64.b64decode(data["scene"]["paths"][0]["points"]["data"]), "<f4").reshape(-1, 3)
+    data = json.loads(
+        re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())[1]
+    )
+    path = np.frombuffer(
+        base64.b64decode(data["scene"]["paths"][0]["points"]["data"]), "<f4"
+    ).reshape(-1, 3)
     assert np.linalg.norm(path[-1]) < 1e-5  # the grasp point
     body, start_s = list(states())[10], 5.0  # the belief of the first plan, at 5 s
     rho = body.T_ac
-    assert path[0] == pytest.approx(matrix(rho.q).T @ -rho.t, abs=1e-4)  # the robot is at the origin of {A}
+    assert path[0] == pytest.approx(
+        matrix(rho.q).T @ -rho.t, abs=1e-4
+    )  # the robot is at the origin of {A}
     times = np.frombuffer(base64.b64decode(data["runs"][0]["t"]["data"]), "<f8")
     assert times[-1] == pytest.approx(plan["t_go_s"])
     assert plan["capture_time_s"] == pytest.approx(start_s + times[-1])
     keys = {"distance_m", "speed_mps", "ux_mps2", "uy_mps2", "uz_mps2", "margin_corridor_m"}
     columns = data["runs"][0]["columns"]
     assert columns.keys() == keys
-    assert np.frombuffer(base64.b64decode(columns["margin_corridor_m"]["data"]), "<f4").min() > -1e-6
+    assert (
+        np.frombuffer(base64.b64decode(columns["margin_corridor_m"]["data"]), "<f4").min() > -1e-6
+    )
     assert run(result, *asked, "--animate", again).exit_code == 0
     assert again.read_bytes() == page.read_bytes()
     assert isinstance(run(result, *asked, "--animate", page).exception, UsageError)
@@ -258,7 +320,10 @@ def test_an_impossible_request_is_one_line(result, args, says):
 
 @pytest.mark.parametrize(
     ("name", "value", "says"),
-    [("P", -1e-6, "scan 7 has a covariance that is not positive"), ("x", np.nan, "scan 7 is not finite")],
+    [
+        ("P", -1e-6, "scan 7 has a covariance that is not positive"),
+        ("x", np.nan, "scan 7 is not finite"),
+    ],
 )
 def test_an_invalid_belief_is_named(result, tmp_path, name, value, says):
     for file in result.iterdir():

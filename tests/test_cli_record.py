@@ -1,4 +1,6 @@
-"""A log converted by rosbags to a ROS 1 bag, to sqlite3 and back gives the same scans and the same rows."""
+"""A log converted by rosbags to a ROS 1 bag, to sqlite3 and back gives the same scans and the same
+rows.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,10 @@ FIRST = 10
 
 
 def converted(source: Path, to: Path, storage: str) -> Path:
-    """By rosbags' own converter; ``/faults`` and ``/tf_static`` have no like in ROS 1 and stay behind."""
+    """By rosbags' own converter.
+
+    ``/faults`` and ``/tf_static`` have no like in ROS 1 and stay behind.
+    """
     ros2 = get_typestore(Stores.ROS2_HUMBLE)
     target = get_typestore(Stores.ROS1_NOETIC) if to.suffix == ".bag" else ros2
     skipped = ["/faults", "/tf_static"]
@@ -29,7 +34,9 @@ def converted(source: Path, to: Path, storage: str) -> Path:
 
 def rows(path: Path, model: Path) -> list[Row]:
     options = SourceOptions(model=model, n_scans=FIRST)
-    with Run(Job(source=path, options=options, assignments=("init=truth", "estimator.start=paper"))) as run:
+    with Run(
+        Job(source=path, options=options, assignments=("init=truth", "estimator.start=paper"))
+    ) as run:
         return [dataclasses.replace(row, fault=None) for row in run.rows()]
 
 
@@ -43,9 +50,16 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     ros1 = converted(LOG, folder / "a.bag", "")
     sqlite = converted(LOG, folder / "db", "sqlite3")
     back = converted(sqlite, folder / "back", "mcap")
-    # A log's first belief and labels do not survive a conversion: the first is taken through one as well.
+    # A log's first belief and labels do not survive a conversion: the first is taken through one as
+    # well.
     plain = converted(LOG, folder / "plain", "mcap")
-    return {"model": folder / surface.name, "plain": plain, "ros1": ros1, "sqlite": sqlite, "back": back}
+    return {
+        "model": folder / surface.name,
+        "plain": plain,
+        "ros1": ros1,
+        "sqlite": sqlite,
+        "back": back,
+    }
 
 
 @pytest.mark.parametrize("name", ["plain", "ros1", "sqlite", "back"])

@@ -1,4 +1,7 @@
-"""Saved results read by the commands: they are verified, and no defect gives an internal error or passes unnoticed."""
+"""Saved results read by the commands.
+
+They are verified, and no defect gives an internal error or passes unnoticed.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from avsreplay.cli import SUMMARIES, group
+from avsreplay.cli.main import SUMMARIES, group
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.log import open_source
 from avsreplay.log.header import surface_bytes
@@ -53,7 +56,9 @@ def read(command: str, result: Path) -> Result:
 
 def rewrite_manifest(result: Path, **changes: object) -> None:
     path = result / "run.json"
-    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
+    path.write_text(
+        json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8"
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,7 +73,9 @@ def rewrite_manifest(result: Path, **changes: object) -> None:
         ("odometry", "RESULT/result.mcap", "-o", "RESULT/result.mcap", "--overwrite"),
     ],
 )
-def test_an_output_never_replaces_what_the_command_reads(words: tuple[str, ...], result: Path) -> None:
+def test_an_output_never_replaces_what_the_command_reads(
+    words: tuple[str, ...], result: Path
+) -> None:
     gate = result.parent / "gate.toml"
     gate.write_text('[[rule]]\nmetric = "healthy"\nmin = 0.0\n')
     files = [gate, *result.iterdir()]
@@ -95,7 +102,11 @@ def pairs() -> list[tuple[str, str, str]]:
         command = group.get_command(click.Context(group), name)
         paths = [param for param in command.params if isinstance(param.type, click.Path)]
         words = [param.opts[0] if isinstance(param, click.Option) else "" for param in paths]
-        outputs = [w for p, w in zip(paths, words, strict=True) if p.name in OUTPUTS and (name, w) not in FOLDERS]
+        outputs = [
+            w
+            for p, w in zip(paths, words, strict=True)
+            if p.name in OUTPUTS and (name, w) not in FOLDERS
+        ]
         found += [(name, output, word) for output in outputs for word in words if word != output]
     return found
 
@@ -116,7 +127,14 @@ def test_no_output_is_another_path_of_its_command(
     if output in more or other in more:
         more = []
     (tmp_path / "source").touch()
-    words = [command, "source" if other else path, *more, output, path, *([other, path] if other else [])]
+    words = [
+        command,
+        "source" if other else path,
+        *more,
+        output,
+        path,
+        *([other, path] if other else []),
+    ]
     done = run(*words, *(["--overwrite"] if command != "run" else []))
     assert isinstance(done.exception, UsageError), done.exception
     assert "another output" in str(done.exception) or "exclude each other" in str(done.exception)
@@ -125,7 +143,9 @@ def test_no_output_is_another_path_of_its_command(
 
 @pytest.fixture
 def little_memory() -> Iterator[None]:
-    """Limit the memory of the process, so that reading without an end is a MemoryError and does not end the machine."""
+    """Limit the memory of the process, so that reading without an end is a MemoryError and does not
+    end the machine.
+    """
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -135,14 +155,30 @@ def little_memory() -> Iterator[None]:
 
 
 ENDLESS = [
-    *(("run", "LOG", *more) for more in (
-        ("--model", "x.ply"), ("--config", "x.toml"), ("--robot", "x.toml"), ("--truth", "x.tum"),
-        ("--truth", "x.conf"), ("--golden", "x.jsonl"))),
-    ("run", "x.mcap"), ("run", "x.tum", "--backend", "poses"), ("info", "x.bag"), ("doctor", "x.db3"),
-    ("record", "x.toml", "-o", "a.mcap"), ("sweep", "x.toml", "--plan"), ("sweep", "campaign.toml", "--plan"),
-    ("compare", "nothing", "--gate", "x.toml"), ("plan", "nothing", "--robot", "x.toml"), ("report", "x.jsonl"),
-    ("model", "LOG", "--against", "x.ply", "-o", "a.ply"), ("bench", "LOG", "--model", "x.ply"),
-]  # fmt: skip
+    *(
+        ("run", "LOG", *more)
+        for more in (
+            ("--model", "x.ply"),
+            ("--config", "x.toml"),
+            ("--robot", "x.toml"),
+            ("--truth", "x.tum"),
+            ("--truth", "x.conf"),
+            ("--golden", "x.jsonl"),
+        )
+    ),
+    ("run", "x.mcap"),
+    ("run", "x.tum", "--backend", "poses"),
+    ("info", "x.bag"),
+    ("doctor", "x.db3"),
+    ("record", "x.toml", "-o", "a.mcap"),
+    ("sweep", "x.toml", "--plan"),
+    ("sweep", "campaign.toml", "--plan"),
+    ("compare", "nothing", "--gate", "x.toml"),
+    ("plan", "nothing", "--robot", "x.toml"),
+    ("report", "x.jsonl"),
+    ("model", "LOG", "--against", "x.ply", "-o", "a.ply"),
+    ("bench", "LOG", "--model", "x.ply"),
+]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the test reads /proc")
@@ -162,7 +198,9 @@ def test_an_input_without_an_end_is_one_line(
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have no such names")
-def test_a_result_of_a_log_whose_name_is_not_utf_8_can_be_read(fixtures_folder: Path, tmp_path: Path) -> None:
+def test_a_result_of_a_log_whose_name_is_not_utf_8_can_be_read(
+    fixtures_folder: Path, tmp_path: Path
+) -> None:
     log, model = (tmp_path / f"x{chr(0xDCFF)}{suffix}" for suffix in (".mcap", ".ply"))
     shutil.copyfile(fixtures_folder / "tumble.mcap", log)
     with open_source(log) as source:
@@ -186,7 +224,9 @@ def test_an_unusable_golden_file_is_refused_before_the_replay(
     assert golden.read_text() == "[1]\n"
 
 
-def test_a_result_that_is_replaced_keeps_the_files_of_others(fixtures_folder: Path, result: Path) -> None:
+def test_a_result_that_is_replaced_keeps_the_files_of_others(
+    fixtures_folder: Path, result: Path
+) -> None:
     (result / "notes.txt").write_text("mine")
     (result / "folder").mkdir()
     (result / "folder" / "a.txt").write_text("mine, too")
@@ -256,7 +296,9 @@ def test_a_result_without_a_manifest_passes_no_gate_in_silence(result: Path) -> 
     assert "not verified" in done.stderr
 
 
-def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(fixtures_folder: Path, tmp_path: Path) -> None:
+def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(
+    fixtures_folder: Path, tmp_path: Path
+) -> None:
     log = tmp_path / "cut.mcap"
     log.write_bytes((fixtures_folder / "tumble.mcap").read_bytes()[:200_000])
     assert isinstance(run("run", log, "-o", tmp_path / "result").exception, DataLost)
@@ -266,9 +308,20 @@ def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(fixtures_folder: Pa
     assert "its log was damaged" in read("export", tmp_path / "result").stderr
 
 
-BAD_JSON = ["", "{", "[]", '"a"', "NaN", "9" * 400, '{"facts": 1e999}', '{"facts": {"labels": [1]}}', '{"config": 3}',
-            '{"limits": {"alpha_max_m": "1", "length_m": 1.0}}', '{"limits": {"rms_max_m": -1e308}}',
-            '{"limits": {"alpha_max_m": 1.0, "length_m": 1e-320}}']  # fmt: skip
+BAD_JSON = [
+    "",
+    "{",
+    "[]",
+    '"a"',
+    "NaN",
+    "9" * 400,
+    '{"facts": 1e999}',
+    '{"facts": {"labels": [1]}}',
+    '{"config": 3}',
+    '{"limits": {"alpha_max_m": "1", "length_m": 1.0}}',
+    '{"limits": {"rms_max_m": -1e308}}',
+    '{"limits": {"alpha_max_m": 1.0, "length_m": 1e-320}}',
+]
 
 
 @pytest.mark.parametrize("command", READERS)
@@ -292,7 +345,9 @@ BAD_ROWS = [
 
 
 @pytest.mark.parametrize(("column", "value"), BAD_ROWS)
-def test_a_value_that_no_run_writes_is_one_line(column: str, value: str, result: Path, fixtures_folder: Path) -> None:
+def test_a_value_that_no_run_writes_is_one_line(
+    column: str, value: str, result: Path, fixtures_folder: Path
+) -> None:
     lines = (result / "rows.jsonl").read_text().splitlines()
     row = json.loads(lines[3])
     row[column] = "HERE"
@@ -302,12 +357,16 @@ def test_a_value_that_no_run_writes_is_one_line(column: str, value: str, result:
     for command in ("report", "export", "compare"):
         done = read(command, result)
         assert isinstance(done.exception, UnreadableInput), repr(done.exception)
-    done = run("run", fixtures_folder / "tumble.mcap", "--n-scans", 5, "--golden", result / "rows.jsonl")
+    done = run(
+        "run", fixtures_folder / "tumble.mcap", "--n-scans", 5, "--golden", result / "rows.jsonl"
+    )
     assert isinstance(done.exception, AvsError), repr(done.exception)
     assert "\x1b" not in done.output
 
 
-def test_escape_codes_in_a_golden_file_do_not_reach_the_terminal(fixtures_folder: Path, tmp_path: Path) -> None:
+def test_escape_codes_in_a_golden_file_do_not_reach_the_terminal(
+    fixtures_folder: Path, tmp_path: Path
+) -> None:
     golden = tmp_path / "golden.jsonl"
     row = json.loads((fixtures_folder / "tumble.rows.jsonl").read_text().splitlines()[0])
     golden.write_text(json.dumps({**row, "\x1b]0;title\x07": 1}) + "\n")
@@ -337,7 +396,9 @@ def test_cells_that_a_spreadsheet_would_evaluate_are_quoted(result: Path, tmp_pa
     assert ",=" not in text
 
 
-def test_devices_as_outputs_stay_devices(result: Path, fixtures_folder: Path, tmp_path: Path) -> None:
+def test_devices_as_outputs_stay_devices(
+    result: Path, fixtures_folder: Path, tmp_path: Path
+) -> None:
     null, link = Path("/dev/null"), tmp_path / "link"
     link.symlink_to(null)
     log = fixtures_folder / "tumble.mcap"
@@ -356,7 +417,10 @@ def test_devices_as_outputs_stay_devices(result: Path, fixtures_folder: Path, tm
     for command in commands:
         for output in (null, link):
             done = run(*(output if word == "OUT" else word for word in command))
-            assert done.exception is None or isinstance(done.exception, AvsError), (command, done.exception)
+            assert done.exception is None or isinstance(done.exception, AvsError), (
+                command,
+                done.exception,
+            )
             assert stat.S_ISCHR(null.stat().st_mode), command
             assert link.is_symlink(), command
 
@@ -385,8 +449,10 @@ def test_a_disk_that_is_full_during_a_run_keeps_the_old_result(
     done = subprocess.run(
         [sys.executable, "-m", "avsreplay", *map(str, words)],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 3
     assert [line for line in done.stderr.splitlines() if line.startswith("avsreplay: ")] == [
         done.stderr.splitlines()[-1]
@@ -397,5 +463,7 @@ def test_a_disk_that_is_full_during_a_run_keeps_the_old_result(
 
 def test_a_belief_of_another_size_is_one_line(result: Path) -> None:
     (result / "run.json").unlink()
-    np.savez(result / "beliefs.npz", t_ns=np.arange(3), x=np.zeros((3, 22)), P=np.zeros((3, 20, 21)))
+    np.savez(
+        result / "beliefs.npz", t_ns=np.arange(3), x=np.zeros((3, 22)), P=np.zeros((3, 20, 21))
+    )
     assert isinstance(read("plan", result).exception, UnreadableInput)

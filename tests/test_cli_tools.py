@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from avsreplay.cli import SUMMARIES
+from avsreplay.cli.main import SUMMARIES
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,12 @@ def test_kitti_and_tum_hold_the_same_poses(result, cli, tmp_path):
     from scipy.spatial.transform import Rotation
 
     for kind in ("kitti", "tum"):
-        assert cli("export", result, "--to", kind, "--poses", "registration", "-o", tmp_path / kind).code == 0
+        assert (
+            cli(
+                "export", result, "--to", kind, "--poses", "registration", "-o", tmp_path / kind
+            ).code
+            == 0
+        )
     kitti = np.loadtxt(tmp_path / "kitti").reshape(-1, 3, 4)
     missing = np.isnan(kitti).any(axis=(1, 2))
     assert len(kitti) == len((result / "rows.jsonl").read_text().splitlines())
@@ -40,7 +45,9 @@ def test_kitti_and_tum_hold_the_same_poses(result, cli, tmp_path):
     kitti = kitti[~missing]
     tum = np.loadtxt(tmp_path / "tum")
     np.testing.assert_allclose(kitti[:, :, 3], tum[:, 1:4], atol=0)
-    np.testing.assert_allclose(kitti[:, :, :3], Rotation.from_quat(tum[:, 4:]).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(
+        kitti[:, :, :3], Rotation.from_quat(tum[:, 4:]).as_matrix(), atol=1e-14
+    )
 
 
 def test_an_existing_export_is_not_overwritten(result, cli, tmp_path):
@@ -110,7 +117,10 @@ def test_the_format_of_an_export_is_that_of_its_name(words, first, result, cli, 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("rows.csv", "--to", "kitti"), "the format is KITTI; name a file that ends in .kitti or .txt"),
+        (
+            ("rows.csv", "--to", "kitti"),
+            "the format is KITTI; name a file that ends in .kitti or .txt",
+        ),
         (("rows.mcap", "--to", "csv"), "the format is CSV"),
         (("a.txt",), "the name states no format; add --to, one of csv, parquet, tum, kitti"),
         (("rows",), "the name states no format"),
@@ -123,7 +133,9 @@ def test_an_export_whose_name_contradicts_its_format_is_refused(words, said, res
     assert not (tmp_path / words[0]).exists()
 
 
-@pytest.mark.parametrize("words", [("odometry", "-o", "x.mcap"), ("model", "-o", "m.ply", "--poses", "x.csv")])
+@pytest.mark.parametrize(
+    "words", [("odometry", "-o", "x.mcap"), ("model", "-o", "m.ply", "--poses", "x.csv")]
+)
 def test_a_trajectory_in_a_file_of_another_format_is_refused(words, cli, fixtures_folder, tmp_path):
     words = [tmp_path / word if "." in word else word for word in words]
     done = cli(words[0], fixtures_folder / "tumble.mcap", *words[1:])

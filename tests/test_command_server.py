@@ -1,4 +1,6 @@
-"""A command in a fork has the output, exit code and environment of a command in a process of its own."""
+"""A command in a fork has the output, exit code and environment of a command in a process of its
+own.
+"""
 
 import os
 import subprocess
@@ -23,7 +25,11 @@ def server():
 def test_a_fork_is_like_a_process(server, tmp_path, args):
     command = [sys.executable, "-m", "avsreplay", *args]
     alone = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert server.run(args, tmp_path, dict(os.environ), 60) == (alone.returncode, alone.stdout, alone.stderr)
+    assert server.run(args, tmp_path, dict(os.environ), 60) == (
+        alone.returncode,
+        alone.stdout,
+        alone.stderr,
+    )
 
 
 def test_variables_that_are_read_at_the_start_need_a_process(server):

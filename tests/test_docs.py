@@ -1,4 +1,7 @@
-"""Documentation: marked blocks run, command lines parse, links lead somewhere, sentences are short, the site builds."""
+"""Documentation.
+
+Marked blocks run, command lines parse, links lead somewhere, sentences are short, the site builds.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,14 @@ from pathlib import Path
 import click
 import pytest
 
-from avsreplay.cli import SUMMARIES, group
+from avsreplay.cli.main import SUMMARIES, group
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
-FENCE = re.compile(r"(?:<!-- (?P<mark>(?:run|file)[^>]*?) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```$", re.M | re.S)
+FENCE = re.compile(
+    r"(?:<!-- (?P<mark>(?:run|file)[^>]*?) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```$",
+    re.M | re.S,
+)
 
 
 def _blocks(page):
@@ -28,14 +34,26 @@ def _blocks(page):
 
 MARKED = [page for page in PAGES if any(block["mark"] for block in _blocks(page))]
 QUICK = {"docs/index.md"}
-SHORT = {"AVSREPLAY_RECORD_DURATION_S": "12", "AVSREPLAY_SWEEP_LIMIT": "2"}  # of what a page simulates itself
+SHORT = {
+    "AVSREPLAY_RECORD_DURATION_S": "12",
+    "AVSREPLAY_SWEEP_LIMIT": "2",
+}  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
-    "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",  # of the README
-    "avsreplay run long.mcap": "test_binary_files.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
+    # of the README
+    "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",
+    "avsreplay run long.mcap": (
+        "test_binary_files.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption"
+    ),
     "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
-    "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
-    "avsreplay sweep docs/campaigns/blackouts.toml --run": "test_sweep_run.py::test_the_worst_run_is_made_again",
-    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_statistics.py::test_the_campaign_of_faults_has_every",
+    "avsreplay sweep docs/campaigns/blackouts.toml -o": (
+        "test_sweep_run.py::test_a_worker_killed_in_the_middle"
+    ),
+    "avsreplay sweep docs/campaigns/blackouts.toml --run": (
+        "test_sweep_run.py::test_the_worst_run_is_made_again"
+    ),
+    "avsreplay sweep docs/campaigns/faults.toml": (
+        "test_sweep_statistics.py::test_the_campaign_of_faults_has_every"
+    ),
     "avsreplay run $D/stanford-dragon": "test_real.py::test_the_folder_itself_runs",
     "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
     "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
@@ -43,7 +61,9 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay model $D/stanford-bunny": "test_reconstruct.py::test_scans_of_the_bunny_that",
     "avsreplay run milk": "test_real.py::test_a_carton_in_a_depth_scene",
     "avsreplay run $D/ros1-bags": "test_real.py::test_raw_packets_are_named",
-    "pip install docs/examples/own_backend": "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract",
+    "pip install docs/examples/own_backend": (
+        "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract"
+    ),
     "python3 -m venv .venv": ".ci/run",
     "pip install -q '.[test]'": ".ci/run",
 }
@@ -54,7 +74,9 @@ def _name(page):
 
 
 def _parameter(page):
-    return pytest.param(page, id=_name(page), marks=() if _name(page) in QUICK else pytest.mark.slow)
+    return pytest.param(
+        page, id=_name(page), marks=() if _name(page) in QUICK else pytest.mark.slow
+    )
 
 
 @pytest.mark.slow
@@ -95,10 +117,17 @@ def _poses(folder):
 
 def _scenarios(folder):
     """A scenario with a moving camera, its recording, and a log to inject faults into."""
-    text = "duration_s = 6.0\nrate_hz = 3.0\n[motion]\nrate_radps = [0.06, 0.064, -0.048]\n[scanner]\nrays = [40, 40]\n"
+    text = (
+        "duration_s = 6.0\nrate_hz = 3.0\n[motion]\nrate_radps = [0.06, 0.064,"
+        " -0.048]\n[scanner]\nrays = [40, 40]\n"
+    )
     (folder / "scenario.toml").write_text(text)
     (folder / "moving.toml").write_text(text + "[camera]\nvelocity_mps = [0.02, 0.0, 0.0]\n")
-    subprocess.run([sys.executable, "-m", "avsreplay", "record", "moving.toml", "-o", "x.mcap"], cwd=folder, check=True)
+    subprocess.run(
+        [sys.executable, "-m", "avsreplay", "record", "moving.toml", "-o", "x.mcap"],
+        cwd=folder,
+        check=True,
+    )
     for name in ("y.mcap", "growing.mcap"):
         shutil.copy(folder / "tumble.mcap", folder / name)
 
@@ -157,7 +186,9 @@ def _environment(folder=None):
 
 
 def _run(block, folder):
-    program = ["bash", "-euo", "pipefail", "-c"] if block["language"] == "sh" else [sys.executable, "-c"]
+    program = (
+        ["bash", "-euo", "pipefail", "-c"] if block["language"] == "sh" else [sys.executable, "-c"]
+    )
     done = subprocess.run(
         [*program, block["text"]],
         cwd=folder,
@@ -168,7 +199,9 @@ def _run(block, folder):
         check=False,
     )
     expected = int(block["mark"].partition("exit")[2] or 0)
-    assert done.returncode == expected, f"{block['text']}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    assert done.returncode == expected, (
+        f"{block['text']}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    )
 
 
 @pytest.mark.parametrize("page", [_parameter(page) for page in MARKED])
@@ -188,13 +221,21 @@ def _commands(block):
 
 def test_every_block_with_a_command_is_run_by_a_test():
     """Marked blocks are run here; the others name the test that runs such a command."""
-    blocks = [(page, block) for page in PAGES if page.name != "CONTRIBUTING.md" for block in _blocks(page)]
-    shown = [(page, block) for page, block in blocks if block["language"] in ("", "sh", "bash", "console")]
+    blocks = [
+        (page, block) for page in PAGES if page.name != "CONTRIBUTING.md" for block in _blocks(page)
+    ]
+    shown = [
+        (page, block)
+        for page, block in blocks
+        if block["language"] in ("", "sh", "bash", "console")
+    ]
     found = set()
     for page, block in shown:
         if block["mark"] or not _commands(block):
             continue
-        known = [start for start in ELSEWHERE if any(line.startswith(start) for line in _commands(block))]
+        known = [
+            start for start in ELSEWHERE if any(line.startswith(start) for line in _commands(block))
+        ]
         assert known, f"{_name(page)} shows a command that no test runs: {block['text']}"
         found.update(known)
     assert found == set(ELSEWHERE)
@@ -205,9 +246,13 @@ def test_every_block_with_a_command_is_run_by_a_test():
 
 
 def test_the_tutorial_of_an_own_log_gives_the_options_that_it_uses(tmp_path, cli):
-    subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", tmp_path], check=True)
+    subprocess.run(
+        [sys.executable, ROOT / "docs" / "examples" / "own_bag.py", tmp_path], check=True
+    )
     said = cli("info", "own.bag", "--model", "target.stl", "--json", cwd=tmp_path)
-    options = " ".join(check["option"] for check in json.loads(said.out)["checks"] if check["option"])
+    options = " ".join(
+        check["option"] for check in json.loads(said.out)["checks"] if check["option"]
+    )
     text = (ROOT / "docs" / "your-own-log.md").read_text(encoding="utf-8")
     assert f"run own.bag --model target.stl {options} -o results/ --report" in text
     done = cli("run", "own.bag", "--model", "target.stl", *options.split(), "--json", cwd=tmp_path)
@@ -215,7 +260,9 @@ def test_the_tutorial_of_an_own_log_gives_the_options_that_it_uses(tmp_path, cli
     verdict = json.loads(done.out)["verdict"]
     assert f"{verdict['grade']}: " in text
     reasons = [reason["text"] for reason in verdict["reasons"]]
-    assert all(reason in text for reason in reasons if not any(sign.isdigit() for sign in reason)), reasons
+    assert all(
+        reason in text for reason in reasons if not any(sign.isdigit() for sign in reason)
+    ), reasons
     assert sum(row["gamma"] for row in rows) >= 0.9 * len(rows) == 0.9 * 42
     assert max(row["pos_err_m"] for row in rows) < 0.01
     assert max(row["rot_err_deg"] for row in rows) < 0.5
@@ -228,10 +275,16 @@ def _installed(package, site):
     info = site / f"{module}-{project['project']['version']}.dist-info"
     info.mkdir(parents=True)
     shutil.copy(package / f"{module}.py", site)
-    head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
+    head = (
+        f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion:"
+        f" {project['project']['version']}\n"
+    )
     (info / "METADATA").write_text(head, encoding="utf-8")
     groups = project["project"]["entry-points"].items()
-    lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups]
+    lines = [
+        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items())
+        for group, points in groups
+    ]
     (info / "entry_points.txt").write_text("".join(lines), encoding="utf-8")
 
 
@@ -261,7 +314,9 @@ def _command_lines(page):
 LINES = [(page, words) for page in PAGES for words in _command_lines(page)]
 
 
-@pytest.mark.parametrize(("page", "words"), LINES, ids=lambda v: _name(v) if isinstance(v, Path) else " ".join(v))
+@pytest.mark.parametrize(
+    ("page", "words"), LINES, ids=lambda v: _name(v) if isinstance(v, Path) else " ".join(v)
+)
 def test_every_command_line_parses(page, words):
     if words[:1] and words[0] in SUMMARIES:
         command = group.get_command(click.Context(group), words[0])
@@ -315,17 +370,24 @@ def _anchors(page):
 
 
 HISTORY = re.compile(
-    r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since then|until now)\b"
+    r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since"
+    r" then|until now)\b"
     r"|(?:^|[.;:(|] ?)(?:Before|Now|Formerly),",
     re.IGNORECASE | re.MULTILINE,
 )
 
 
 def _sentences(text):
-    """Sentences outside of code, as words; a heading, an entry of a list and a cell of a table are sentences."""
+    """Sentences outside of code, as words.
+
+    A heading, an entry of a list and a cell of a table are sentences.
+    """
     for part in re.split(r"\n\s*\n|\||\n(?=\s*(?:[-*#]|\d+\. ))|^#+ [^\n]*\n", text, flags=re.M):
         joined = " ".join(re.sub(r"`[^`]*`", "code", part).split())
-        yield from (sentence.split() for sentence in re.split(r"(?<=[.!?:;])(?:\*\*)? +(?=[A-Zc*\[({])", joined))
+        yield from (
+            sentence.split()
+            for sentence in re.split(r"(?<=[.!?:;])(?:\*\*)? +(?=[A-Zc*\[({])", joined)
+        )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
@@ -338,9 +400,16 @@ def test_a_sentence_has_at_most_45_words_and_states_the_present(page):
 def test_the_glossary_explains_terms_that_occur_and_names_sections_that_exist():
     glossary = ROOT / "docs" / "glossary.md"
     symbols, _, terms = glossary.read_text(encoding="utf-8").partition("## Terms")
-    files = [*(page for page in PAGES if page != glossary), *(ROOT / "avsreplay" / "register").glob("*.py")]
+    files = [
+        *(page for page in PAGES if page != glossary),
+        *(ROOT / "avsreplay" / "register").glob("*.py"),
+    ]
     text = " ".join(" ".join(file.read_text(encoding="utf-8").lower().split()) for file in files)
-    named = [term for cell in re.findall(r"^\| ([^|]+) \| .*[.?] \|$", terms, flags=re.M) for term in cell.split(", ")]
+    named = [
+        term
+        for cell in re.findall(r"^\| ([^|]+) \| .*[.?] \|$", terms, flags=re.M)
+        for term in cell.split(", ")
+    ]
     assert len(named) > 40
     assert [term for term in named if term.lower() not in text] == []
     equations = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
@@ -373,18 +442,26 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 
 def test_the_campaign_of_removed_guards_covers_every_line_of_the_table_of_defects(monkeypatch):
-    """``tests/benchmarks/guards.py`` removes each guard; here only that its texts are in the code, once each."""
+    """``tests/benchmarks/guards.py`` removes each guard.
+
+    Here only that its texts are in the code, once each.
+    """
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     from guards import ALL
 
     for edits, test in ALL:
         for name, text, _ in edits:
-            assert (ROOT / "avsreplay" / name).read_text(encoding="utf-8").count(text) == 1, (name, text)
+            assert (ROOT / "avsreplay" / name).read_text(encoding="utf-8").count(text) == 1, (
+                name,
+                text,
+            )
         file, _, name = test.partition("::")
         assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), test
     page = (ROOT / "docs" / "reliability-tests.md").read_text(encoding="utf-8")
     table = page.partition("## Defects found")[2].partition("The observations of a new user")[0]
-    lines = [set(re.findall(r"`(test_\w+)`", line)) for line in table.splitlines() if "`test_" in line]
+    lines = [
+        set(re.findall(r"`(test_\w+)`", line)) for line in table.splitlines() if "`test_" in line
+    ]
     assert len(lines) > 20
     removed = {test.partition("::")[2] for _, test in ALL}
     assert [names for names in lines if not names & removed] == []

@@ -1,4 +1,7 @@
-"""A constant acceleration: the falling frame changes no statistic; the fit is unbiased and its 1 sigma correct."""
+"""A constant acceleration: the falling frame changes no statistic.
+
+The fit is unbiased and its 1 sigma correct.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,8 @@ def test_the_fitted_acceleration_is_unbiased_and_its_covariance_is_right() -> No
         error = found.mean - GRAVITY
         nees.append(float(error @ np.linalg.solve(found.P, error)))
         assert found.poses >= 38
-    # chi-square with 180 degrees of freedom over 60: mean 3, 1 sigma 0.32; the estimated noise adds some spread
+    # chi-square with 180 degrees of freedom over 60: mean 3, 1 sigma 0.32; the estimated noise adds
+    # some spread
     assert 2.0 < np.mean(nees) < 4.2
 
 
@@ -54,7 +58,9 @@ def test_the_fit_ends_before_the_motion_changes() -> None:
         kick = np.array([0.0, 0.0, 2.0])
         hit = 25
         data = [
-            (t, replace(a, T_ac=Pose(a.T_ac.q, a.T_ac.t + kick * (t - data[hit][0]) * 1e-9))) if k > hit else (t, a)
+            (t, replace(a, T_ac=Pose(a.T_ac.q, a.T_ac.t + kick * (t - data[hit][0]) * 1e-9)))
+            if k > hit
+            else (t, a)
             for k, (t, a) in enumerate(data)
         ]
         found = fit_acceleration(data, PARAMS)
@@ -78,7 +84,9 @@ def test_a_known_acceleration_changes_poses_and_velocities_only(tmp_path: Path) 
     plain, _ = rows(tum(tmp_path / "free.tum", times, free), extent_m=2.0)
     truth = tum(tmp_path / "truth.tum", times, fallen(world, a))
     setting = f"estimator.acceleration_mps2={a.tolist()}"
-    under, summary = rows(tum(tmp_path / "moved.tum", times, moved), setting, extent_m=2.0, truth_file=truth)
+    under, summary = rows(
+        tum(tmp_path / "moved.tum", times, moved), setting, extent_m=2.0, truth_file=truth
+    )
     for before, after, t in zip(plain, under, world.times, strict=True):
         assert after.gamma == 1
         assert after.nis == pytest.approx(before.nis, rel=1e-4, abs=1e-6)
@@ -88,12 +96,16 @@ def test_a_known_acceleration_changes_poses_and_velocities_only(tmp_path: Path) 
         assert [after.vx_mps, after.vy_mps, after.vz_mps] == pytest.approx(
             np.array([before.vx_mps, before.vy_mps, before.vz_mps]) + t * a, abs=1e-5
         )
-        assert (after.sigma1, after.pos_1s_m) == pytest.approx((before.sigma1, before.pos_1s_m), rel=1e-3, abs=1e-6)
+        assert (after.sigma1, after.pos_1s_m) == pytest.approx(
+            (before.sigma1, before.pos_1s_m), rel=1e-3, abs=1e-6
+        )
     assert max(row.pos_err_m for row in under[20:]) < 0.006
     assert summary.acceleration is not None
     assert "given" in summary.acceleration
     ignored, _ = rows(tmp_path / "moved.tum", extent_m=2.0)
-    assert ignored[-1].grasp_pos_1s_m > 10.0 * under[-1].grasp_pos_1s_m  # without it the poses show a random force
+    assert (
+        ignored[-1].grasp_pos_1s_m > 10.0 * under[-1].grasp_pos_1s_m
+    )  # without it the poses show a random force
 
 
 def test_predictions_contain_the_acceleration() -> None:

@@ -1,4 +1,7 @@
-"""Large innovations: manoeuvres, sensor biases and bad scans are distinguished, and clean logs give none of them."""
+"""Large innovations.
+
+Manoeuvres, sensor biases and bad scans are distinguished, and clean logs give none of them.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,11 @@ def test_the_evidence_is_the_marginal_likelihood() -> None:
 
 def test_the_evidence_of_several_kinds_is_the_mean_of_their_densities() -> None:
     rng = np.random.Generator(np.random.PCG64(5))
-    M, white, scale = rng.normal(size=(3, 12, 7)), 2.0 * rng.normal(size=12), rng.uniform(0.1, 3.0, size=7)
+    M, white, scale = (
+        rng.normal(size=(3, 12, 7)),
+        2.0 * rng.normal(size=12),
+        rng.uniform(0.1, 3.0, size=7),
+    )
     kinds = [slice(6, 7), slice(0, 3), slice(0, 6)]
     free = multivariate_normal.logpdf(white, np.zeros(12), np.eye(12))
     for one, found in zip(M, scan_window.mixed(M, white, scale, kinds), strict=True):
@@ -53,7 +60,9 @@ def test_the_evidence_of_several_kinds_is_the_mean_of_their_densities() -> None:
             np.eye(12) + one[:, kind] @ np.diag((factor * scale[kind]) ** 2) @ one[:, kind].T
             for kind, factor in itertools.product(kinds, scan_window.SCALES)
         ]
-        ratios = [np.exp(multivariate_normal.logpdf(white, np.zeros(12), C) - free) for C in covariances]
+        ratios = [
+            np.exp(multivariate_normal.logpdf(white, np.zeros(12), C) - free) for C in covariances
+        ]
         assert found == pytest.approx(np.log(np.mean(ratios)), rel=1e-9, abs=1e-9)
         A, b = one.T @ one, one.T @ white
         want = multivariate_normal.logpdf(white, np.zeros(12), np.eye(12) + one @ one.T) - free
@@ -62,35 +71,58 @@ def test_the_evidence_of_several_kinds_is_the_mean_of_their_densities() -> None:
 
 def test_the_effect_of_a_change_acts_on_the_scans_after_it() -> None:
     rng = np.random.Generator(np.random.PCG64(6))
-    late, impulses, instants = rng.normal(size=(4, 18, 12)), rng.normal(size=(2, 6, 3)), np.array([0.3, 1.7])
+    late, impulses, instants = (
+        rng.normal(size=(4, 18, 12)),
+        rng.normal(size=(2, 6, 3)),
+        np.array([0.3, 1.7]),
+    )
     found = _motion.after_changes(late, np.array([0, 2]), impulses, instants)
     for k, scan in enumerate((0, 2)):
-        assert found[k, :, :3] == pytest.approx(late[scan, :, :6] @ impulses[k], rel=1e-12, abs=1e-12)
-        assert found[k, :, 3:] == pytest.approx(late[scan, :, 9:] - instants[k] * late[scan, :, 6:9], abs=1e-12)
+        assert found[k, :, :3] == pytest.approx(
+            late[scan, :, :6] @ impulses[k], rel=1e-12, abs=1e-12
+        )
+        assert found[k, :, 3:] == pytest.approx(
+            late[scan, :, 9:] - instants[k] * late[scan, :, 6:9], abs=1e-12
+        )
     with pytest.raises(ValueError, match="not so many scans"):
         _motion.after_changes(late, np.array([0, 4]), impulses, instants)
 
 
 def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None:
-    """Likelihood ratio and moments of the error against the joint densities of two innovations, evaluated directly."""
+    """Likelihood ratio and moments of the error against the joint densities of two innovations,
+    evaluated directly.
+    """
     rng = np.random.Generator(np.random.PCG64(4))
-    Phi, H, A = rng.normal(size=(2, 20, 20)), rng.normal(size=(2, 6, 20)), 0.3 * rng.normal(size=(2, 20, 20))
-    P, R = A @ A.swapaxes(1, 2), np.array([np.diag(rng.uniform(1.0, 2.0, size=6)) for _ in range(2)])
+    Phi, H, A = (
+        rng.normal(size=(2, 20, 20)),
+        rng.normal(size=(2, 6, 20)),
+        0.3 * rng.normal(size=(2, 20, 20)),
+    )
+    P, R = (
+        A @ A.swapaxes(1, 2),
+        np.array([np.diag(rng.uniform(1.0, 2.0, size=6)) for _ in range(2)]),
+    )
     S, alpha, one_sigma = H @ P @ H.swapaxes(1, 2) + R, 3.0 * rng.normal(size=(2, 6)), (0.2, 0.3)
     share, none, y = 0.2, np.zeros(12), alpha.reshape(-1)
     used = [_motion.used(Phi[k], P[k], H[k], alpha[k], S[k], R[k], (1.0, 1.0)) for k in range(2)]
     ratio, moments = _motion.change(np.array(used), one_sigma, [0.3, 0.1, 0.03, 0.01], 1.0, share)
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
     ratios, weighted = [], []
-    for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1, 0.03, 0.01)):
+    for first, part, kind, size in itertools.product(
+        (0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1, 0.03, 0.01)
+    ):
         C = np.kron(np.diag([1.0, 0.0]), S[0]) + np.kron(np.diag([0.0, 1.0]), S[1])
         C *= 1.0 + share if first == 0 else 1.0  # errors that both scans have in common
         F = Phi[first][:, [3, 4, 5] if kind == 0 else [9, 10, 11]]
         F = F * np.where(np.isin(np.arange(20), [0, 1, 2, 6, 7, 8]), part, 1.0)[:, None]
-        M = np.vstack([H[0] @ F, H[1] @ Phi[1] @ left[0] @ F] if first == 0 else [np.zeros((6, 3)), H[1] @ F])
+        M = np.vstack(
+            [H[0] @ F, H[1] @ Phi[1] @ left[0] @ F] if first == 0 else [np.zeros((6, 3)), H[1] @ F]
+        )
         error = left[1] @ (Phi[1] @ left[0] @ F if first == 0 else F)
         with_change = C + (size * one_sigma[kind]) ** 2 * M @ M.T
-        ratios.append(multivariate_normal.pdf(y, none, with_change) / multivariate_normal.pdf(y, none, C))
+        ratios.append(
+            multivariate_normal.pdf(y, none, with_change) / multivariate_normal.pdf(y, none, C)
+        )
         u = (size * one_sigma[kind]) ** 2 * M.T @ np.linalg.solve(with_change, y)
         P_u = np.linalg.inv(np.eye(3) / (size * one_sigma[kind]) ** 2 + M.T @ np.linalg.solve(C, M))
         weighted.append(max(ratios[-1] - 1.0, 0.0) * error @ (np.outer(u, u) + P_u) @ error.T)
@@ -108,42 +140,60 @@ def test_nothing_is_found_on_a_clean_log() -> None:
     assert all(result.gamma)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
+)
 def test_a_push_is_reported_and_followed(seed: int) -> None:
-    """A velocity step of 1 cm/s at 45.2 s: instant, size and sigma, and no claim of convergence while in doubt."""
+    """A velocity step of 1 cm/s at 45.2 s.
+
+    Instant, size and sigma, and no claim of convergence while in doubt.
+    """
     case = surprises.Case("push", velocity=0.01, seconds=60.0)
     result = surprises.run(case, seed)
     assert result.track is not None
     (found,) = result.track.manoeuvres
     assert abs(found.t_ns * 1e-9 - 45.2) < max(0.6, 4.0 * found.t_1s_s)
     off = np.concatenate([found.rate, found.velocity - result.true_velocity])
-    assert off @ np.linalg.solve(found.P, off) < 22.5  # 99.9 % of chi-square with 6 degrees of freedom
+    assert (
+        off @ np.linalg.solve(found.P, off) < 22.5
+    )  # 99.9 % of chi-square with 6 degrees of freedom
     at = result.t.index(45.5)
     assert found.detected_ns * 1e-9 <= 47.0  # the fourth scan after it
     assert max(result.ratio[at + 10 :]) < 4.0
     doubtful = [k for k, reason in enumerate(result.reason) if reason == "doubtful"]
     assert not any(result.converged[k] for k in doubtful)
-    assert not any(claimed and ratio > 4.0 for claimed, ratio in zip(result.converged, result.ratio, strict=True))
+    assert not any(
+        claimed and ratio > 4.0
+        for claimed, ratio in zip(result.converged, result.ratio, strict=True)
+    )
 
 
 @pytest.mark.parametrize("seed", [719, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_step_far_below_the_expected_size_of_a_change_is_a_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of a tracker may show any motion: the changes that are expected are ten times those of scans."""
+    """Poses of a tracker may show any motion.
+
+    The changes that are expected are ten times those of scans.
+    """
     wide = partial(surprises.EstimatorParams, start_vel_1s_mps=2.0)
     monkeypatch.setattr(surprises, "EstimatorParams", wide)
     result = surprises.run(surprises.Case("push", velocity=0.01, seconds=60.0), seed)
     assert result.track is not None
     (found,) = result.track.manoeuvres
     off = found.velocity - result.true_velocity
-    assert off @ np.linalg.solve(found.P[3:, 3:], off) < 16.3  # 99.9 % of chi-square with 3 degrees of freedom
+    assert (
+        off @ np.linalg.solve(found.P[3:, 3:], off) < 16.3
+    )  # 99.9 % of chi-square with 3 degrees of freedom
     assert found.detected_ns * 1e-9 <= 48.5
     assert result.track.drift is None
 
 
 def test_a_change_of_the_rate_contains_the_error_of_the_mass_centre() -> None:
-    """Of a body at rest the centre of mass is unknown: its velocity after a release is known along the axis only."""
+    """Of a body at rest the centre of mass is unknown.
+
+    Its velocity after a release is known along the axis only.
+    """
     case = surprises.Case("release", speed=1e-9, rate=0.1, at_s=20.0, seconds=30.0)
     for seed in range(3):
         result = surprises.run(case, seed)
@@ -157,7 +207,9 @@ def test_a_change_of_the_rate_contains_the_error_of_the_mass_centre() -> None:
 
 
 def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> None:
-    """Taken for random forces, it is contradicted by the quiet poses before it as soon as all poses are fitted."""
+    """Taken for random forces, it is contradicted by the quiet poses before it as soon as all poses
+    are fitted.
+    """
     result = surprises.run(surprises.Case("push", velocity=0.01, seconds=60.0), 719)
     assert result.track is not None
     assert len(result.track.manoeuvres) == 1
@@ -167,7 +219,10 @@ def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> Non
 
 @pytest.mark.slow
 def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
-    """5 cm along the line of sight from 60 to 70 s: flagged from the first scan, and the estimate is not moved."""
+    """5 cm along the line of sight from 60 to 70 s.
+
+    Flagged from the first scan, and the estimate is not moved.
+    """
     case = surprises.Case("bias", at_s=60.0, until_s=70.0, bias=0.05, seconds=75.0)
     result = surprises.run(case, 1)
     assert result.track is not None
@@ -180,7 +235,10 @@ def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
 
 
 def test_a_bias_before_convergence_does_not_stay() -> None:
-    """15 cm over the first 10 s: the estimate starts anew from the later poses, which agree with one another."""
+    """15 cm over the first 10 s.
+
+    The estimate starts anew from the later poses, which agree with one another.
+    """
     case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=30.0)
     result = surprises.run(case, 2)
     after = result.t.index(10.0)
@@ -190,15 +248,17 @@ def test_a_bias_before_convergence_does_not_stay() -> None:
 
 
 def test_a_new_start_fails_no_check() -> None:
-    """The scans of a new start are used again with their own noise, without the factors of the estimate it replaces."""
+    """The scans of a new start are used again with their own noise, without the factors of the
+    estimate it replaces.
+    """
     case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=16.0)
     assert [v for seed in range(3) for v in surprises.run(case, seed).violations] == []
 
 
 @pytest.mark.parametrize("seconds", [5.0, 12.0, 20.0])
 def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds: float) -> None:
-    """Of a linear system the chi-square of the joint innovations is the sum of the NIS; poor early estimates are not
-    linear and are left out of the window."""
+    """Of a linear system the chi-square of the joint innovations is the sum of the NIS; poor early
+    estimates are not linear and are left out of the window."""
     for seed in range(4):
         result = surprises.run(surprises.Case("clean", seconds=seconds), seed)
         assert result.track is not None
@@ -213,7 +273,10 @@ def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None:
-    """A quarter of the poses is off by 0.1 m: they are no disturbance, no manoeuvre and no noise of the others."""
+    """A quarter of the poses is off by 0.1 m.
+
+    They are no disturbance, no manoeuvre and no noise of the others.
+    """
     result = surprises.run(surprises.Case("wrong", wrong=0.25, seconds=40.0), seed)
     assert result.track is not None
     assert result.track.manoeuvres == ()
@@ -224,7 +287,10 @@ def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None
 
 
 def test_three_poses_that_agree_replace_the_first_ones() -> None:
-    """The first four poses are 15 cm off: too few for a test of the next ones, which agree with one another."""
+    """The first four poses are 15 cm off.
+
+    Too few for a test of the next ones, which agree with one another.
+    """
     case = surprises.Case("first", at_s=0.0, until_s=2.0, bias=0.15, seconds=10.0)
     result = surprises.run(case, 0)
     after = result.t.index(2.0)
@@ -236,10 +302,15 @@ def test_three_poses_that_agree_replace_the_first_ones() -> None:
 def test_disturbances_that_the_end_of_a_bias_feigns_are_estimated_again(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of 0.1 mm: the end of the bias looks like a driven target, with a fit of fewer poses than an estimate."""
+    """Poses of 0.1 mm.
+
+    The end of the bias looks like a driven target, with a fit of fewer poses than an estimate.
+    """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
-    case = surprises.Case("bias", at_s=0.0, until_s=10.0, bias=0.15, hz=5.0, speed=0.4, seconds=30.0)
+    case = surprises.Case(
+        "bias", at_s=0.0, until_s=10.0, bias=0.15, hz=5.0, speed=0.4, seconds=30.0
+    )
     result = surprises.run(case, seed)
     assert result.track is not None
     assert result.track.levels.torque < 1e-5  # rad/s^1.5; the target is free
@@ -250,17 +321,24 @@ def test_disturbances_that_the_end_of_a_bias_feigns_are_estimated_again(
 def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """15 cm off for 10 s, 2 cm more in the last second: changes of the velocity that cancel would explain the step."""
+    """15 cm off for 10 s, 2 cm more in the last second.
+
+    Changes of the velocity that cancel would explain the step.
+    """
     simulated = surprises.measured
 
     def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
         shifts = {9.0: np.array([0.0, 0.02, 0.0]), 9.5: np.array([0.0, 0.0, 0.02])}
         poses = simulated(case, times, states, seed)
-        moved = (Pose(a.T_ac.q, a.T_ac.t + shifts.get(t, 0.0)) for t, a in zip(times, poses, strict=True))
+        moved = (
+            Pose(a.T_ac.q, a.T_ac.t + shifts.get(t, 0.0)) for t, a in zip(times, poses, strict=True)
+        )
         return [replace(a, T_ac=T) for a, T in zip(poses, moved, strict=True)]
 
     monkeypatch.setattr(surprises, "measured", measured)
-    result = surprises.run(surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=20.0), seed)
+    result = surprises.run(
+        surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=20.0), seed
+    )
     assert result.track is not None
     assert result.track.manoeuvres == ()
     after = result.t.index(10.0)
@@ -269,7 +347,10 @@ def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
 
 
 def test_an_outlier_before_the_estimate_is_tested_causes_no_doubt_about_later_scans() -> None:
-    """The fourth pose alone is 8 cm off; where it is used, with a small weight, the next scans are not deferred."""
+    """The fourth pose alone is 8 cm off.
+
+    Where it is used, with a small weight, the next scans are not deferred.
+    """
     case = surprises.Case("early outlier", at_s=1.5, until_s=2.0, bias=0.08, seconds=12.0)
     results = [surprises.run(case, seed) for seed in (1, 3, 5)]
     assert [reason for result in results for reason in result.reason if reason != "ok"] == []
@@ -277,7 +358,9 @@ def test_an_outlier_before_the_estimate_is_tested_causes_no_doubt_about_later_sc
 
 
 @pytest.mark.parametrize("until_s", [1e9, 48.0])
-def test_a_bias_from_40_s_on_is_flagged_from_its_first_scan_before_convergence(until_s: float) -> None:
+def test_a_bias_from_40_s_on_is_flagged_from_its_first_scan_before_convergence(
+    until_s: float,
+) -> None:
     case = surprises.Case("bias", at_s=40.0, until_s=until_s, bias=0.03, seconds=54.0)
     result = surprises.run(case, 0)
     first = result.t.index(40.0)
@@ -290,7 +373,10 @@ def test_a_bias_from_40_s_on_is_flagged_from_its_first_scan_before_convergence(u
 
 
 def test_the_end_of_an_early_bias_restores_the_estimate_before_it() -> None:
-    """Biased from 8 to 12 s: the estimate begins anew at 8 s; at 12 s that of the first 8 s is right again."""
+    """Biased from 8 to 12 s: the estimate begins anew at 8 s.
+
+    At 12 s that of the first 8 s is right again.
+    """
     case = surprises.Case("bias", at_s=8.0, until_s=12.0, bias=0.15, seconds=20.0)
     result = surprises.run(case, 2)
     after = result.t.index(12.0)
@@ -300,18 +386,25 @@ def test_the_end_of_an_early_bias_restores_the_estimate_before_it() -> None:
     assert result.track.started_ns == 0
 
 
-@pytest.mark.parametrize(("before", "after", "began"), [(0.005, 0.006, True), (0.006, 0.005, False)])
+@pytest.mark.parametrize(
+    ("before", "after", "began"), [(0.005, 0.006, True), (0.006, 0.005, False)]
+)
 def test_the_residuals_of_the_registration_tell_which_poses_are_biased(
     before: float, after: float, began: bool
 ) -> None:
-    """A range error deforms the scan. The time since the start would give the opposite answer in both cases."""
+    """A range error deforms the scan.
+
+    The time since the start would give the opposite answer in both cases.
+    """
     from types import SimpleNamespace
 
     from avsreplay.estimate import Estimator, EstimatorParams
 
     def scan(rms: float, t_s: float) -> SimpleNamespace:
         belief = SimpleNamespace(t_ns=round(t_s * 1e9))
-        return SimpleNamespace(innovation=SimpleNamespace(rms_m=rms), prediction=SimpleNamespace(belief=belief))
+        return SimpleNamespace(
+            innovation=SimpleNamespace(rms_m=rms), prediction=SimpleNamespace(belief=belief)
+        )
 
     late = 1.0 if began else 100.0
     recent = tuple(scan(before * (1.0 + 0.005 * k), late) for k in range(4))
@@ -322,7 +415,10 @@ def test_the_residuals_of_the_registration_tell_which_poses_are_biased(
 
 @pytest.mark.slow
 def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoeuvre() -> None:
-    """The first three scans after the step resemble an offset of 13 mm. An offset that grows is a manoeuvre."""
+    """The first three scans after the step resemble an offset of 13 mm.
+
+    An offset that grows is a manoeuvre.
+    """
     case = surprises.Case("step", at_s=45.0, velocity=0.01, seconds=54.0)
     result = surprises.run(case, 5016)
     first = result.t.index(45.5)
@@ -331,14 +427,20 @@ def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoe
     assert result.track is not None
     (found,) = result.track.manoeuvres
     assert abs(found.t_ns * 1e-9 - 45.2) < 1.0
-    assert found.velocity == pytest.approx(result.true_velocity, abs=4.0 * float(np.sqrt(found.P[3:, 3:].max())))
-    assert not any(c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True))
+    assert found.velocity == pytest.approx(
+        result.true_velocity, abs=4.0 * float(np.sqrt(found.P[3:, 3:].max()))
+    )
+    assert not any(
+        c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True)
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [20003, 20007])
 def test_a_small_bias_is_flagged_until_its_end(seed: int) -> None:
-    """Of an offset of 1.5 cm the difference of two scans cannot show every time whether it has ended."""
+    """Of an offset of 1.5 cm the difference of two scans cannot show every time whether it has
+    ended.
+    """
     case = surprises.Case("bias", at_s=45.0, until_s=65.0, bias=0.015, seconds=70.0)
     result = surprises.run(case, seed)
     first, after = result.t.index(45.0), result.t.index(65.0)
@@ -351,20 +453,28 @@ def test_a_small_bias_is_flagged_until_its_end(seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [21000, 21018])
 def test_a_bias_below_the_gate_of_a_single_scan_is_found(seed: int) -> None:
-    """Each scan with an offset of 1 cm would be accepted. Together they are those of a sensor error."""
+    """Each scan with an offset of 1 cm would be accepted.
+
+    Together they are those of a sensor error.
+    """
     case = surprises.Case("bias", at_s=45.0, until_s=60.0, bias=0.01, seconds=64.0)
     result = surprises.run(case, seed)
     first, after = result.t.index(45.0), result.t.index(60.0)
     assert not any(result.gamma[first + 5 : after])
     assert result.reason[after - 1] == "sensor_bias"
     assert all(result.gamma[after + 2 :])
-    assert not any(c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True))
+    assert not any(
+        c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True)
+    )
     assert result.error[-1][0] < 0.005
 
 
 @pytest.mark.slow
 def test_a_push_during_a_bias_ends_the_claim_of_convergence() -> None:
-    """The offset of 3 cm begins at once, so that no manoeuvre explains it; from the push on it grows."""
+    """The offset of 3 cm begins at once, so that no manoeuvre explains it.
+
+    From the push on it grows.
+    """
     case = surprises.Case("bias", at_s=45.0, bias=0.03, seconds=64.0)
     times, states, _, _ = surprises.world_of(case, 31005)
     moved = [
@@ -394,7 +504,10 @@ def test_a_single_wild_scan_changes_nothing() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_covariance_of_scans_with_common_errors_is_positive_semidefinite(seed: int) -> None:
-    """Neighbouring views may have very different covariances: a nearly degenerate one beside a good one."""
+    """Neighbouring views may have very different covariances.
+
+    A nearly degenerate one beside a good one.
+    """
     rng = np.random.default_rng(seed)
     R = []
     for _ in range(6):
@@ -440,7 +553,9 @@ def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> 
 
 
 def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_they_make() -> None:
-    """White innovations N(0, 1 + M M') with the columns M of the instants, two in each interval, against N(0, 1)."""
+    """White innovations N(0, 1 + M M') with the columns M of the instants, two in each interval,
+    against N(0, 1).
+    """
     rng = np.random.default_rng(7)
     every, white = rng.normal(size=(40, 48)), 3.0 * rng.normal(size=40)
     for intervals in (1, 3, 4):
@@ -456,13 +571,21 @@ def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_the
 @pytest.mark.parametrize(("m", "n"), [(20, 9), (6, 9), (5, 1), (5, 2)])
 def test_the_odds_of_random_impulses_are_those_of_the_gaussian_they_make(m: int, n: int) -> None:
     rng = np.random.default_rng(n)
-    M, white, variances = rng.normal(size=(m, n)), 2.0 * rng.normal(size=m), np.array([0.0, 1e-6, 0.3, 1e8])
+    M, white, variances = (
+        rng.normal(size=(m, n)),
+        2.0 * rng.normal(size=m),
+        np.array([0.0, 1e-6, 0.3, 1e8]),
+    )
     odds, fall = _motion.impulse_odds(M.T @ M, M.T @ white, variances)
     for variance, value, less in zip(variances, odds, fall, strict=True):
         C = np.eye(m) + variance * M @ M.T
         free = multivariate_normal.logpdf(white, cov=np.eye(m))
-        assert value == pytest.approx(multivariate_normal.logpdf(white, cov=C) - free, rel=1e-6, abs=1e-9)
-        assert less == pytest.approx(white @ white - white @ np.linalg.solve(C, white), rel=1e-6, abs=1e-9)
+        assert value == pytest.approx(
+            multivariate_normal.logpdf(white, cov=C) - free, rel=1e-6, abs=1e-9
+        )
+        assert less == pytest.approx(
+            white @ white - white @ np.linalg.solve(C, white), rel=1e-6, abs=1e-9
+        )
 
 
 def test_a_triangular_matrix_is_inverted_and_divided_by() -> None:
@@ -478,7 +601,9 @@ def test_a_triangular_matrix_is_inverted_and_divided_by() -> None:
 
 
 def test_the_window_holds_the_covariance_of_its_innovations() -> None:
-    """H_i P_i Phi_ij' H_j' for scans i before j, with P propagated from scan to scan and its process noise."""
+    """H_i P_i Phi_ij' H_j' for scans i before j, with P propagated from scan to scan and its
+    process noise.
+    """
     rng = np.random.default_rng(3)
     world = tumbling.draw(3, seconds=4.0, hz=1.0, rate=0.3)
     half = rng.normal(size=(20, 20)) * 1e-3
@@ -487,20 +612,27 @@ def test_the_window_holds_the_covariance_of_its_innovations() -> None:
     epochs, beliefs = [], [start]
     for t_ns in (0, 10**9, 2 * 10**9, 4 * 10**9):
         beliefs.append(propagate(beliefs[-1], t_ns, *noises)[0])
-        prediction = Prediction(beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
+        prediction = Prediction(
+            beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
+        )
         seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0, 0.0)
         epochs.append(Epoch(Track(start, "filter"), prediction, seen, False))
     C = scan_window.window_of(epochs, 4, start, *noises).C
     for i, first in enumerate(beliefs[1:]):
         for j, later in enumerate(beliefs[1:][i:], start=i):
             _, Phi = propagate_state(first.x, (later.t_ns - first.t_ns) * 1e-9)
-            expected = measurement_jacobian(first.x) @ first.P @ Phi.T @ measurement_jacobian(later.x).T
+            expected = (
+                measurement_jacobian(first.x) @ first.P @ Phi.T @ measurement_jacobian(later.x).T
+            )
             expected = expected + (R if i == j else 0.0)
-            np.testing.assert_allclose(C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], expected, rtol=1e-7, atol=1e-13)
+            np.testing.assert_allclose(
+                C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], expected, rtol=1e-7, atol=1e-13
+            )
 
 
 @pytest.mark.parametrize(
-    ("at_s", "step"), [(44.8, {"velocity": 0.01}), (44.93, {"velocity": 0.01}), (44.8, {"rate": 0.01})]
+    ("at_s", "step"),
+    [(44.8, {"velocity": 0.01}), (44.93, {"velocity": 0.01}), (44.8, {"rate": 0.01})],
 )
 def test_size_and_time_of_a_manoeuvre_are_as_precise_as_they_claim_with_precise_poses(
     monkeypatch: pytest.MonkeyPatch, at_s: float, step: dict[str, float]
@@ -511,13 +643,17 @@ def test_size_and_time_of_a_manoeuvre_are_as_precise_as_they_claim_with_precise_
     monkeypatch.setattr(surprises, "NEES_S", (47.0, 50.0))
     result = surprises.run(surprises.Case("push", at_s=at_s, seconds=52.0, **step), 1)
     assert result.track is not None
-    (found,) = result.track.manoeuvres  # a size that is wrong by many of its sigma caused a second report
+    (found,) = (
+        result.track.manoeuvres
+    )  # a size that is wrong by many of its sigma caused a second report
     assert abs(found.t_ns * 1e-9 - at_s - 0.2) < 3.0 * found.t_1s_s
     assert found.t_1s_s < 0.03
     off = found.velocity - result.true_velocity
     assert off @ np.linalg.solve(found.P[3:, 3:], off) < 16.3  # 99.9 % point, 3 degrees of freedom
     if result.true_rate.any():
-        assert abs(float(np.linalg.norm(found.rate)) - 0.01) < 3.0 * float(np.sqrt(np.trace(found.P[:3, :3])))
+        assert abs(float(np.linalg.norm(found.rate)) - 0.01) < 3.0 * float(
+            np.sqrt(np.trace(found.P[:3, :3]))
+        )
     assert np.max(np.array(result.nees)[:, 0]) < 2.0
 
 
@@ -533,7 +669,9 @@ def test_random_disturbances_are_no_manoeuvre(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("density", "kind"), [(3e-3, 0), (3e-2, 3)])
-def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: float, kind: int) -> None:
+def test_changes_in_every_interval_and_a_single_change_are_told_apart(
+    density: float, kind: int
+) -> None:
     """Innovations drawn from one hypothesis: it is the more likely one, and the density is found.
 
     A constant acceleration is more likely than either where it acts.
@@ -551,21 +689,36 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: f
                 push[kind : kind + 3] = density * np.array([0.1, 0.2, -0.1])
             elif not single or k == n // 2:
                 push[kind : kind + 3] = (
-                    density * np.sqrt(0.5) * (rng.normal(size=3) if not single else 3.0 * np.ones(3))
+                    density
+                    * np.sqrt(0.5)
+                    * (rng.normal(size=3) if not single else 3.0 * np.ones(3))
                 )
             x = replace(propagate_state(x, 0.25)[0])
             x = propagate_state(replace(x, w_b=x.w_b + push[:3], v_a=x.v_a + push[3:]), 0.25)[0]
             free = propagate_state(free, 0.5)[0]
             alpha = innovation_vector(free, x.T_ac) + 1e-4 * rng.normal(size=6)
             prediction = Prediction(
-                Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
+                Belief(round((k + 1) * 5e8), free, start.P),
+                np.eye(20),
+                np.zeros((6, 20)),
+                noise.NoiseWindow.empty(),
             )
-            epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0), False))
+            epochs.append(
+                Epoch(
+                    Track(start, "filter"),
+                    prediction,
+                    Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0),
+                    False,
+                )
+            )
             drawn.append(push)
         priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
         _, ranked = hypotheses.explain(epochs, n - 1, priors, 0.0, 0.0)
         found = {e.hypothesis: e for e in ranked}
-        disturbed, change = found[scan_window.Hypothesis.DISTURBED], found[scan_window.Hypothesis.MANOEUVRE]
+        disturbed, change = (
+            found[scan_window.Hypothesis.DISTURBED],
+            found[scan_window.Hypothesis.MANOEUVRE],
+        )
         constant = found[scan_window.Hypothesis.ACCELERATED]
         if single is None:
             assert ranked[0] is constant
@@ -582,20 +735,35 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: f
 
 @pytest.mark.parametrize("cancels", [False, True])
 def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
-    """Half a second at 0.3 m/s: a step of the pose by 15 cm if the target stops again, an impact if it does not."""
+    """Half a second at 0.3 m/s.
+
+    A step of the pose by 15 cm if the target stops again, an impact if it does not.
+    """
     rng, n, step = np.random.Generator(np.random.PCG64(8)), 14, np.array([0.0, 0.1, -0.3])
     start = Belief(0, tumbling.draw(2, seconds=7.0).states[0], np.eye(20) * 1e-10)
     R, free, epochs = np.eye(6) * 1e-6, start.x, []
     for k in range(n):
         free = propagate_state(free, 0.5)[0]
         since = max(0.0, 0.5 * (k - 8))  # the change is at 4.5 s
-        moved = step * (min(since, 0.5) if cancels else since) + 0.01 * since  # and a small error of the velocity
+        moved = (
+            step * (min(since, 0.5) if cancels else since) + 0.01 * since
+        )  # and a small error of the velocity
         T = Pose(free.T_ac.q, free.T_ac.t + moved)
         alpha = innovation_vector(free, T) + 1e-3 * rng.normal(size=6)
         prediction = Prediction(
-            Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
+            Belief(round((k + 1) * 5e8), free, start.P),
+            np.eye(20),
+            np.zeros((6, 20)),
+            noise.NoiseWindow.empty(),
         )
-        epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0), False))
+        epochs.append(
+            Epoch(
+                Track(start, "filter"),
+                prediction,
+                Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0),
+                False,
+            )
+        )
     priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
     _, ranked = hypotheses.explain(epochs, 9, priors, 0.0, 0.0)
     change = next(e for e in ranked if e.hypothesis is scan_window.Hypothesis.MANOEUVRE)
@@ -612,7 +780,10 @@ def test_an_error_of_a_known_acceleration_needs_no_other_evidence() -> None:
     rng = np.random.Generator(np.random.PCG64(4))
     edges, white = np.linspace(0.0, 6.0, 13), rng.normal(size=72)
     between, priors = rng.normal(size=(12, 72, 6)), scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
-    begins, known = (hypotheses._accelerated(edges, between, white, -5.0, priors, known) for known in (False, True))
+    begins, known = (
+        hypotheses._accelerated(edges, between, white, -5.0, priors, known)
+        for known in (False, True)
+    )
     assert known.log_evidence - begins.log_evidence == pytest.approx(np.log(1e3))
     assert (known.chi2, known.dof) == (begins.chi2, begins.dof)
 
@@ -622,15 +793,23 @@ def _poses_of(monkeypatch: pytest.MonkeyPatch, pose_at: Callable[[float], Pose])
     simulated = surprises.measured
 
     def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
-        errors = [x.T_ac.inverse() @ a.T_ac for x, a in zip(states, simulated(case, times, states, seed), strict=True)]
+        errors = [
+            x.T_ac.inverse() @ a.T_ac
+            for x, a in zip(states, simulated(case, times, states, seed), strict=True)
+        ]
         given = simulated(case, times, states, seed)
-        return [replace(a, T_ac=pose_at(t) @ e) for t, a, e in zip(times, given, errors, strict=True)]
+        return [
+            replace(a, T_ac=pose_at(t) @ e) for t, a, e in zip(times, given, errors, strict=True)
+        ]
 
     monkeypatch.setattr(surprises, "measured", measured)
 
 
 def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Poses of 0.1 mm at 10 Hz; the offset of 50 mm varies by 0.5 mm, which is many times their standard deviation."""
+    """Poses of 0.1 mm at 10 Hz.
+
+    The offset of 50 mm varies by 0.5 mm, which is many times their standard deviation.
+    """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
     simulated = surprises.measured
@@ -644,22 +823,32 @@ def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.Mon
         ]
 
     monkeypatch.setattr(surprises, "measured", measured)
-    case = surprises.Case("bias", at_s=45.0, until_s=52.0, bias=0.05, hz=10.0, speed=0.3, seconds=54.0)
+    case = surprises.Case(
+        "bias", at_s=45.0, until_s=52.0, bias=0.05, hz=10.0, speed=0.3, seconds=54.0
+    )
     result = surprises.run(case, 1)
     assert result.track is not None
     assert not result.track.manoeuvres
-    during = [reason for t, reason in zip(result.t, result.reason, strict=True) if 45.35 < t < 51.95]
+    during = [
+        reason for t, reason in zip(result.t, result.reason, strict=True) if 45.35 < t < 51.95
+    ]
     assert set(during) == {"sensor_bias"}
     assert all(gamma for t, gamma in zip(result.t, result.gamma, strict=True) if t > 53.0)
 
 
 def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The offset stays, because the prediction has it: the scans from 60 s on have half of the residuals."""
+    """The offset stays, because the prediction has it.
+
+    The scans from 60 s on have half of the residuals.
+    """
     simulated = surprises.measured
 
     def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
         given = simulated(case, times, states, seed)
-        return [replace(a, rms_m=0.016 if 30.0 <= t < 60.0 else 0.008) for t, a in zip(times, given, strict=True)]
+        return [
+            replace(a, rms_m=0.016 if 30.0 <= t < 60.0 else 0.008)
+            for t, a in zip(times, given, strict=True)
+        ]
 
     monkeypatch.setattr(surprises, "measured", measured)
     result = surprises.run(surprises.Case("bias", at_s=45.0, bias=0.015), 0)
@@ -669,29 +858,45 @@ def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.Monkey
 
 
 def _swing(t: float) -> Pose:
-    """A part on a cable of 2 m that swings by 12 degrees in one plane and 4 in the other, and turns about the cable."""
+    """A part on a cable of 2 m that swings by 12 degrees in one plane and 4 in the other, and turns
+    about the cable.
+    """
     a, b = 0.2 * np.cos(2.2 * t), 0.07 * np.cos(2.2 * t + 1.0)
     place = np.array([2.0 * np.sin(a), 2.0 * (np.cos(a) * np.cos(b) - 1.0), 4.0 + 2.0 * np.sin(b)])
-    turn = geometry.multiply(geometry.exp([b, 0.0, -a]), geometry.exp([0.0, 0.8 * np.cos(0.5 * t), 0.0]))
+    turn = geometry.multiply(
+        geometry.exp([b, 0.0, -a]), geometry.exp([0.0, 0.8 * np.cos(0.5 * t), 0.0])
+    )
     return Pose(turn, place)
 
 
-def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gravity and the cable accelerate it by 2 m/s^2: after five rejected poses their level is estimated from them."""
+def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Gravity and the cable accelerate it by 2 m/s^2.
+
+    After five rejected poses their level is estimated from them.
+    """
     _poses_of(monkeypatch, _swing)
     result = surprises.run(surprises.Case("swing", hz=10.0, seconds=15.0), 0)
     assert result.track is not None
     last_rejected = max(k for k, gamma in enumerate(result.gamma) if not gamma)
     assert result.t[last_rejected] < 2.0
-    assert max(result.failed_at) < result.t[last_rejected]  # the estimate is then never worse than the measured pose
+    assert (
+        max(result.failed_at) < result.t[last_rejected]
+    )  # the estimate is then never worse than the measured pose
     assert not any(result.converged)  # the forces of the cable are not known in advance
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_poses_that_contradict_one_another_are_no_driven_target(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+def test_poses_that_contradict_one_another_are_no_driven_target(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
     """After 2 s, poses with independent errors of 5 cm, which no motion explains."""
     rng = np.random.Generator(np.random.PCG64(seed))
-    _poses_of(monkeypatch, lambda t: Pose.from_matrix(np.eye(4)) if t < 2.0 else Pose(_swing(0).q, rng.normal(size=3)))
+    _poses_of(
+        monkeypatch,
+        lambda t: Pose.from_matrix(np.eye(4)) if t < 2.0 else Pose(_swing(0).q, rng.normal(size=3)),
+    )
     result = surprises.run(surprises.Case("wrong", hz=10.0, seconds=12.0), seed)
     assert result.track is not None
     assert result.track.reinitialised == 0
@@ -699,8 +904,13 @@ def test_poses_that_contradict_one_another_are_no_driven_target(monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("interval_s", "density"), [(0.1, 0.3), (0.5, 0.01)])
-def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s: float, density: float) -> None:
-    """A velocity that is a random walk: the root density is found to within the error of few poses."""
+def test_the_level_of_disturbances_is_found_from_differences_of_poses(
+    interval_s: float, density: float
+) -> None:
+    """A velocity that is a random walk.
+
+    The root density is found to within the error of few poses.
+    """
     rng = np.random.Generator(np.random.PCG64(7))
     fine = 50
     step = interval_s / fine
@@ -710,7 +920,11 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s
         places = np.cumsum(velocity * step, axis=0)[::fine]
         turned = np.cumsum(velocity[::fine, 0]) * interval_s
         fixes = [
-            PoseFix(round(k * interval_s * 1e9), Pose(geometry.exp([turn, 0.0, 0.0]), place), 1e-12 * np.eye(6))
+            PoseFix(
+                round(k * interval_s * 1e9),
+                Pose(geometry.exp([turn, 0.0, 0.0]), place),
+                1e-12 * np.eye(6),
+            )
             for k, (turn, place) in enumerate(zip(turned, places, strict=True))
         ]
         levels = pose_differences.disturbance_levels(fixes, 4.0)
@@ -722,12 +936,17 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s
 
 
 def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
-    """Mean square over motions of which a fifth has a change of the velocities; a linear motion of the mass centre."""
+    """Mean square over motions of which a fifth has a change of the velocities.
+
+    A linear motion of the mass centre.
+    """
     world, rng, share = tumbling.draw(3, seconds=1.0), np.random.Generator(np.random.PCG64(4)), 0.2
     x, times = world.states[0], np.array([5.0, 30.0])
     F = rng.normal(size=(20, 6)) * 1e-4
     belief, P = Belief(0, x, 1e-8 * np.eye(20)), F @ F.T
-    plain, changed = (grasp_forecast(Belief(0, x, C), times, 1e-6, 1e-6) for C in (belief.P, belief.P + P))
+    plain, changed = (
+        grasp_forecast(Belief(0, x, C), times, 1e-6, 1e-6) for C in (belief.P, belief.P + P)
+    )
     found = with_change(plain, belief, share * P)
     assert with_change(plain, belief, np.zeros((20, 20))) is plain
     for name in ("pos_1s_m", "vel_1s_mps", "rot_1s_rad"):
@@ -736,18 +955,26 @@ def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
 
 
 @pytest.mark.parametrize("least", [0.0, 1e-3, math.inf])
-def test_a_disturbance_that_the_earlier_poses_exclude_must_begin_within_the_scans(least: float) -> None:
-    """The mean of Gaussian densities over all root densities, of excluded ones with the prior odds of 0.01."""
+def test_a_disturbance_that_the_earlier_poses_exclude_must_begin_within_the_scans(
+    least: float,
+) -> None:
+    """The mean of Gaussian densities over all root densities, of excluded ones with the prior odds
+    of 0.01.
+    """
     rng, n = np.random.Generator(np.random.PCG64(7)), 4
     edges, between = np.array([0.0, 0.4, 1.0, 1.5, 2.0]), 30.0 * rng.normal(size=(n, 6 * n, 6))
     white, densities = 2.0 * rng.normal(size=6 * n), np.logspace(-6.0, -1.0, 21)
     found = hypotheses._disturbed(edges, between, white, 0.0, (math.inf, least))
     possible, values = densities < least, []
     for q in densities:
-        A = np.hstack([np.sqrt(h) * part[:, 3:] for h, part in zip(np.diff(edges), between, strict=True)])
+        A = np.hstack(
+            [np.sqrt(h) * part[:, 3:] for h, part in zip(np.diff(edges), between, strict=True)]
+        )
         C = np.eye(6 * n) + q * q * A @ A.T
         values.append(
-            multivariate_normal.logpdf(white, cov=C) + 0.5 * float(white @ white) + 3.0 * n * math.log(2.0 * math.pi)
+            multivariate_normal.logpdf(white, cov=C)
+            + 0.5 * float(white @ white)
+            + 3.0 * n * math.log(2.0 * math.pi)
         )
     weights = np.where(possible, 1.0 / max(possible.sum(), 1), np.exp(-4.6) / len(densities))
     force = float(np.log(weights @ np.exp(values))) - math.log(2.0) + scan_window.PRIOR_ODDS

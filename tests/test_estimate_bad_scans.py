@@ -1,4 +1,7 @@
-"""Errors of single scans, and noise that rises without a larger claimed covariance: ``estimate/bad_scans.py``."""
+"""Errors of single scans, and noise that rises without a larger claimed covariance.
+
+``estimate/bad_scans.py``.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,10 @@ PRIORS, FIRST, SCANS = ChangePriors(0.01, 0.02, 0.2, 0.05), 2, 4
 
 
 def window(seed: int, errors: float = 1.0) -> tuple[Window, np.ndarray]:
-    """Scans whose innovations have any covariance, the doubtful ones larger by ``errors``; whitened innovations."""
+    """Scans whose innovations have any covariance, the doubtful ones larger by ``errors``.
+
+    Whitened innovations.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     A, n = 0.01 * rng.normal(size=(6 * SCANS, 6 * SCANS)), SCANS
     C = A @ A.T + 1e-4 * np.eye(6 * n)
@@ -36,7 +42,9 @@ def window(seed: int, errors: float = 1.0) -> tuple[Window, np.ndarray]:
 
 def log_density(y: np.ndarray, C: np.ndarray) -> float:
     """Without the constant that the estimator leaves out."""
-    return float(multivariate_normal.logpdf(y, np.zeros(len(y)), C)) + 0.5 * len(y) * np.log(2.0 * np.pi)
+    return float(multivariate_normal.logpdf(y, np.zeros(len(y)), C)) + 0.5 * len(y) * np.log(
+        2.0 * np.pi
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -52,7 +60,9 @@ def test_larger_noise_has_the_mean_of_the_densities_with_it(seed: int) -> None:
             C[block, block] += np.outer(more, more) * scans.R[k]
         values[tuple(factor)] = log_density(scans.y, C)
     logs = np.array(list(values.values()))
-    assert found.log_evidence == pytest.approx(np.logaddexp.reduce(logs) - np.log(len(logs)) + PRIOR_ODDS, rel=1e-8)
+    assert found.log_evidence == pytest.approx(
+        np.logaddexp.reduce(logs) - np.log(len(logs)) + PRIOR_ODDS, rel=1e-8
+    )
     assert tuple(found.size) == max(values, key=values.__getitem__)
     assert found.hypothesis is Hypothesis.NOISIER
 
@@ -62,7 +72,9 @@ def test_the_last_of_the_bad_scans_may_be_good(seed: int) -> None:
     scans, white = window(seed, 10.0)
     found, logs = bad_scans.bad_scans(scans, white, PRIORS, FIRST), []
     for bad in (SCANS, SCANS - 1):
-        for size, (columns, sigma) in itertools.product((1.0, 0.1), (("range", 0.2), ("position", 0.2), ("pose", 0.2))):
+        for size, (columns, sigma) in itertools.product(
+            (1.0, 0.1), (("range", 0.2), ("position", 0.2), ("pose", 0.2))
+        ):
             C = scans.C.copy()
             for k in range(FIRST, bad):
                 u = scans.poses[k].t / np.linalg.norm(scans.poses[k].t)
@@ -74,7 +86,9 @@ def test_the_last_of_the_bad_scans_may_be_good(seed: int) -> None:
                 block = slice(6 * k, 6 * k + 6)
                 C[block, block] += size**2 * one
             logs.append(log_density(scans.y, C) + (bad - FIRST) * np.log(1e-2))
-    assert found.log_evidence == pytest.approx(np.logaddexp.reduce(logs) - np.log(len(logs)) + PRIOR_ODDS, rel=1e-8)
+    assert found.log_evidence == pytest.approx(
+        np.logaddexp.reduce(logs) - np.log(len(logs)) + PRIOR_ODDS, rel=1e-8
+    )
 
 
 @pytest.mark.parametrize("factor", [3.0, 8.0])
@@ -93,13 +107,21 @@ def test_a_rise_lasts_while_the_noise_is_larger_and_ends_soon_after(factor: floa
 
 @pytest.mark.parametrize("level", [3.0, 6.0])
 @pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
-def test_noise_that_rises_unannounced_is_no_manoeuvre(monkeypatch: pytest.MonkeyPatch, level: float, seed: int) -> None:
-    """The poses keep the covariance that they claim: the scans are used with more noise after three of them at most."""
+def test_noise_that_rises_unannounced_is_no_manoeuvre(
+    monkeypatch: pytest.MonkeyPatch, level: float, seed: int
+) -> None:
+    """The poses keep the covariance that they claim.
+
+    The scans are used with more noise after three of them at most.
+    """
     simulated, sigma = surprises.measured, np.repeat([surprises.ROT_RAD, surprises.POS_M], 3)
 
     def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
         C = np.diag(sigma**2)
-        return [replace(a, covariance=C, info=np.linalg.inv(C)) for a in simulated(case, times, states, seed)]
+        return [
+            replace(a, covariance=C, info=np.linalg.inv(C))
+            for a in simulated(case, times, states, seed)
+        ]
 
     monkeypatch.setattr(surprises, "measured", measured)
     case = surprises.Case("unannounced", at_s=30.0, until_s=40.0, noise=level, seconds=50.0)

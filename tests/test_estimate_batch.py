@@ -40,11 +40,15 @@ from avsreplay.records import Belief, State
 WHITE = EstimatorParams(correlated_share=0.0).resolved(2.0)
 
 
-def seen(world: tumbling.World, seed: int, pos_m: float = 0.01, rot_deg: float = 1.0) -> tuple[PoseFix, ...]:
+def seen(
+    world: tumbling.World, seed: int, pos_m: float = 0.01, rot_deg: float = 1.0
+) -> tuple[PoseFix, ...]:
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
     found = [tumbling.alignment(x.T_ac, rng, pos_m, np.radians(rot_deg)) for x in world.states]
     return tuple(
-        PoseFix(round(t * 1e9), a.T_ac, a.covariance) for t, a in zip(world.times, found, strict=True) if a is not None
+        PoseFix(round(t * 1e9), a.T_ac, a.covariance)
+        for t, a in zip(world.times, found, strict=True)
+        if a is not None
     )
 
 
@@ -60,10 +64,17 @@ def grown(fixes: tuple[PoseFix, ...], *counts: int):
 
 
 def test_poses_almost_at_one_instant_do_not_determine_the_first_rate() -> None:
-    """Stamps that step back are replaced by times 1 ns after the one before: a difference of poses is no rate then."""
+    """Stamps that step back are replaced by times 1 ns after the one before.
+
+    A difference of poses is no rate then.
+    """
     world = tumbling.draw(3, mu_deg=80.0, seconds=10.0)
     first, second, *others = seen(world, 3, rot_deg=0.1)[:6]
-    fixes = (first, second, *(replace(fix, t_ns=second.t_ns + k) for k, fix in enumerate(others, 1)))
+    fixes = (
+        first,
+        second,
+        *(replace(fix, t_ns=second.t_ns + k) for k, fix in enumerate(others, 1)),
+    )
     found, expected = rough_state(fixes), rough_state((first, second))
     assert np.linalg.norm(found.w_b) < 10.0 * np.linalg.norm(expected.w_b)
     assert np.linalg.norm(found.v_a) < 10.0 * np.linalg.norm(expected.v_a)
@@ -82,12 +93,18 @@ def test_chart_and_state_are_inverse(seed: int) -> None:
 def test_to_errors_is_the_derivative_of_to_state(seed: int) -> None:
     x, eps = tumbling.draw(seed, mu_deg=80.0, seconds=1.0).states[0], 1e-6
     c = to_chart(x)
-    slope = [(boxminus(to_state(c.moved(eps * u)), x) - boxminus(to_state(c.moved(-eps * u)), x)) for u in np.eye(20)]
+    slope = [
+        (boxminus(to_state(c.moved(eps * u)), x) - boxminus(to_state(c.moved(-eps * u)), x))
+        for u in np.eye(20)
+    ]
     assert np.abs(np.transpose(slope) / (2 * eps) - to_errors(c)).max() < 1e-8
 
 
 def test_every_parameter_vector_is_a_valid_inertia() -> None:
-    """The triangle inequalities need no guarding: every M gives |sigma| < 1, moments that a mass could have."""
+    """The triangle inequalities need no guarding.
+
+    Every M gives |sigma| < 1, moments that a mass could have.
+    """
     rng = np.random.Generator(np.random.PCG64(5))
     base = to_chart(tumbling.draw(0, seconds=1.0).states[0])
     for _ in range(50):
@@ -102,7 +119,12 @@ def test_every_parameter_vector_is_a_valid_inertia() -> None:
 def test_equal_moments_are_not_singular() -> None:
     """A sphere's chart moves smoothly through M = 0, where sigma and mu jump."""
     sphere = Chart.of(
-        np.array([0, 0, 0, 1.0]), np.array([0.1, 0, 0]), *[np.zeros(3)] * 2, np.zeros((3, 3)), *[np.ones(3)], np.eye(3)
+        np.array([0, 0, 0, 1.0]),
+        np.array([0.1, 0, 0]),
+        *[np.zeros(3)] * 2,
+        np.zeros((3, 3)),
+        *[np.ones(3)],
+        np.eye(3),
     )
     y = np.zeros(20)
     y[12:17] = 1e-3
@@ -119,16 +141,25 @@ def test_arc_gives_the_motion_and_its_derivative(seed: int) -> None:
     path = rotation_history(x, world.times)
     for k in (0, 1, 50, 120):
         there, h = world.states[k], float(world.times[k])
-        assert float(geometry.angle(geometry.multiply(geometry.conjugate(there.q_ab), path.q[k]))) < 1e-9
+        assert (
+            float(geometry.angle(geometry.multiply(geometry.conjugate(there.q_ab), path.q[k])))
+            < 1e-9
+        )
         assert np.abs(path.w[k] - there.w_b).max() < 1e-10
         Phi = transition(flow(x.w_b, x.sigma, h), x.sigma, h)
-        assert np.abs(path.S[k] - Phi[:6][:, [0, 1, 2, 3, 4, 5, 12, 13]]).max() < 1e-9 * (1 + np.abs(Phi).max())
+        assert np.abs(path.S[k] - Phi[:6][:, [0, 1, 2, 3, 4, 5, 12, 13]]).max() < 1e-9 * (
+            1 + np.abs(Phi).max()
+        )
 
 
 def test_the_step_follows_the_cost() -> None:
-    """The normal equations' right side is minus the gradient of the cost, prior and robust weights included."""
+    """The normal equations' right side is minus the gradient of the cost, prior and robust weights
+    included.
+    """
     fixes = list(seen(tumbling.draw(3, seconds=20.0), 3))
-    fixes[7] = replace(fixes[7], T_ac=fixes[7].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
+    fixes[7] = replace(
+        fixes[7], T_ac=fixes[7].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0]))
+    )
     poses = poses_of(tuple(fixes))
     prior = weak_prior(poses, WHITE)
     c = to_chart(tumbling.draw(3, seconds=20.0).states[0]).moved(np.full(20, 1e-3))
@@ -139,12 +170,17 @@ def test_the_step_follows_the_cost() -> None:
     for k in range(20):
         step = np.zeros(20)
         step[k] = 1e-6
-        slope = (core.residuals(c.moved(step).flat)[0] - core.residuals(c.moved(-step).flat)[0]) / 2e-6
+        slope = (
+            core.residuals(c.moved(step).flat)[0] - core.residuals(c.moved(-step).flat)[0]
+        ) / 2e-6
         assert b[k] == pytest.approx(-slope, rel=2e-2, abs=2e-2 * np.abs(b).max())
 
 
 def test_a_pass_without_disturbance_is_the_fit() -> None:
-    """One least-squares problem solved pose by pose: mean and covariance of the normal equations."""
+    """One least-squares problem solved pose by pose.
+
+    Mean and covariance of the normal equations.
+    """
     fixes = seen(tumbling.draw(2, seconds=30.0), 2)
     poses, fitted, prior = grown(fixes, 61)
     there = fitted.chart.moved(np.full(20, 1e-5))
@@ -152,16 +188,24 @@ def test_a_pass_without_disturbance_is_the_fit() -> None:
     A, b = problem.core.normal()
     y, P = process_noise_pass(there, None, problem, (0.0, 0.0))
     scale = np.sqrt(np.diag(P))
-    assert np.abs(P / np.outer(scale, scale) - np.linalg.inv(A) / np.outer(scale, scale)).max() < 1e-6
+    assert (
+        np.abs(P / np.outer(scale, scale) - np.linalg.inv(A) / np.outer(scale, scale)).max() < 1e-6
+    )
     assert np.abs((y - np.linalg.solve(A, b)) / scale).max() < 1e-5
 
 
 def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
-    """Against the joint normal of the errors at all poses, from the transition and the noise of each step."""
+    """Against the joint normal of the errors at all poses, from the transition and the noise of
+    each step.
+    """
     fixes = seen(tumbling.draw(5, seconds=4.0), 5, pos_m=0.002, rot_deg=0.1)
     poses, noise, at = poses_of(fixes), (1e-3, 1e-3), tumbling.draw(5, seconds=4.0).states[0]
     prior, x, n = Prior(to_chart(at), np.diag(np.full(20, 1e-2))), at, len(poses)
-    d, G, lag = np.empty((n, 6)), np.empty((n, 6, 20)), []  # residual, Jacobian by the error states then, noise of step
+    d, G, lag = (
+        np.empty((n, 6)),
+        np.empty((n, 6, 20)),
+        [],
+    )  # residual, Jacobian by the error states then, noise of step
     Phi = [np.eye(20)]
     for k in range(n):
         if k:
@@ -182,7 +226,10 @@ def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
     for i in range(n):
         for j in range(i, n):
             C = G[i] @ ends[i] @ far(i, j).T @ G[j].T + (poses.C[i] if i == j else 0.0)
-            S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], S[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = C, C.T
+            S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], S[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = (
+                C,
+                C.T,
+            )
         cross[:, 6 * i : 6 * i + 6] = far(i, n - 1) @ ends[i] @ G[i].T
     K = np.linalg.solve(S, cross.T).T
     want_y, want_P = -K @ d.reshape(-1), ends[-1] - K @ cross.T
@@ -195,10 +242,15 @@ def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
-    """600 poses at 10 Hz with an outlier, a reference 1 sigma off: mean and covariance of both fits agree."""
+    """600 poses at 10 Hz with an outlier, a reference 1 sigma off.
+
+    Mean and covariance of both fits agree.
+    """
     world = tumbling.draw(seed, seconds=60.0, hz=10.0, sigma_max=0.85)
     fixes = list(seen(world, seed, pos_m=0.005, rot_deg=0.3))
-    fixes[40] = replace(fixes[40], T_ac=fixes[40].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
+    fixes[40] = replace(
+        fixes[40], T_ac=fixes[40].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0]))
+    )
     poses = poses_of(tuple(fixes))
     prior = weak_prior(poses, WHITE)
     full = whole(fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False)))
@@ -229,9 +281,14 @@ def test_poses_are_corrected_by_their_mean_errors() -> None:
     assert np.abs(t - (place - geometry.rotate(geometry.matrix(want), moved))).max() < 1e-13
 
 
-@pytest.mark.parametrize(("n", "rate", "hz"), [(153, 0.1, 2.0), (1000, 0.05, 10.0), (500, 1e-6, 5.0), (300, 1.0, 2.0)])
+@pytest.mark.parametrize(
+    ("n", "rate", "hz"), [(153, 0.1, 2.0), (1000, 0.05, 10.0), (500, 1e-6, 5.0), (300, 1.0, 2.0)]
+)
 def test_there_are_not_more_normal_points_than_asked_for(n: int, rate: float, hz: float) -> None:
-    """153 poses at 0.05 rad per pose: four poses and 0.25 rad end at different poses; both rules split them once."""
+    """153 poses at 0.05 rad per pose: four poses and 0.25 rad end at different poses.
+
+    Both rules split them once.
+    """
     world = tumbling.draw(2, rate=rate, seconds=(n - 1) / hz, hz=hz)
     rng = np.random.Generator(np.random.PCG64(4))
     seen = [tumbling.alignment(x.T_ac, rng, 0.002, 0.002) for x in world.states]
@@ -246,13 +303,16 @@ def test_there_are_not_more_normal_points_than_asked_for(n: int, rate: float, hz
 
 def test_few_poses_are_their_own_normal_points() -> None:
     poses = poses_of(seen(tumbling.draw(0, seconds=20.0), 0))
-    assert normal_points(poses, to_chart(tumbling.draw(0, seconds=1.0).states[0]), np.ones(2)) is poses
+    assert (
+        normal_points(poses, to_chart(tumbling.draw(0, seconds=1.0).states[0]), np.ones(2)) is poses
+    )
 
 
 def test_exact_poses_give_the_exact_motion() -> None:
     world = tumbling.draw(1, seconds=60.0)
     fixes = tuple(
-        PoseFix(round(t * 1e9), x.T_ac, np.eye(6) * 1e-8) for t, x in zip(world.times, world.states, strict=True)
+        PoseFix(round(t * 1e9), x.T_ac, np.eye(6) * 1e-8)
+        for t, x in zip(world.times, world.states, strict=True)
     )
     poses = poses_of(fixes)
     flat = Prior(to_chart(rough_state(fixes)), np.diag(np.full(20, 1e8)))
@@ -274,14 +334,20 @@ def test_fit_from_nothing_finds_the_truth_within_its_covariance(seed: int) -> No
 def test_fit_is_the_optimum_from_any_side() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    again = whole(fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective))
+    again = whole(
+        fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective)
+    )
     assert again.half_chi2 == pytest.approx(fitted.half_chi2, abs=0.02)
-    assert Problem(poses, prior, fitted.effective).cost(to_chart(world.states[0])) > fitted.half_chi2
+    assert (
+        Problem(poses, prior, fitted.effective).cost(to_chart(world.states[0])) > fitted.half_chi2
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_a_bent_valley_of_the_cost_is_followed_to_its_minimum_in_few_steps(seed: int) -> None:
-    """Without the second-order part of a step some of these fits take more than 40 steps, or end before the minimum."""
+    """Without the second-order part of a step some of these fits take more than 40 steps, or end
+    before the minimum.
+    """
     fixes, work = seen(tumbling.draw(seed, seconds=30.0), seed, 1e-4, 0.01), 0
     chart = to_chart(rough_state(fixes))
     for count in (5, 9, 15, 25, 40, 60):
@@ -295,7 +361,10 @@ def test_a_bent_valley_of_the_cost_is_followed_to_its_minimum_in_few_steps(seed:
 
 
 def test_a_descent_over_many_turns_is_done_in_parts_and_takes_the_same_steps() -> None:
-    """Each step passes the rotation between the poses in pieces; a log of many turns has few normal points."""
+    """Each step passes the rotation between the poses in pieces.
+
+    A log of many turns has few normal points.
+    """
     fixes = seen(tumbling.draw(3, seconds=240.0, hz=0.25, rate=1.0), 3)
     poses, start = poses_of(fixes), to_chart(tumbling.draw(3, seconds=1.0, rate=1.0).states[0])
     prior = weak_prior(poses, WHITE)
@@ -318,7 +387,9 @@ def test_false_poses_are_weighted_down() -> None:
     world = tumbling.draw(4)
     fixes = list(seen(world, 4))
     for k in range(5, 200, 20):
-        fixes[k] = replace(fixes[k], T_ac=fixes[k].T_ac @ Pose(geometry.exp([2.0, 0.5, 0]), np.array([1.0, 0, 0])))
+        fixes[k] = replace(
+            fixes[k], T_ac=fixes[k].T_ac @ Pose(geometry.exp([2.0, 0.5, 0]), np.array([1.0, 0, 0]))
+        )
     _, fitted, _ = grown(tuple(fixes), 21, 41, 81, 201)
     assert np.all(fitted.weights[5:200:20] < 0.05)
     assert np.sum(fitted.weights == 1.0) == 201 - 10
@@ -327,7 +398,10 @@ def test_false_poses_are_weighted_down() -> None:
 
 def test_a_registration_that_claims_too_little_is_rescaled() -> None:
     world = tumbling.draw(4)
-    fixes = tuple(replace(f, C=f.C * np.repeat([1 / 9, 1 / 4], 3)[:, None] * np.eye(6)) for f in seen(world, 4))
+    fixes = tuple(
+        replace(f, C=f.C * np.repeat([1 / 9, 1 / 4], 3)[:, None] * np.eye(6))
+        for f in seen(world, 4)
+    )
     _, fitted, _ = grown(fixes, 21, 81, 201)
     assert fitted.factors == pytest.approx([3.0, 2.0], rel=0.12)
 
@@ -348,18 +422,26 @@ def test_residuals_that_stay_widen_the_covariance() -> None:
 def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: float) -> Belief:
     """The belief at the last pose, without process noise."""
     problem = Problem(poses, prior, found.fitted.effective)
-    return moments(whole(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds)))
+    return moments(
+        whole(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds))
+    )
 
 
 def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
-    """Seven bodies seen for 40 s: the curvature alone is far too sure, the mended covariance is not."""
+    """Seven bodies seen for 40 s.
+
+    The curvature alone is far too sure, the mended covariance is not.
+    """
     plain, mended = [], []
     for seed in (3, 6, 9, 15, 2):
         world = tumbling.draw(seed, seconds=40.0)
         poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
         found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
         assert not found.gaussian
-        plain.append(nees(at_the_end(replace(found, directions=()), poses, prior, 40.0), world.states[-1]) / 20)
+        plain.append(
+            nees(at_the_end(replace(found, directions=()), poses, prior, 40.0), world.states[-1])
+            / 20
+        )
         mended.append(nees(at_the_end(found, poses, prior, 40.0), world.states[-1]) / 20)
     assert np.mean(plain) > 3.0
     assert np.mean(mended) < 1.6
@@ -389,7 +471,9 @@ def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_varia
     others = at_the_end(replace(found, directions=found.directions[1:]), poses, prior, 20.0)
     lost = found.directions[0].points[1].pin
 
-    def passed(chart: Chart, pin: Pin | None, problem: Problem, noise: tuple[float, float]) -> tuple[Array, Array]:
+    def passed(
+        chart: Chart, pin: Pin | None, problem: Problem, noise: tuple[float, float]
+    ) -> tuple[Array, Array]:
         y, P = process_noise_pass(chart, pin, problem, noise)
         return y, P * np.nan if pin is lost else P
 
@@ -399,7 +483,10 @@ def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_varia
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(seed: int) -> None:
-    """A fit ends some tenths of a sigma away from the minimum; this difference is no evidence for a torque."""
+    """A fit ends some tenths of a sigma away from the minimum.
+
+    This difference is no evidence for a torque.
+    """
     poses, fitted, prior = grown(seen(tumbling.draw(seed, seconds=30.0), seed, 0.001, 0.05), 41, 61)
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))
     weakest = 0.3 * np.sqrt(values[-1]) * vectors[:, -1] * prior.one_sigma
@@ -413,12 +500,22 @@ def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(s
 
 
 @pytest.mark.parametrize(("count", "seconds"), [(3, 1.0), (40, 400.0)])
-def test_correlated_errors_change_the_covariance_as_in_exact_arithmetic(count: int, seconds: float) -> None:
-    """P (prior + J' V J) P in 60 digits, for three poses, most directions being unknown, and over many turns."""
+def test_correlated_errors_change_the_covariance_as_in_exact_arithmetic(
+    count: int, seconds: float
+) -> None:
+    """P (prior + J' V J) P in 60 digits, for three poses, most directions being unknown, and over
+    many turns.
+    """
     states = tumbling.draw(2, seconds=seconds, hz=(count - 1) / seconds, rate=0.3).states
     rng = np.random.Generator(np.random.PCG64(2))
     fixes = tuple(
-        PoseFix(round(k * seconds / (count - 1) * 1e9), x.T_ac, np.diag(rng.uniform(0.5, 2.0, 6) * 1e-6), 0, 0.5)
+        PoseFix(
+            round(k * seconds / (count - 1) * 1e9),
+            x.T_ac,
+            np.diag(rng.uniform(0.5, 2.0, 6) * 1e-6),
+            0,
+            0.5,
+        )
         for k, x in enumerate(states)
     )
     poses = poses_of(fixes)
@@ -437,7 +534,9 @@ def test_correlated_errors_change_the_covariance_as_in_exact_arithmetic(count: i
             total = total + rows.reshape(-1, 20).T.dot(exact(V[b]).dot(rows).reshape(-1, 20))
         want, P = P.dot(total).dot(P).astype(float), P.astype(float)
     scale = np.sqrt(np.diag(want))
-    assert pytest.approx(want / np.outer(scale, scale), abs=1e-11) == A @ (B @ P @ B.T) @ A.T / np.outer(scale, scale)
+    assert pytest.approx(want / np.outer(scale, scale), abs=1e-11) == A @ (
+        B @ P @ B.T
+    ) @ A.T / np.outer(scale, scale)
 
 
 def _inverse(A: Array) -> Array:
@@ -457,7 +556,9 @@ def test_a_long_arc_settles() -> None:
     found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
     assert found.gaussian
     here = at_the_end(found, poses, prior, 100.0)
-    assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)
+    assert nees(here, world.states[-1]) == pytest.approx(
+        nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2
+    )
 
 
 def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others() -> None:
@@ -467,7 +568,9 @@ def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others()
     row[12] = 1.0
     shift = 2.0 * np.sqrt(fitted.P_chart[12, 12])
     problem = Problem(poses, prior, fitted.effective)
-    held, _, _ = whole(problem.pinned(fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift), 40))
+    held, _, _ = whole(
+        problem.pinned(fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift), 40)
+    )
     assert held.minus(fitted.chart)[12] == pytest.approx(shift, rel=0.02)
     rise = problem.cost(held) - fitted.half_chi2
     assert rise == pytest.approx(2.0, rel=0.5)
@@ -504,7 +607,10 @@ def test_reference_needs_no_truth_and_is_close_to_it() -> None:
     world = tumbling.draw(14)
     fixes = seen(world, 14)
     ref = reference_fit([f.t_ns for f in fixes], [f.T_ac for f in fixes], None, 2.0)
-    gaps = [np.linalg.norm(ref.at(f.t_ns).T_ac.t - x.T_ac.t) for f, x in zip(fixes, world.states, strict=True)]
+    gaps = [
+        np.linalg.norm(ref.at(f.t_ns).T_ac.t - x.T_ac.t)
+        for f, x in zip(fixes, world.states, strict=True)
+    ]
     assert np.sqrt(np.mean(np.square(gaps))) < 0.004
     with pytest.raises(ValueError, match="outside"):
         ref.at(fixes[-1].t_ns + 1)
@@ -531,14 +637,27 @@ def test_poses_can_be_cut() -> None:
 
 
 def test_a_body_at_rest_is_estimated() -> None:
-    """No turn, nothing to tell inertia by: the fit stays with its prior and says so by its covariance."""
-    x = State([0, 0, 0, 1.0], np.zeros(3), [0, 0, 5.0], np.zeros(3), np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
+    """No turn, nothing to tell inertia by.
+
+    The fit stays with its prior and says so by its covariance.
+    """
+    x = State(
+        [0, 0, 0, 1.0],
+        np.zeros(3),
+        [0, 0, 5.0],
+        np.zeros(3),
+        np.zeros(2),
+        np.zeros(3),
+        [0, 0, 0, 1.0],
+    )
     rng = np.random.Generator(np.random.PCG64(0))
     estimator = Estimator(WHITE, None, 2.0)
     track = estimator.initial(0, x.T_ac)
     for k in range(40):
         prediction = estimator.predict(track, k * 500_000_000)
-        seen_pose = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 0.01, np.radians(1.0)))
+        seen_pose = estimator.innovate(
+            prediction, tumbling.alignment(x.T_ac, rng, 0.01, np.radians(1.0))
+        )
         track = estimator.update(track, prediction, seen_pose, 1)
     assert track.mode == "fit"
     assert np.linalg.norm(track.belief.x.T_ac.t - x.T_ac.t) < 0.02
@@ -547,9 +666,14 @@ def test_a_body_at_rest_is_estimated() -> None:
 
 @pytest.mark.slow
 def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_unknown() -> None:
-    """A spent stage: where its cross axes lie can hardly be told, where its fixture will be in 30 s can."""
+    """A spent stage.
+
+    Where its cross axes lie can hardly be told, where its fixture will be in 30 s can.
+    """
     moments, base = np.array([1.0, 1.003, 0.3]), tumbling.draw(5, seconds=1.0).states[0]
-    first = State(base.q_ab, base.w_b, base.r_a, base.v_a, tumbling.ratios(moments), base.c_b, base.q_bc)
+    first = State(
+        base.q_ab, base.w_b, base.r_a, base.v_a, tumbling.ratios(moments), base.c_b, base.q_bc
+    )
     times = np.arange(0.0, 60.1, 0.5)
     states = tumbling.follow(np.append(times, 90.0), moments, first)
     estimator, test = Estimator(WHITE, None, 2.0), Convergence(ConvergenceParams(), 2.0)
@@ -571,7 +695,10 @@ def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_u
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_pure_spin_stays_predictable(axis: int) -> None:
-    """Spin about a principal axis, 120 s: inertia is unobservable, yet the forecast of the grasp point gets better."""
+    """Spin about a principal axis, 120 s.
+
+    Inertia is unobservable, yet the forecast of the grasp point gets better.
+    """
     case = surprises.Case("spin", spin=axis, seconds=120.0)
     result = surprises.run(case, 0)
     grasp = np.array(result.grasp)
@@ -583,11 +710,18 @@ def test_a_pure_spin_stays_predictable(axis: int) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 6])
-def test_a_fit_without_any_prior_knowledge_ends_although_first_trials_are_absurd(count: int) -> None:
-    """A few poses and a prior of a thousand times the usual width: trials have inertias beyond all bounds."""
+def test_a_fit_without_any_prior_knowledge_ends_although_first_trials_are_absurd(
+    count: int,
+) -> None:
+    """A few poses and a prior of a thousand times the usual width.
+
+    Trials have inertias beyond all bounds.
+    """
     fixes = seen(tumbling.draw(0, mu_deg=80.0, seconds=4.0), 0, pos_m=0.05)[:count]
     poses = poses_of(fixes)
     prior = weak_prior(poses, WHITE)
-    fitted = whole(fit(poses, to_chart(rough_state(fixes)), Prior(prior.mean, 1e6 * prior.P), FitParams()))
+    fitted = whole(
+        fit(poses, to_chart(rough_state(fixes)), Prior(prior.mean, 1e6 * prior.P), FitParams())
+    )
     assert np.isfinite(fitted.half_chi2)
     assert fitted.half_chi2 < 10.0 * len(fixes)

@@ -1,4 +1,7 @@
-"""Scheduling of the batch fit: the effect of accepted bad scans on the estimate, and of impulses on a fit."""
+"""Scheduling of the batch fit.
+
+The effect of accepted bad scans on the estimate, and of impulses on a fit.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +39,29 @@ from avsreplay.records import Belief, State
 
 POS_M, ROT_RAD = 0.005, np.radians(0.3)
 WHITE = EstimatorParams(correlated_share=0.0, start=Start.NEAR)
-DEAF = replace(WHITE, audit_poses=0, robust=False, constraint=Constraint.GAIN)  # the filter as printed
+DEAF = replace(
+    WHITE, audit_poses=0, robust=False, constraint=Constraint.GAIN
+)  # the filter as printed
 BAND_20 = chi2.ppf([0.0005, 0.9995], 20)
 
 
 def fold(
-    times: np.ndarray, states: list[State], params: EstimatorParams, seed: int, wrong=None, noise=1.0, wide=1.0
+    times: np.ndarray,
+    states: list[State],
+    params: EstimatorParams,
+    seed: int,
+    wrong=None,
+    noise=1.0,
+    wide=1.0,
 ) -> Iterator[Track]:
-    """The track after each scan; ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy."""
+    """The track after each scan.
+
+    ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
-    estimator = Estimator(params, tumbling.near(states[0], seed, wide) if params.start is Start.NEAR else None, 2.0)
+    estimator = Estimator(
+        params, tumbling.near(states[0], seed, wide) if params.start is Start.NEAR else None, 2.0
+    )
     track = estimator.initial(0, states[0].T_ac)
     for k, (t, x) in enumerate(zip(times, states, strict=True)):
         prediction = estimator.predict(track, round(t * 1e9))
@@ -72,7 +88,9 @@ def test_a_pose_is_weighted_down_beyond_the_gate_only() -> None:
     for size in (0.0, 1.0, 5.0, 5.27, 5.29, 20.0, 1e6):
         seen = innovation_of(P, H, np.array([size, 0, 0, 0, 0, 0]), R, robust=True)
         assert seen.nis == pytest.approx(size**2)
-        assert seen.weight == pytest.approx(min(1.0, chi2.ppf(0.9999, 6) / max(size**2, 1e-9)), rel=1e-3)
+        assert seen.weight == pytest.approx(
+            min(1.0, chi2.ppf(0.9999, 6) / max(size**2, 1e-9)), rel=1e-3
+        )
         assert innovation_of(P, H, seen.alpha, R).weight == 1.0
 
 
@@ -89,7 +107,10 @@ def test_an_accepted_frozen_scan_leaves_the_estimate_consistent(seed: int) -> No
 
 @pytest.mark.slow
 def test_a_consistent_filter_is_not_changed() -> None:
-    """Twenty bodies, three audits each: the fit takes the word from none, and nothing differs in a bit."""
+    """Twenty bodies, three audits each.
+
+    The fit takes the word from none, and nothing differs in a bit.
+    """
     recalls = 0
     for seed in range(20):
         world = tumbling.draw(seed, seconds=100.0, sigma_max=0.85)
@@ -122,16 +143,28 @@ def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
 
 def test_the_start_of_the_paper_is_not_changed() -> None:
     world = tumbling.draw(2, seconds=40.0)
-    track = last(world.times, world.states, replace(WHITE, start=Start.PAPER), 2, frozen_scanner(30, 3, world.states))
+    track = last(
+        world.times,
+        world.states,
+        replace(WHITE, start=Start.PAPER),
+        2,
+        frozen_scanner(30, 3, world.states),
+    )
     assert track.reinitialised == 0
     assert track.fixes == ()
     assert {epoch.weight for epoch in track.window.epochs} == {1.0}
 
 
 def fixes(seed: int, seconds: float) -> tuple[PoseFix, ...]:
-    world, rng = tumbling.draw(seed, seconds=seconds), np.random.Generator(np.random.PCG64([seed, 7]))
+    world, rng = (
+        tumbling.draw(seed, seconds=seconds),
+        np.random.Generator(np.random.PCG64([seed, 7])),
+    )
     seen = [tumbling.alignment(x.T_ac, rng, POS_M, ROT_RAD) for x in world.states]
-    return tuple(PoseFix(round(t * 1e9), a.T_ac, a.covariance) for t, a in zip(world.times, seen, strict=True))
+    return tuple(
+        PoseFix(round(t * 1e9), a.T_ac, a.covariance)
+        for t, a in zip(world.times, seen, strict=True)
+    )
 
 
 def test_process_noise_increases_the_covariance_and_zero_noise_gives_the_fit() -> None:
@@ -160,11 +193,16 @@ def test_the_memory_is_where_pushes_have_turned_the_body_by_the_stray() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [Start.NEAR, Start.COLD])
 def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
-    """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's word or the filter's."""
+    """Ten times the default torque noise over 100 s.
+
+    Mean NEES of eight bodies, the fit's word or the filter's.
+    """
     sizes = []
     for seed in range(8):
         world = tumbling.pushed(seed, 1e-5, seconds=100.0, hz=2.0)
-        track = last(world.times, world.states, replace(WHITE, start=start, torque_noise_radps15=1e-5), seed)
+        track = last(
+            world.times, world.states, replace(WHITE, start=start, torque_noise_radps15=1e-5), seed
+        )
         sizes.append(nees(track.belief, world.states[-1]) / 20)
     assert np.median(sizes) < 1.4
     assert np.median(sizes) > 0.5
@@ -195,7 +233,10 @@ def test_the_fit_begins_where_the_belief_came_from() -> None:
 
 @pytest.mark.slow
 def test_a_given_start_is_consistent_under_precise_poses() -> None:
-    """Poses far finer than the start: what the printed filter linearises on the way it takes for knowledge."""
+    """Poses far finer than the start.
+
+    What the printed filter linearises on the way it takes for knowledge.
+    """
     sizes: dict[Constraint, list[float]] = {constraint: [] for constraint in Constraint}
     for seed in range(10):
         world = tumbling.draw(seed, seconds=30.0, sigma_max=0.6)
@@ -209,29 +250,46 @@ def test_a_given_start_is_consistent_under_precise_poses() -> None:
 
 
 def test_a_belief_becomes_a_prior_by_its_draws() -> None:
-    """Where it is narrow the derivative says the same; where two moments are nearly equal the axes count for more."""
+    """Where it is narrow the derivative says the same.
+
+    Where two moments are nearly equal the axes count for more.
+    """
     world = tumbling.draw(4, seconds=1.0)
     x = replace(world.states[0], sigma=np.array([-0.5, 0.4]))
     P = np.diag(tumbling.NEAR_1S**2) * 1e-4
     back = np.linalg.inv(to_errors(to_chart(x)))
     scale = np.sqrt(np.diagonal(back @ P @ back.T))
-    assert np.abs((given_prior(Belief(0, x, P)).P - back @ P @ back.T) / np.outer(scale, scale)).max() < 0.2
+    assert (
+        np.abs((given_prior(Belief(0, x, P)).P - back @ P @ back.T) / np.outer(scale, scale)).max()
+        < 0.2
+    )
     near_equal = replace(x, sigma=np.array([-0.5, 0.001]))
     P = np.diag(tumbling.NEAR_1S**2)
     back = np.linalg.inv(to_errors(to_chart(near_equal)))
     drawn, straight = given_prior(Belief(0, near_equal, P)).P, back @ P @ back.T
-    assert np.linalg.eigvalsh(drawn[12:17, 12:17])[0] > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]
+    assert (
+        np.linalg.eigvalsh(drawn[12:17, 12:17])[0]
+        > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("constraint", Constraint)
 def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None:
-    """Ten of its own sigma off: no confident wrong number is made of it, and the row says that it was contradicted."""
+    """Ten of its own sigma off.
+
+    No confident wrong number is made of it, and the row says that it was contradicted.
+    """
     for seed in range(2):
         world = tumbling.draw(seed, seconds=100.0, sigma_max=0.6)
-        false = replace(tumbling.near(world.states[0], seed), x=tumbling.near(world.states[0], seed, 10.0).x)
+        false = replace(
+            tumbling.near(world.states[0], seed), x=tumbling.near(world.states[0], seed, 10.0).x
+        )
         estimator = Estimator(replace(WHITE, constraint=constraint), false, 2.0)
-        track, rng = estimator.initial(0, false.x.T_ac), np.random.Generator(np.random.PCG64([seed, 7]))
+        track, rng = (
+            estimator.initial(0, false.x.T_ac),
+            np.random.Generator(np.random.PCG64([seed, 7])),
+        )
         for t, x in zip(world.times, world.states, strict=True):
             prediction = estimator.predict(track, round(t * 1e9))
             seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, POS_M, ROT_RAD))
@@ -263,7 +321,10 @@ def fixes_of(world: tumbling.World, seed: int) -> tuple[PoseFix, ...]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
-    """The older half joined in pairs, twice over: the estimate changes by a small part of its standard deviation."""
+    """The older half joined in pairs, twice over.
+
+    The estimate changes by a small part of its standard deviation.
+    """
     world = tumbling.draw(seed, seconds=80.0, hz=5.0, sigma_max=0.85)
     fixes = fixes_of(world, seed)
     reference = to_chart(world.states[0])
@@ -276,10 +337,17 @@ def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
     assert pose_count(fewer) == pose_count(fixes) == len(fixes)
     assert sorted(f.t_ns for f in fewer) == [f.t_ns for f in fewer]
     params, rules = EstimatorParams().resolved(2.0), FitParams(rescale=False)
-    every, part = (whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference)) for some in (fixes, fewer))
+    every, part = (
+        whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference))
+        for some in (fixes, fewer)
+    )
     assert part.count == every.count == len(fixes)
     there = to_chart(every.belief.x)
-    size = to_errors(there) @ to_chart(part.belief.x).minus(there) / np.sqrt(np.diagonal(every.belief.P))
+    size = (
+        to_errors(there)
+        @ to_chart(part.belief.x).minus(there)
+        / np.sqrt(np.diagonal(every.belief.P))
+    )
     assert np.abs(size).max() < 0.2
     ratio = np.sqrt(np.diagonal(part.belief.P) / np.diagonal(every.belief.P))
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
@@ -305,7 +373,10 @@ def test_a_fit_uses_a_bounded_number_of_poses() -> None:
 
 @pytest.mark.parametrize(("seed", "axis"), [(1, 0), (4, 2)])
 def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: int) -> None:
-    """The spin about an unstable axis for 300 rad: its covariance grows beyond what numbers can hold."""
+    """The spin about an unstable axis for 300 rad.
+
+    Its covariance grows beyond what numbers can hold.
+    """
     world = tumbling.draw(seed, seconds=1500.0, hz=0.1, sigma_max=0.85)
     first = replace(world.states[0], w_b=0.2 * np.eye(3)[axis])
     world = replace(world, states=tumbling.follow(world.times, world.moments, first))
@@ -317,13 +388,17 @@ def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: i
         if a.covariance is not None
     )
     params, levels = EstimatorParams().resolved(4.0), NoiseLevels(torque=1e-7, count=100)
-    P = whole(batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first))).belief.P
+    P = whole(
+        batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first))
+    ).belief.P
     assert np.all(np.isfinite(P))
     scale = np.sqrt(np.diagonal(P))
     assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9
 
 
-def test_one_component_of_a_curved_likelihood_is_fitted_again_once_the_inertia_has_left_it() -> None:
+def test_one_component_of_a_curved_likelihood_is_fitted_again_once_the_inertia_has_left_it() -> (
+    None
+):
     world = tumbling.draw(3, seconds=12.0)
     track = last(world.times, world.states, replace(WHITE, start=Start.COLD), 3)
     fitted = track.batch

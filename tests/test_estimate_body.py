@@ -1,4 +1,7 @@
-"""Physical parameters in {C}: correct for a known body, equal for every axis permutation, inside their range."""
+"""Physical parameters in {C}.
+
+Correct for a known body, equal for every axis permutation, inside their range.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,12 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate.chart import AXIS_PERMUTATIONS, body_parameters, permute_axes, permute_covariance
+from avsreplay.estimate.chart import (
+    AXIS_PERMUTATIONS,
+    body_parameters,
+    permute_axes,
+    permute_covariance,
+)
 from avsreplay.records import Belief
 
 
@@ -34,7 +42,9 @@ def test_nothing_depends_on_the_axis_permutation() -> None:
     P = root @ root.T + 1e-8 * np.eye(20)
     first = body_parameters(Belief(0, x, P))
     for permutation in AXIS_PERMUTATIONS:
-        other = body_parameters(Belief(0, permute_axes(x, permutation), permute_covariance(P, x, permutation)))
+        other = body_parameters(
+            Belief(0, permute_axes(x, permutation), permute_covariance(P, x, permutation))
+        )
         for name in ("inertia", "inertia_1s", "moments", "moments_1s", "centre_c", "rate_c"):
             assert np.abs(getattr(other, name) - getattr(first, name)).max() < 1e-7, name
         assert other.centre_1s_m == pytest.approx(first.centre_1s_m, rel=1e-6)
@@ -60,7 +70,10 @@ def test_a_small_spread_is_the_linear_one() -> None:
     y[12:17] = 0.01
     T = to_errors(chart)
     found = body_parameters(Belief(0, x, T @ np.diag(y**2 + 1e-16) @ T.T))
-    draws = [body_parameters(Belief(0, to_state(chart.moved(y * d)), np.eye(20))) for d in rng.normal(size=(400, 20))]
+    draws = [
+        body_parameters(Belief(0, to_state(chart.moved(y * d)), np.eye(20)))
+        for d in rng.normal(size=(400, 20))
+    ]
     assert found.moments_1s == pytest.approx(np.std([d.moments for d in draws], axis=0), rel=0.15)
     assert found.inertia_1s == pytest.approx(np.std([d.inertia for d in draws], axis=0), rel=0.2)
 
@@ -68,7 +81,10 @@ def test_a_small_spread_is_the_linear_one() -> None:
 @pytest.mark.parametrize("gap", [1e-6, 1e-3, 0.3])
 @pytest.mark.parametrize("wide", [1e-3, 1.0, 100.0])
 def test_standard_deviations_stay_in_the_physical_range(gap: float, wide: float) -> None:
-    """However wide the covariance and however undetermined the axes: no sigma beyond that of no information."""
+    """However wide the covariance and however undetermined the axes.
+
+    No sigma beyond that of no information.
+    """
     x = tumbling.draw(3, seconds=1.0).states[0]
     x = replace(x, sigma=np.array([gap, 0.4]))
     P = np.diag(np.repeat([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 10.0], [3, 3, 3, 3, 2, 3, 3]) * wide) ** 2

@@ -40,9 +40,13 @@ def test_there_are_24_proper_rotations() -> None:
 
 
 @EACH
-def test_sigma_is_that_of_the_permuted_moments(world: tumbling.World, naming: AxisPermutation) -> None:
+def test_sigma_is_that_of_the_permuted_moments(
+    world: tumbling.World, naming: AxisPermutation
+) -> None:
     moments = world.moments[list(naming.perm)]
-    assert permute_axes(world.states[0], naming).sigma == pytest.approx(tumbling.ratios(moments), abs=1e-14)
+    assert permute_axes(world.states[0], naming).sigma == pytest.approx(
+        tumbling.ratios(moments), abs=1e-14
+    )
 
 
 @EACH
@@ -65,12 +69,16 @@ def test_the_covariance_follows(world: tumbling.World, naming: AxisPermutation) 
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        J[:, k] = boxminus(permute_axes(boxplus(x, d), naming), permute_axes(boxplus(x, -d), naming)) / (2 * eps)
+        J[:, k] = boxminus(
+            permute_axes(boxplus(x, d), naming), permute_axes(boxplus(x, -d), naming)
+        ) / (2 * eps)
     assert np.abs(permute_covariance(P, x, naming) - J @ P @ J.T).max() < 1e-7
 
 
 @EACH
-def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: AxisPermutation) -> None:
+def test_nees_is_independent_of_the_axis_names(
+    world: tumbling.World, naming: AxisPermutation
+) -> None:
     x = world.states[0]
     d = np.random.Generator(np.random.PCG64(0)).normal(size=20) * 1e-3
     belief = Belief(0, boxplus(x, d), np.eye(20) * 1e-6)
@@ -82,7 +90,9 @@ def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: Ax
 
 
 @pytest.mark.parametrize("naming", AXIS_PERMUTATIONS[::5])
-def test_nees_of_every_block_is_that_of_the_solved_equations(world: tumbling.World, naming: AxisPermutation) -> None:
+def test_nees_of_every_block_is_that_of_the_solved_equations(
+    world: tumbling.World, naming: AxisPermutation
+) -> None:
     x, rng = world.states[0], np.random.Generator(np.random.PCG64(1))
     root = 1e-3 * rng.normal(size=(20, 20))
     P = root @ root.T
@@ -94,12 +104,16 @@ def test_nees_of_every_block_is_that_of_the_solved_equations(world: tumbling.Wor
     assert size == pytest.approx(e @ np.linalg.solve(P, e), rel=1e-6)
     total, blocks = nees_by_block(belief, truth)
     assert total == pytest.approx(d @ np.linalg.solve(P, d), rel=1e-6)
-    assert blocks == pytest.approx({name: d[b] @ np.linalg.solve(P[b, b], d[b]) for name, b in BLOCKS.items()})
+    assert blocks == pytest.approx(
+        {name: d[b] @ np.linalg.solve(P[b, b], d[b]) for name, b in BLOCKS.items()}
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nees_of_the_rate_is_right_where_the_axes_are_unknown(seed: int) -> None:
-    """Errors drawn in the chart, with axes uncertain by tens of degrees and a rate that is well known in {C}."""
+    """Errors drawn in the chart, with axes uncertain by tens of degrees and a rate that is well
+    known in {C}.
+    """
     rng, found = np.random.default_rng(seed), []
     chart = to_chart(tumbling.draw(seed, seconds=1.0).states[0])
     sigma = np.repeat([1e-3, 1e-4, 1e-3, 1e-3, 0.7, 0.1], [3, 3, 3, 3, 5, 3])
@@ -112,7 +126,9 @@ def test_nees_of_the_rate_is_right_where_the_axes_are_unknown(seed: int) -> None
 
 
 @pytest.mark.parametrize("size", [1.0, 30.0, 1e3, 1e8])
-def test_the_inertia_stays_in_its_range_however_large_the_step(world: tumbling.World, size: float) -> None:
+def test_the_inertia_stays_in_its_range_however_large_the_step(
+    world: tumbling.World, size: float
+) -> None:
     rng, chart = np.random.Generator(np.random.PCG64(3)), to_chart(world.states[0])
     for _ in range(50):
         step = np.zeros(20)
@@ -154,13 +170,19 @@ def test_a_wrong_inertia_is_not_explained_by_a_permutation(world: tumbling.World
 def test_a_fixture_turned_by_180_degrees_is_distinguished(world: tumbling.World) -> None:
     """A relabelling keeps the pose; turning the fixture on the body does not."""
     x = world.states[0]
-    turned = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, geometry.multiply([1.0, 0, 0, 0], x.q_bc))
+    turned = State(
+        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, geometry.multiply([1.0, 0, 0, 0], x.q_bc)
+    )
     assert nees(Belief(0, turned, np.eye(20) * 1e-4), x) > 5e3
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_nearly_equal_moments_are_separated_by_a_small_part_of_their_standard_deviation(seed: int) -> None:
-    """The error of the pose is half the sum of those of attitude and mu, computed without a loss of precision."""
+def test_nearly_equal_moments_are_separated_by_a_small_part_of_their_standard_deviation(
+    seed: int,
+) -> None:
+    """The error of the pose is half the sum of those of attitude and mu, computed without a loss of
+    precision.
+    """
     rng = np.random.default_rng(seed)
     x = tumbling.draw(seed, seconds=1.0).states[0]
     chart = to_chart(replace(x, sigma=rng.normal(size=2) * 10.0 ** rng.uniform(-12.0, -4.0)))

@@ -1,4 +1,7 @@
-"""Errors that all measured poses have in common: a wrong size, wrong ranges, errors of the shape of the model."""
+"""Errors that all measured poses have in common.
+
+A wrong size, wrong ranges, errors of the shape of the model.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,9 @@ from avsreplay.estimate.common_errors import (
 )
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, Scan, Surface
-from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.model_check import ModelCheck
+from avsreplay.register.registrar import Registrar
 
 EXTENT_M = 4.0
 
@@ -60,7 +64,10 @@ def test_systematic_errors_leave_a_motion_that_more_scans_do_not_reduce() -> Non
 
 
 def test_a_scan_that_is_not_used_changes_only_the_place_of_the_sensor() -> None:
-    errors, sensor = after(20, aligned(0.9)), Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.0, 2.0, 3.0]))
+    errors, sensor = (
+        after(20, aligned(0.9)),
+        Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.0, 2.0, 3.0])),
+    )
     later = errors.with_scan(None, EXTENT_M, sensor)
     assert later.sensor == (1.0, 2.0, 3.0)
     assert (later.scans, later.share, later.sizes) == (errors.scans, errors.share, errors.sizes)
@@ -89,7 +96,9 @@ def test_the_size_that_noise_feigns_does_not_count() -> None:
 
 def test_the_line_of_sight_begins_at_the_sensor() -> None:
     sensor, at = np.array([0.0, 5.0, 0.0]), np.array([0.0, 5.0, 2.0])
-    errors = after(100, aligned(0.1, 0.004)).with_scan(None, EXTENT_M, Pose(np.array([0.0, 0.0, 0.0, 1.0]), sensor))
+    errors = after(100, aligned(0.1, 0.004)).with_scan(
+        None, EXTENT_M, Pose(np.array([0.0, 0.0, 0.0, 1.0]), sensor)
+    )
     assert line_of_sight_1s(at, np.zeros((3, 3)), errors) == pytest.approx(
         [0.0, 0.0, np.sqrt(0.5) * 0.004 * 2.0], rel=0.01
     )
@@ -107,10 +116,15 @@ def test_a_constant_motion_of_the_model_is_an_error_of_the_fixture() -> None:
 
 
 def bent(surface: Surface, angle: float) -> Surface:
-    """The model with its second box rotated about its middle [rad]: a part that is not where the model says."""
+    """The model with its second box rotated about its middle [rad].
+
+    A part that is not where the model says.
+    """
     v = np.array(surface.vertices)
     middle = v[8:16].mean(axis=0)
-    v[8:16] = (v[8:16] - middle) @ geometry.matrix(geometry.exp(np.array([angle, angle, 0.0]))).T + middle
+    v[8:16] = (v[8:16] - middle) @ geometry.matrix(
+        geometry.exp(np.array([angle, angle, 0.0]))
+    ).T + middle
     return replace(surface, vertices=v, sha256="")
 
 

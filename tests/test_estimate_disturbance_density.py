@@ -1,4 +1,6 @@
-"""The density that stands for all densities of a random disturbance, on linear motions drawn from the model."""
+"""The density that stands for all densities of a random disturbance, on linear motions drawn from
+the model.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +31,22 @@ V = np.eye(3 * len(TIMES))
 
 
 def drawn(density: float, rng: np.random.Generator) -> tuple[Marginal, Residuals, np.ndarray]:
-    """The likelihood of measured positions, their residuals about zero motion, and the true present velocity."""
-    y, u = rng.normal(size=6) / np.sqrt(np.diagonal(INFO)), density * rng.normal(size=3 * len(MIDDLE))
+    """The likelihood of measured positions, their residuals about zero motion, and the true present
+    velocity.
+    """
+    y, u = (
+        rng.normal(size=6) / np.sqrt(np.diagonal(INFO)),
+        density * rng.normal(size=3 * len(MIDDLE)),
+    )
     e = -(INITIAL @ y + EFFECTS @ u) + rng.normal(size=len(V))
     data = Residuals(e, INITIAL, INFO, np.zeros(6))
     return marginal(V, EFFECTS, data), data, PRESENT.by_initial @ y + PRESENT.by_impulses @ u
 
 
 def velocity(data: Residuals, density: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of the present velocity with this density, by the normal equations of all unknowns."""
+    """Mean and covariance of the present velocity with this density, by the normal equations of all
+    unknowns.
+    """
     J = np.hstack([data.J, density * EFFECTS])
     info = np.zeros((J.shape[1], J.shape[1]))
     info[:6, :6], info[6:, 6:] = data.info, np.eye(J.shape[1] - 6)
@@ -52,7 +61,9 @@ def nees(data: Residuals, density: float, truth: np.ndarray) -> float:
 
 
 def power_mean(found: Marginal) -> float:
-    """The power 2/3 of the mean of q^1.5, to which the variance of a velocity that is long tracked is proportional."""
+    """The power 2/3 of the mean of q^1.5, to which the variance of a velocity that is long tracked
+    is proportional.
+    """
     log = np.append(0.0, found.log_odds - np.log(len(DENSITIES)))
     weights = np.exp(log - log.max())
     return float(weights[1:] @ DENSITIES**1.5 / weights.sum()) ** (2.0 / 3.0)
@@ -79,17 +90,23 @@ def test_the_density_in_use_is_zero_or_the_true_one_where_the_poses_determine_it
     assert quiet.excluded < 1e-2 < strong.excluded
     assert (quiet.log_odds[quiet.excluded <= DENSITIES] <= np.log(0.01)).all()
     assert (
-        density_in_use(quiet, PRESENT, 0.1) < density_in_use(quiet, PRESENT, 0.5) < density_in_use(quiet, PRESENT, 0.9)
+        density_in_use(quiet, PRESENT, 0.1)
+        < density_in_use(quiet, PRESENT, 0.5)
+        < density_in_use(quiet, PRESENT, 0.9)
     )
     assert density_in_use(quiet, PRESENT, 1e-300) < 1e-9
 
 
 def test_the_density_in_use_never_exceeds_the_root_mean_square_of_all() -> None:
-    """Of few poses the expected NEES of the rate may be 1 for densities that are out of the question only."""
+    """Of few poses the expected NEES of the rate may be 1 for densities that are out of the
+    question only.
+    """
     rng = np.random.Generator(np.random.PCG64(5))
     for _ in range(20):
         found = drawn(1e-4, rng)[0]
-        weights = np.exp(np.append(0.0, found.log_odds - np.log(len(DENSITIES))))  # of a weak disturbance: no overflow
+        weights = np.exp(
+            np.append(0.0, found.log_odds - np.log(len(DENSITIES)))
+        )  # of a weak disturbance: no overflow
         largest = float(np.sqrt(weights[1:] @ DENSITIES**2 / weights.sum()))
         assert density_in_use(found, PRESENT) <= largest * (1.0 + 1e-12)
         nowhere = Present(PRESENT.by_initial, 1e6 * PRESENT.by_impulses)
@@ -103,7 +120,9 @@ def log_likelihood(S: np.ndarray, e: np.ndarray) -> float:
         exact = np.vectorize(Decimal, otypes=[object])
         A, b = exact(S), exact(e)
         twice = Decimal(0)
-        for k in range(len(b)):  # Cholesky's decomposition from left to right, and forward substitution
+        for k in range(
+            len(b)
+        ):  # Cholesky's decomposition from left to right, and forward substitution
             root = A[k, k].sqrt()
             column = A[k:, k] / root
             A[k + 1 :, k + 1 :] -= column[1:, None] * column[1:]
@@ -128,8 +147,12 @@ def test_the_likelihood_of_a_density_is_that_of_the_whole_covariance() -> None:
 
 
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e8])
-def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_are(size: float) -> None:
-    """Impulses in an unstable spin have large effects over minutes, nearly those of other initial values."""
+def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_are(
+    size: float,
+) -> None:
+    """Impulses in an unstable spin have large effects over minutes, nearly those of other initial
+    values.
+    """
     rng = np.random.Generator(np.random.PCG64(42))
     e, J = rng.normal(size=144), rng.normal(size=(144, 20))
     effects = rng.normal(size=(144, 69)) + size * J @ rng.normal(size=(20, 69))

@@ -1,4 +1,7 @@
-"""A constant torque or force: found with onset and size, tracked, and not found where there is none."""
+"""A constant torque or force.
+
+Found with onset and size, tracked, and not found where there is none.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +35,13 @@ from avsreplay.records import State
 PARAMS = EstimatorParams(correlated_share=0.1).resolved(4.0)
 
 
-def fixes_of(case: surprises.Case, seed: int, force: float = 0.0, onset_s: float = 0.0) -> tuple[PoseFix, ...]:
-    """Noisy poses of a case; ``force`` is a constant acceleration along x of {A} from ``onset_s`` on."""
+def fixes_of(
+    case: surprises.Case, seed: int, force: float = 0.0, onset_s: float = 0.0
+) -> tuple[PoseFix, ...]:
+    """Noisy poses of a case.
+
+    ``force`` is a constant acceleration along x of {A} from ``onset_s`` on.
+    """
     times, states, _, _ = surprises.world_of(case, seed)
     found = []
     for t, a in zip(times, surprises.measured(case, times, states, seed), strict=True):
@@ -56,7 +64,9 @@ def found_in(
     return best, motion.belief(fixes[0].t_ns, fixes[-1].t_ns)
 
 
-@pytest.mark.parametrize("case", [surprises.Case("c"), surprises.Case("s", spin=2), surprises.Case("r", speed=1e-6)])
+@pytest.mark.parametrize(
+    "case", [surprises.Case("c"), surprises.Case("s", spin=2), surprises.Case("r", speed=1e-6)]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_free_motion_shows_no_drift(case: surprises.Case, seed: int) -> None:
     assert found_in(fixes_of(case, seed), case, seed) is None
@@ -78,14 +88,18 @@ def test_a_constant_force_is_found_with_its_onset(seed: int) -> None:
 @pytest.mark.parametrize("velocity", [0.004, 0.02])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_single_change_of_the_velocity_is_no_constant_force(velocity: float, seed: int) -> None:
-    """Until some time after the change, an acceleration that begins before it explains the poses nearly as well."""
+    """Until some time after the change, an acceleration that begins before it explains the poses
+    nearly as well.
+    """
     for seconds in (52.0, 60.0):
         case = surprises.Case("step", velocity=velocity, seconds=seconds)
         assert found_in(fixes_of(case, seed), case, seed) is None
 
 
 def test_the_effect_of_a_step_is_that_on_the_poses_after_it() -> None:
-    """Columns against the residuals of poses of which those after an instant have another velocity."""
+    """Columns against the residuals of poses of which those after an instant have another
+    velocity.
+    """
     case, at_s, step = surprises.Case("clean", seconds=30.0), 11.75, np.array([1e-4, -2e-4, 3e-4])
     times, states, _, _ = surprises.world_of(case, 1)
     alignments, start = surprises.measured(case, times, states, 1), to_chart(states[0])
@@ -93,7 +107,9 @@ def test_the_effect_of_a_step_is_that_on_the_poses_after_it() -> None:
     for size in (0.0, 1.0):
         moves = (max(0.0, t - at_s) * size * step for t in times)
         poses = zip(times, alignments, moves, strict=True)
-        fixes = tuple(PoseFix(round(t * 1e9), Pose(a.T_ac.q, a.T_ac.t + d), a.covariance) for t, a, d in poses)
+        fixes = tuple(
+            PoseFix(round(t * 1e9), Pose(a.T_ac.q, a.T_ac.t + d), a.covariance) for t, a, d in poses
+        )
         prior = weak_prior(poses_of(fixes), PARAMS)
         found.append(whole(fit_driven(poses_of(fixes), start, prior, np.ones(2), 0.0, np.zeros(6))))
     columns = step_columns(found[0], np.array([at_s]))[0][:, 3:] @ step
@@ -120,8 +136,12 @@ def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:
     assert x.w_b - free.w_b == pytest.approx(moved[3:], rel=0.02, abs=1e-6)
 
 
-def inertia_of(fixes: tuple[PoseFix, ...], truth: State, params: EstimatorParams) -> tuple[float, float]:
-    """NEES per degree of freedom of the inertia at the last pose by a fit to all poses, and the trace of its P."""
+def inertia_of(
+    fixes: tuple[PoseFix, ...], truth: State, params: EstimatorParams
+) -> tuple[float, float]:
+    """NEES per degree of freedom of the inertia at the last pose by a fit to all poses, and the
+    trace of its P.
+    """
     found = whole(batch_estimate(fixes, params, FitParams(rescale=False), NO_LEVELS)).belief
     here = to_chart(found.x)
     T, off = to_errors(here), to_chart(truth).minus(here)[INERTIA]
@@ -132,9 +152,14 @@ def inertia_of(fixes: tuple[PoseFix, ...], truth: State, params: EstimatorParams
 @pytest.mark.parametrize("seed", range(3))
 def test_the_covariance_allows_for_a_torque_that_a_wrong_inertia_explains(seed: int) -> None:
     told_none = replace(PARAMS, torque_noise_radps15=0.0)
-    for case in (surprises.Case("torque", torque=1e-4, seconds=40.0), surprises.Case("free", seconds=40.0)):
+    for case in (
+        surprises.Case("torque", torque=1e-4, seconds=40.0),
+        surprises.Case("free", seconds=40.0),
+    ):
         fixes, truth = fixes_of(case, seed), surprises.world_of(case, seed)[1][-1]
-        (nees, trace), (nees_told, trace_told) = (inertia_of(fixes, truth, p) for p in (PARAMS, told_none))
+        (nees, trace), (nees_told, trace_told) = (
+            inertia_of(fixes, truth, p) for p in (PARAMS, told_none)
+        )
         if case.torque:
             assert nees < 0.5 * nees_told
         else:
@@ -142,7 +167,10 @@ def test_the_covariance_allows_for_a_torque_that_a_wrong_inertia_explains(seed: 
 
 
 def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """1e-4 rad/s2 per unit inertia: size and onset within their standard deviations, no claim beyond 4 sigma."""
+    """1e-4 rad/s2 per unit inertia.
+
+    Size and onset within their standard deviations, no claim beyond 4 sigma.
+    """
     monkeypatch.setattr(surprises, "POS_M", 1e-3)
     monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.05))
     case = surprises.Case("torque", torque=1e-4, seconds=75.0)
@@ -161,8 +189,12 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
     belief = result.track.belief
     assert isinstance(belief, DrivenBelief)
     direction = surprises._direction(np.random.Generator(np.random.PCG64([0, 5])))
-    off = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)]) - belief.u
-    assert float(off[:3] @ np.linalg.solve(belief.P_u[:3, :3], off[:3])) < 21.1  # 99.99 % point, 3 degrees of freedom
+    off = (
+        np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)]) - belief.u
+    )
+    assert (
+        float(off[:3] @ np.linalg.solve(belief.P_u[:3, :3], off[:3])) < 21.1
+    )  # 99.99 % point, 3 degrees of freedom
     assert nees(belief, truth) < 2.0 * 20
 
 
@@ -170,7 +202,10 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
 def test_a_torque_is_found_in_precise_poses_that_free_motion_cannot_explain(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of 0.1 mm and 0.01 deg: the fit of free motion leaves residuals of many sigma and does not converge."""
+    """Poses of 0.1 mm and 0.01 deg.
+
+    The fit of free motion leaves residuals of many sigma and does not converge.
+    """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.01))
     result = surprises.run(surprises.Case("torque", torque=1e-4, seconds=45.0), seed)
@@ -183,9 +218,14 @@ def test_a_torque_is_found_in_precise_poses_that_free_motion_cannot_explain(
     assert not any(c and r > 4.0 for c, r in zip(result.converged, result.ratio, strict=True))
 
 
-@pytest.mark.parametrize(("density", "seed"), [(3e-5, 3), (3e-5, 4), (1e-4, 11), (1e-4, 4107), (1e-4, 5003)])
+@pytest.mark.parametrize(
+    ("density", "seed"), [(3e-5, 3), (3e-5, 4), (1e-4, 11), (1e-4, 4107), (1e-4, 5003)]
+)
 def test_a_random_torque_and_force_are_no_drift(density: float, seed: int) -> None:
-    """3e-5 or 1e-4 rad/s^1.5 and m/s^1.5: the rate wanders, and a constant torque would explain much of it."""
+    """3e-5 or 1e-4 rad/s^1.5 and m/s^1.5.
+
+    The rate wanders, and a constant torque would explain much of it.
+    """
     result = surprises.run(surprises.Case("random", random=(density, density), seconds=60.0), seed)
     assert result.track is not None
     drift, manoeuvres = result.track.drift, result.track.manoeuvres
@@ -194,7 +234,9 @@ def test_a_random_torque_and_force_are_no_drift(density: float, seed: int) -> No
 
 
 def test_an_acceleration_is_reported_only_where_it_is_none_by_chance() -> None:
-    """Two thirds of a standard deviation in each of three directions is not significant, five are."""
+    """Two thirds of a standard deviation in each of three directions is not significant, five
+    are.
+    """
     x = surprises.world_of(surprises.Case("c", seconds=2.0), 0)[1][0]
     P_u, cross = np.zeros((6, 6)), np.zeros((20, 6))
     P_u[:3, :3] = 1e-8 * np.eye(3)
@@ -210,7 +252,8 @@ def test_an_acceleration_is_reported_only_where_it_is_none_by_chance() -> None:
 def test_after_a_false_report_of_a_torque_the_density_of_the_random_one_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The torque is random. Estimated anew from none, its density fell to 4e-7 once a constant torque was known.
+    """The torque is random. Estimated anew from none, its density fell to 4e-7 once a constant
+    torque was known.
 
     The conditions that prevent the false report are left out.
     """
@@ -235,7 +278,9 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
     direction = surprises._direction(np.random.Generator(np.random.PCG64([seed, 5])))
     u = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)])
     begin = ((to_chart(truth), u), (to_chart(rough_state(fixes)), np.zeros(6)))
-    true, found = (whole(fit_jointly(poses, c, prior, np.ones(2), 0.0, a, widths)) for c, a in begin)
+    true, found = (
+        whole(fit_jointly(poses, c, prior, np.ones(2), 0.0, a, widths)) for c, a in begin
+    )
     free = whole(fit_driven(poses, to_chart(truth), prior, np.ones(2), 0.0, np.zeros(6)))
     assert free.cost > true.cost + 14.0
     assert abs(found.cost - true.cost) < 1.0
@@ -243,13 +288,17 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
 
 
 def test_the_derivatives_along_the_motion_are_those_of_differences() -> None:
-    """Residuals with a torque and a force since an instant within the poses, by chart steps, acceleration and onset."""
+    """Residuals with a torque and a force since an instant within the poses, by chart steps,
+    acceleration and onset.
+    """
     case = surprises.Case("c", seconds=20.0)
     fixes, chart = fixes_of(case, 1), to_chart(surprises.world_of(case, 1)[1][0])
     poses, u, onset_s = poses_of(fixes), np.array([2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -1e-3]), 7.1
     path, x = followed(chart, u, onset_s, poses.times_s, None)[0], to_state(chart)
     position = path.r + geometry.matrix(path.q) @ x.c_b
-    poses = replace(poses, q=geometry.multiply(path.q, x.q_bc), t=position)  # without noise: residuals of zero
+    poses = replace(
+        poses, q=geometry.multiply(path.q, x.q_bc), t=position
+    )  # without noise: residuals of zero
 
     prior = Prior(chart, np.eye(20))
 
@@ -271,7 +320,9 @@ def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
     """Against the truth of another integrator, DOP853, pushed in small steps."""
     pushed, free = (surprises.Case("t", torque=torque, seconds=40.0) for torque in (2e-4, 0.0))
     times, states, _, _ = surprises.world_of(pushed, 5)
-    fixes = tuple(PoseFix(round(t * 1e9), x.T_ac, np.eye(6)) for t, x in zip(times, states, strict=True))
+    fixes = tuple(
+        PoseFix(round(t * 1e9), x.T_ac, np.eye(6)) for t, x in zip(times, states, strict=True)
+    )
     straight = surprises.world_of(free, 5)[1]
     direction = surprises._direction(np.random.Generator(np.random.PCG64([5, 5])))
     about, u = (
@@ -280,7 +331,10 @@ def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
     )
     left = without_drift(poses_of(fixes), about, 0.0, u)
     moved, rest = (
-        [geometry.angle(geometry.multiply(geometry.conjugate(a.T_ac.q), q)) for a, q in zip(straight, qs, strict=True)]
+        [
+            geometry.angle(geometry.multiply(geometry.conjugate(a.T_ac.q), q))
+            for a, q in zip(straight, qs, strict=True)
+        ]
         for qs in ([x.T_ac.q for x in states], left.q)
     )
     assert max(moved) > 0.1
@@ -291,14 +345,20 @@ def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
 
 
 def test_correlated_errors_of_the_poses_are_no_unexplained_motion() -> None:
-    """Residuals drawn with the covariance of normal points whose errors have a part in common, 1,000 times."""
+    """Residuals drawn with the covariance of normal points whose errors have a part in common,
+    1,000 times.
+    """
     case, rng, ones = surprises.Case("c"), np.random.Generator(np.random.PCG64(8)), np.ones(2)
     poses = replace(poses_of(fixes_of(case, 4)), shares=np.full(161, 0.3))
     points = normal_points(poses, to_chart(surprises.world_of(case, 4)[1][0]), ones, 40)
     V = pose_error_covariance(points, NO_LEVELS, ones)
     root, dof = np.linalg.cholesky(V), 6 * len(points)
-    e = root[:, None] @ rng.normal(size=(2, 1000, 3, len(points), 1)).reshape(2, 1000, 3, len(points)).swapaxes(2, 3)
-    cost = 0.5 * (e * e).sum(axis=(0, 2, 3)) * (1.0 - 26.0 / dof)  # the fit takes a part of the residuals
+    e = root[:, None] @ rng.normal(size=(2, 1000, 3, len(points), 1)).reshape(
+        2, 1000, 3, len(points)
+    ).swapaxes(2, 3)
+    cost = (
+        0.5 * (e * e).sum(axis=(0, 2, 3)) * (1.0 - 26.0 / dof)
+    )  # the fit takes a part of the residuals
 
     def rejected(scale: float) -> float:
         frames = (SimpleNamespace(points=points, cost=scale * float(c)) for c in cost)
@@ -310,8 +370,13 @@ def test_correlated_errors_of_the_poses_are_no_unexplained_motion() -> None:
 
 
 @pytest.mark.parametrize("seed", [903, 907])
-def test_a_torque_is_found_where_the_linear_problem_about_it_has_another_inertia_instead(seed: int) -> None:
-    """At 1 Hz and 0.05 rad/s: free motion costs 200 to 500 more, which the linear problem does not show."""
+def test_a_torque_is_found_where_the_linear_problem_about_it_has_another_inertia_instead(
+    seed: int,
+) -> None:
+    """At 1 Hz and 0.05 rad/s.
+
+    Free motion costs 200 to 500 more, which the linear problem does not show.
+    """
     case = surprises.Case("d", torque=1e-4, speed=0.05, hz=1.0, seconds=68.0)
     fixes = fixes_of(case, seed)
     start = whole(batch_estimate(fixes, PARAMS, FitParams(rescale=False), NO_LEVELS)).chart

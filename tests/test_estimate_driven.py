@@ -1,4 +1,6 @@
-"""A constant torque and force as part of a belief's motion, against a motion with many small impulses."""
+"""A constant torque and force as part of a belief's motion, against a motion with many small
+impulses.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,10 @@ U = np.array([1.2e-3, -0.8e-3, 0.5e-3, 2e-3, 1e-3, -1e-3])
 
 
 def pushed(x: State, u: Array, seconds: float, parts: int = 1000) -> State:
-    """The motion under u (6,): rad/s2 in {C}, m/s2 in {A}, as impulses in the middle of many free steps."""
+    """The motion under u (6,).
+
+    Rad/s2 in {C}, m/s2 in {A}, as impulses in the middle of many free steps.
+    """
     h = seconds / parts
     for _ in range(parts):
         x, _ = propagate_state(x, 0.5 * h)
@@ -49,7 +54,9 @@ def belief_of(seed: int, u: Array = U) -> DrivenBelief:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("seconds", [0.5, 20.0])
-def test_the_prediction_is_the_motion_under_the_torque_and_the_force(seed: int, seconds: float) -> None:
+def test_the_prediction_is_the_motion_under_the_torque_and_the_force(
+    seed: int, seconds: float
+) -> None:
     belief = belief_of(seed)
     there, _ = propagated(belief, round(seconds * 1e9), 0.0, 0.0)
     truth = pushed(belief.x, U, seconds)
@@ -57,7 +64,9 @@ def test_the_prediction_is_the_motion_under_the_torque_and_the_force(seed: int, 
     back, _ = propagated(there, 0, 0.0, 0.0)
     assert boxminus(back.x, belief.x) == pytest.approx(np.zeros(20), abs=1e-9)
     free, _ = propagate(belief, round(seconds * 1e9), 0.0, 0.0)
-    assert np.linalg.norm(boxminus(free.x, truth)) > 100.0 * np.linalg.norm(boxminus(there.x, truth))
+    assert np.linalg.norm(boxminus(free.x, truth)) > 100.0 * np.linalg.norm(
+        boxminus(there.x, truth)
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,7 +88,9 @@ def test_the_covariance_is_that_of_differences_of_the_motion(seed: int) -> None:
     assert Phi == pytest.approx(J[:, :20], rel=1e-3, abs=1e-4)
     joint = np.block([[belief.P, belief.cross], [belief.cross.T, belief.P_u]])
     scale = np.sqrt(np.diagonal(there.P))
-    assert there.P / np.outer(scale, scale) == pytest.approx((J @ joint @ J.T) / np.outer(scale, scale), abs=1e-3)
+    assert there.P / np.outer(scale, scale) == pytest.approx(
+        (J @ joint @ J.T) / np.outer(scale, scale), abs=1e-3
+    )
     assert isinstance(there, DrivenBelief)
     expected = J @ joint[:, 20:]
     assert there.cross == pytest.approx(expected, rel=1e-2, abs=1e-3 * np.abs(expected).max())
@@ -101,7 +112,9 @@ def test_a_pose_corrects_the_acceleration_as_in_the_joint_filter() -> None:
     assert after.u - U == pytest.approx(K[20:] @ alpha, rel=1e-6)
     assert after.P_u == pytest.approx(expected[20:, 20:], rel=1e-6)
     T, T0 = to_errors(to_chart(after.x)), to_errors(to_chart(belief.x))
-    assert after.cross == pytest.approx(T @ np.linalg.solve(T0, expected[:20, 20:]), rel=1e-6, abs=1e-12)
+    assert after.cross == pytest.approx(
+        T @ np.linalg.solve(T0, expected[:20, 20:]), rel=1e-6, abs=1e-12
+    )
 
 
 def test_without_an_acceleration_it_is_free_motion() -> None:
@@ -112,7 +125,9 @@ def test_without_an_acceleration_it_is_free_motion() -> None:
     free, Phi_free = propagate(plain, 10**10, 1e-4, 1e-4)
     assert Phi == pytest.approx(Phi_free, abs=1e-12)
     assert pytest.approx(free.P, rel=1e-9, abs=1e-15) == there.P
-    found, expected = (f(b, times, 1e-4, 1e-4) for f, b in ((driven_forecast, known), (grasp_forecast, plain)))
+    found, expected = (
+        f(b, times, 1e-4, 1e-4) for f, b in ((driven_forecast, known), (grasp_forecast, plain))
+    )
     for name in ("pos_1s_m", "vel_1s_mps", "rot_1s_rad"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9)
 
@@ -138,20 +153,30 @@ def test_a_mixture_has_the_moments_of_its_parts() -> None:
     assert found.u == pytest.approx(0.7 * U + 0.3 * 1.1 * U)
     d = boxminus(other.x, first.x)
     assert boxminus(found.x, first.x) == pytest.approx(0.3 * d, rel=1e-2, abs=1e-8)
-    assert np.diagonal(found.P) == pytest.approx(np.diagonal(first.P + 0.21 * np.outer(d, d)), rel=1e-2)
+    assert np.diagonal(found.P) == pytest.approx(
+        np.diagonal(first.P + 0.21 * np.outer(d, d)), rel=1e-2
+    )
     assert driven_moments([(1.0, first)]) is first
 
 
 def test_a_belief_with_a_torque_is_no_less_precise_than_the_last_pose() -> None:
-    """In the directions in which its pose is less precise, the pose is used as far as is missing, and no further."""
+    """In the directions in which its pose is less precise, the pose is used as far as is missing,
+    and no further.
+    """
     belief, C = belief_of(3), np.diag(np.repeat([2e-2, 6e-2], 3) ** 2)
-    pose = belief.x.T_ac @ geometry.Pose(geometry.exp(np.array([0.01, -0.02, 0.01])), np.array([0.03, 0.0, -0.02]))
+    pose = belief.x.T_ac @ geometry.Pose(
+        geometry.exp(np.array([0.01, -0.02, 0.01])), np.array([0.03, 0.0, -0.02])
+    )
     H = measurement_jacobian(belief.x)
-    before = np.linalg.eigvals(np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ belief.P @ H.T)).real
+    before = np.linalg.eigvals(
+        np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ belief.P @ H.T)
+    ).real
     assert before.min() < 1.0 < before.max()
     after = no_worse_than_pose(belief, PoseFix(0, pose, C), np.ones(2))
     T, U = to_errors(to_chart(belief.x)), to_errors(to_chart(after.x))
     P = T @ np.linalg.solve(U, np.linalg.solve(U, after.P).T) @ T.T
-    found = np.linalg.eigvals(np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ P @ H.T)).real
+    found = np.linalg.eigvals(
+        np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ P @ H.T)
+    ).real
     assert np.sort(found) == pytest.approx(np.sort(np.minimum(before, 1.0)), rel=1e-4)
     assert np.trace(after.P_u) < np.trace(belief.P_u)

@@ -1,4 +1,6 @@
-"""The step of the motion against the full inertia tensor, finite differences and the covariance equation."""
+"""The step of the motion against the full inertia tensor, finite differences and the covariance
+equation.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,15 @@ def test_steps_join_and_turn_back(seed: int) -> None:
 
 
 def test_a_body_at_rest_stays() -> None:
-    x = State([0, 0, 0, 1.0], np.zeros(3), [1.0, 2, 3], [0.1, 0, 0], [0.2, -0.4], [0.1, 0, 0], [0, 0, 0, 1.0])
+    x = State(
+        [0, 0, 0, 1.0],
+        np.zeros(3),
+        [1.0, 2, 3],
+        [0.1, 0, 0],
+        [0.2, -0.4],
+        [0.1, 0, 0],
+        [0, 0, 0, 1.0],
+    )
     y = after(x, 5.0)
     assert np.array_equal(y.q_ab, x.q_ab)
     assert np.allclose(y.r_a, [1.5, 2, 3])
@@ -76,7 +86,9 @@ def test_phi_is_the_derivative_of_the_step(seed: int, h: float) -> None:
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        column = (boxminus(after(boxplus(x, d), h), base) - boxminus(after(boxplus(x, -d), h), base)) / (2 * eps)
+        column = (
+            boxminus(after(boxplus(x, d), h), base) - boxminus(after(boxplus(x, -d), h), base)
+        ) / (2 * eps)
         assert np.abs(column - Phi[:, k]).max() < 2e-8 * max(1.0, np.abs(Phi[:, k]).max()), k
 
 
@@ -91,8 +103,12 @@ def test_phi_and_noise_solve_their_differential_equation(h: float) -> None:
     assert np.abs(belief.P - want_P).max() < 1e-10 * np.abs(want_P).max()
 
 
-def by_integration(x: State, moments: np.ndarray, P0: np.ndarray, h: float, torque: float, force: float):
-    """Phi and P by DOP853 from F and G as printed, F's derivatives taken by finite differences of phi."""
+def by_integration(
+    x: State, moments: np.ndarray, P0: np.ndarray, h: float, torque: float, force: float
+):
+    """Phi and P by DOP853 from F and G as printed, F's derivatives taken by finite differences of
+    phi.
+    """
     G = np.zeros((20, 6))
     G[3:6, :3], G[9:12, 3:] = np.diag(moments.sum() / moments) * torque, np.eye(3) * force
 
@@ -105,14 +121,24 @@ def by_integration(x: State, moments: np.ndarray, P0: np.ndarray, h: float, torq
         s3, d = -(s1 + s2) / (1 + s1 * s2), (1 + s1 * s2) ** 2
         M = np.zeros((20, 20))
         M[:3, :3], M[:3, 3:6], M[6:9, 9:12] = -geometry.skew(w), 0.5 * np.eye(3), np.eye(3)
-        M[3:6, 3:6] = [[0, s1 * w[2], s1 * w[1]], [s2 * w[2], 0, s2 * w[0]], [s3 * w[1], s3 * w[0], 0]]
-        M[3:6, 12:14] = [[w[1] * w[2], 0], [0, w[0] * w[2]], np.array([s2**2 - 1, s1**2 - 1]) / d * w[0] * w[1]]
+        M[3:6, 3:6] = [
+            [0, s1 * w[2], s1 * w[1]],
+            [s2 * w[2], 0, s2 * w[0]],
+            [s3 * w[1], s3 * w[0], 0],
+        ]
+        M[3:6, 12:14] = [
+            [w[1] * w[2], 0],
+            [0, w[0] * w[2]],
+            np.array([s2**2 - 1, s1**2 - 1]) / d * w[0] * w[1],
+        ]
         return M
 
     def rates(_: float, y: np.ndarray) -> np.ndarray:
         w, Phi, P = y[:3], y[3:403].reshape(20, 20), y[403:].reshape(20, 20)
         A = F(w)
-        return np.concatenate([phi(w, x.sigma), (A @ Phi).ravel(), (A @ P + P @ A.T + G @ G.T).ravel()])
+        return np.concatenate(
+            [phi(w, x.sigma), (A @ Phi).ravel(), (A @ P + P @ A.T + G @ G.T).ravel()]
+        )
 
     y0 = np.concatenate([x.w_b, np.eye(20).ravel(), P0.ravel()])
     y = solve_ivp(rates, (0.0, h), y0, method="DOP853", rtol=1e-12, atol=1e-18).y[:, -1]
@@ -155,7 +181,11 @@ def test_forecast_is_the_spread_of_displaced_motions() -> None:
                 for s, t in zip(far, times, strict=True)
             ]
         )
-    for values, claimed in ((poses, seen.pos_1s_m), (speeds, seen.vel_1s_mps), (turns, seen.rot_1s_rad)):
+    for values, claimed in (
+        (poses, seen.pos_1s_m),
+        (speeds, seen.vel_1s_mps),
+        (turns, seen.rot_1s_rad),
+    ):
         assert np.sqrt(np.var(values, axis=0).sum(axis=1)) == pytest.approx(claimed, rel=0.09)
 
 
@@ -169,17 +199,24 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
         then, _ = dynamics.propagate(Belief(0, x, P0), round(t * 1e9), torque, force)
         J = dynamics.grasp_jacobian(geometry.matrix(then.x.q_ab)[None], then.x.w_b[None], x.c_b)[0]
         want = np.sqrt(np.diag(J @ then.P @ J.T).reshape(3, 3).sum(axis=1)) * [1, 1, 2]
-        assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(tuple(want), rel=1e-11)
+        assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(
+            tuple(want), rel=1e-11
+        )
 
 
 def test_a_gap_of_years_is_refused_in_one_line() -> None:
     x, _ = some_state(1)
-    with pytest.raises(UsageError, match=r"the target turns .* rad: too far to predict; check the stamps"):
+    with pytest.raises(
+        UsageError, match=r"the target turns .* rad: too far to predict; check the stamps"
+    ):
         dynamics.propagate(Belief(0, x, np.eye(20)), 10**18, 0.0, 0.0)
 
 
 def noise_by_quadrature(x: State, moments: np.ndarray, h: float, torque: float) -> np.ndarray:
-    """Q (6, 6) as an integral: what a push at each instant has become by the end, on a motion from there on."""
+    """Q (6, 6) as an integral.
+
+    What a push at each instant has become by the end, on a motion from there on.
+    """
     G = np.zeros((6, 3))
     G[3:] = np.diag(moments.sum() / moments) * torque
     cells = max(4, int(4 * abs(h) * np.linalg.norm(x.w_b)))
@@ -206,13 +243,17 @@ def test_noise_of_a_body_at_rest_is_the_textbook_one() -> None:
     sigma, torque, h = np.array([0.2, -0.4]), 3e-4, 0.7
     Q = dynamics.flow(np.zeros(3), sigma, h, torque).Q
     push = np.diag((np.array(dynamics.disturbance(sigma)) * torque) ** 2)
-    want = np.block([[push * h**3 / 12.0, push * h**2 / 4.0], [push * h**2 / 4.0, push * h]])  # dq' = w / 2
+    want = np.block(
+        [[push * h**3 / 12.0, push * h**2 / 4.0], [push * h**2 / 4.0, push * h]]
+    )  # dq' = w / 2
     assert np.abs(Q - want).max() < 1e-15 * np.abs(want).max()
 
 
 @pytest.mark.parametrize("h", [60.0, -0.3, -30.0])
 def test_sensitivity_is_the_derivative_by_three_ratios_either_way(h: float) -> None:
-    """Each of sigma1..3 apart, as the extension takes them, and a start of any attitude error and rate."""
+    """Each of sigma1..3 apart, as the extension takes them, and a start of any attitude error and
+    rate.
+    """
     x, _ = some_state(9, rate=0.3)
     q, ratios = np.array([0.0, 0.0, 0.0, 1.0]), np.array(dynamics.ratios(x.sigma))
 
@@ -236,7 +277,9 @@ def test_fast_bodies_follow_the_full_inertia_tensor(rate: float) -> None:
     x, moments = some_state(6)
     x, h = replace(x, w_b=x.w_b * rate / np.linalg.norm(x.w_b)), 20.0 / rate
     for span in (h, -h):
-        truth = tumbling.follow(np.array([0.0, abs(span)]), moments, x if span > 0 else after(x, span))[-1]
+        truth = tumbling.follow(
+            np.array([0.0, abs(span)]), moments, x if span > 0 else after(x, span)
+        )[-1]
         d = boxminus(after(x, span) if span > 0 else x, truth)
         assert np.abs(d / np.maximum(1.0, rate)).max() < 1e-9
 
@@ -259,7 +302,12 @@ def test_many_instants_are_the_steps_between_them() -> None:
         step = dynamics.flow(x.w_b, x.sigma, t)
         Phi = dynamics.transition(step, x.sigma, t)
         assert np.abs(seen.w[k] - step.w).max() < 1e-12
-        assert np.abs(geometry.matrix(seen.q[k]) - geometry.matrix(dynamics.advance(x, step, t).q_ab)).max() < 1e-12
+        assert (
+            np.abs(
+                geometry.matrix(seen.q[k]) - geometry.matrix(dynamics.advance(x, step, t).q_ab)
+            ).max()
+            < 1e-12
+        )
         assert np.abs(seen.S[k] - Phi[:6, [0, 1, 2, 3, 4, 5, 12, 13]]).max() < 1e-10
 
 
@@ -278,7 +326,15 @@ def test_a_path_is_the_same_motion_in_any_order() -> None:
 
 
 def test_a_path_of_a_body_at_rest_stays_in_one_place() -> None:
-    x = State([0, 0, 0, 1.0], np.zeros(3), np.zeros(3), np.zeros(3), [0.2, -0.4], np.zeros(3), [0, 0, 0, 1.0])
+    x = State(
+        [0, 0, 0, 1.0],
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros(3),
+        [0.2, -0.4],
+        np.zeros(3),
+        [0, 0, 0, 1.0],
+    )
     q, w = rotation_path(x).at(np.array([0.0, 1e9, -5.0]))
     assert np.array_equal(q, np.tile(x.q_ab, (3, 1)))
     assert not w.any()
@@ -299,7 +355,9 @@ def test_a_rate_that_is_not_finite_or_too_large_is_refused(bad: float) -> None:
 
 @pytest.mark.parametrize("ratio", [1.0001, -1e4, np.nan, np.inf])
 def test_an_inertia_ratio_that_no_body_has_is_refused(ratio: float) -> None:
-    """Beyond -1 to 1 the principal moments break the triangle inequality, and the rate grows without bound."""
+    """Beyond -1 to 1 the principal moments break the triangle inequality, and the rate grows
+    without bound.
+    """
     x, _ = some_state(1)
     sigma = np.array([0.1, ratio])
     impossible = replace(x, sigma=sigma)

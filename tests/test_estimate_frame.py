@@ -1,4 +1,7 @@
-"""The estimate does not depend on the origin of the model: poses about one origin against poses about another."""
+"""The estimate does not depend on the origin of the model.
+
+Poses about one origin against poses about another.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,10 @@ def shifted(pose: Pose, by: Array) -> Pose:
 
 
 def about(alignment: Alignment, by: Array) -> Alignment:
-    """The same measurement with the origin of {C} moved by ``by``: covariance by differences of the poses."""
+    """The same measurement with the origin of {C} moved by ``by``.
+
+    Covariance by differences of the poses.
+    """
     exact, J, step = shifted(alignment.T_ac, by), np.zeros((6, 6)), 1e-5
     for k in range(6):
         d = step * np.eye(6)[k]
@@ -38,10 +44,14 @@ def about(alignment: Alignment, by: Array) -> Alignment:
         J[:, k] = np.concatenate([geometry.log(between.q), between.t]) / step
     inverse, C = np.linalg.inv(J), alignment.covariance
     assert C is not None
-    return replace(alignment, T_ac=exact, covariance=J @ C @ J.T, info=inverse.T @ alignment.info @ inverse)
+    return replace(
+        alignment, T_ac=exact, covariance=J @ C @ J.T, info=inverse.T @ alignment.info @ inverse
+    )
 
 
-def followed(estimator: Estimator, seen: list[tuple[float, Alignment]]) -> tuple[list[float], Track]:
+def followed(
+    estimator: Estimator, seen: list[tuple[float, Alignment]]
+) -> tuple[list[float], Track]:
     """The NIS of each pose, and the track after the last."""
     track, nis = estimator.initial(0, seen[0][1].T_ac), []
     for t, alignment in seen:
@@ -63,8 +73,12 @@ def test_mean_and_covariance_about_another_origin_are_those_of_displaced_states(
             J[:, k] = boxminus(moved, found.x) / step
         expected = J @ root @ root.T @ J.T
         np.testing.assert_allclose(found.P, expected, atol=1e-5 * np.abs(expected).max())
-        np.testing.assert_allclose(found.x.T_ac.t, shifted(x.T_ac, -FAR).t + 2.0 * acceleration, rtol=1e-12)
-        np.testing.assert_allclose(frame.belief_into(found).P, root @ root.T, atol=1e-10 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            found.x.T_ac.t, shifted(x.T_ac, -FAR).t + 2.0 * acceleration, rtol=1e-12
+        )
+        np.testing.assert_allclose(
+            frame.belief_into(found).P, root @ root.T, atol=1e-10 * np.abs(expected).max()
+        )
 
 
 @pytest.mark.parametrize("poses", [6, 40])
@@ -75,7 +89,10 @@ def test_the_origin_of_the_model_does_not_change_the_estimate(poses: int) -> Non
         (t, tumbling.alignment(x.T_ac, rng, 2e-3, np.radians(0.1)))
         for t, x in zip(world.times[:poses], world.states, strict=False)
     ]
-    near, far = Estimator(EstimatorParams(), None, 4.0), Estimator(EstimatorParams(), None, 4.0, 0, FAR)
+    near, far = (
+        Estimator(EstimatorParams(), None, 4.0),
+        Estimator(EstimatorParams(), None, 4.0, 0, FAR),
+    )
     nis, plain = followed(near, seen)
     moved, track = followed(far, [(t, about(alignment, -FAR)) for t, alignment in seen])
     np.testing.assert_allclose(moved, nis, rtol=1e-4, atol=1e-6)
@@ -88,7 +105,9 @@ def test_the_origin_of_the_model_does_not_change_the_estimate(poses: int) -> Non
     np.testing.assert_allclose(other.inertia, body.inertia, atol=1e-3 * body.inertia_1s.max())
     ahead, farther = near.track_forecast(plain, AHEAD), far.track_forecast(track, AHEAD)
     np.testing.assert_allclose(farther.rot_1s_rad, ahead.rot_1s_rad, rtol=1e-4)
-    assert np.all(farther.pos_1s_m > ahead.pos_1s_m)  # the far point has the error of the attitude times its distance
+    assert np.all(
+        farther.pos_1s_m > ahead.pos_1s_m
+    )  # the far point has the error of the attitude times its distance
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -102,7 +121,10 @@ def test_the_forecast_of_a_mixture_at_a_point_is_that_of_components_about_it(see
         A = 1e-3 * rng.normal(size=(20, 20))
         chart, P = to_chart(x), A @ A.T
         J = np.array(
-            [(_about(chart.moved(e), origin).minus(_about(chart.moved(-e), origin))) / 2e-6 for e in 1e-6 * np.eye(20)]
+            [
+                (_about(chart.moved(e), origin).minus(_about(chart.moved(-e), origin))) / 2e-6
+                for e in 1e-6 * np.eye(20)
+            ]
         ).T
         parts.append(Component(weight, weight, 0, chart, P))
         there.append(Component(weight, weight, 0, _about(chart, origin), J @ P @ J.T))
@@ -118,13 +140,17 @@ def test_a_belief_is_converted_as_its_draws_are() -> None:
     rng = np.random.default_rng(5)
     x, A = tumbling.draw(5, seconds=1.0).states[0], 1e-4 * rng.normal(size=(26, 26))
     joint, frame = A @ A.T, EstimatorFrame(FAR, np.array([0.1, 0.0, -0.2]), 10**9)
-    driven = DrivenBelief(3 * 10**9, x, joint[:20, :20], np.zeros(6), joint[20:, 20:], joint[:20, 20:])
+    driven = DrivenBelief(
+        3 * 10**9, x, joint[:20, :20], np.zeros(6), joint[20:, 20:], joint[:20, 20:]
+    )
     out = frame.belief_out(driven)
     assert isinstance(out, DrivenBelief)
     draws = rng.multivariate_normal(np.zeros(26), joint, size=4000)
     moved = [frame.state_out(boxplus(x, d[:20]), driven.t_ns) for d in draws]
     arms = np.array([m.c_b for m in moved]) - out.x.c_b
-    np.testing.assert_allclose(np.cov(arms.T), out.P[14:17, 14:17], rtol=0.15, atol=0.1 * out.P[14:17, 14:17].max())
+    np.testing.assert_allclose(
+        np.cov(arms.T), out.P[14:17, 14:17], rtol=0.15, atol=0.1 * out.P[14:17, 14:17].max()
+    )
     cross = arms.T @ draws[:, 20:] / len(draws)
     np.testing.assert_allclose(cross, out.cross[14:17], atol=0.1 * np.abs(out.cross[14:17]).max())
     back = frame.belief_into(out)
@@ -154,7 +180,9 @@ def test_the_papers_method_estimates_the_origin_of_the_model_itself() -> None:
 def test_a_degenerate_view_is_converted_with_its_information() -> None:
     frame, info = EstimatorFrame(FAR, np.zeros(3), 0), np.diag([0.0, 1e4, 1e4, 1e6, 1e6, 1e6])
     free = np.eye(6)[:, :1]
-    seen = Alignment(Pose.identity(), 1, True, 100, 100, 0.0, info, AlignStatus.DEGENERATE, None, free=free)
+    seen = Alignment(
+        Pose.identity(), 1, True, 100, 100, 0.0, info, AlignStatus.DEGENERATE, None, free=free
+    )
     found = frame.alignment_into(seen, 0)
     assert found.covariance is None
     assert found.free is not None

@@ -1,4 +1,7 @@
-"""Measurement model and update: signs and units against finite differences, the kernel against numpy."""
+"""Measurement model and update.
+
+Signs and units against finite differences, the kernel against numpy.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ from avsreplay.estimate.measurement import (
     step_of_sets,
 )
 from avsreplay.geometry import Pose
-from avsreplay.monitor import gramian, measure, observe, weakest
+from avsreplay.monitor.gramian import gramian, measure, observe, weakest
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, State
 
 
@@ -59,8 +62,12 @@ def test_the_error_is_on_the_side_that_the_paper_uses(x: State) -> None:
     d[:3], d[17:] = [0.1, 0.2, -0.1], [0.05, 0.0, 0.1]
     y = boxplus(x, d)
     dq, dmu = (np.append(v, np.sqrt(1 - v @ v)) for v in (d[:3], d[17:]))
-    assert np.allclose(geometry.matrix(y.q_ab), geometry.matrix(x.q_ab) @ geometry.matrix(dq))  # q = dq (x) q_hat
-    assert np.allclose(geometry.matrix(y.q_bc), geometry.matrix(dmu) @ geometry.matrix(x.q_bc))  # mu = mu_hat (x) dmu
+    assert np.allclose(
+        geometry.matrix(y.q_ab), geometry.matrix(x.q_ab) @ geometry.matrix(dq)
+    )  # q = dq (x) q_hat
+    assert np.allclose(
+        geometry.matrix(y.q_bc), geometry.matrix(dmu) @ geometry.matrix(x.q_bc)
+    )  # mu = mu_hat (x) dmu
 
 
 def test_perfect_pose_has_no_innovation(x: State) -> None:
@@ -72,7 +79,9 @@ def test_sensitivity_is_the_derivative(x: State) -> None:
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        column = (innovation_vector(x, boxplus(x, d).T_ac) - innovation_vector(x, boxplus(x, -d).T_ac)) / (2 * eps)
+        column = (
+            innovation_vector(x, boxplus(x, d).T_ac) - innovation_vector(x, boxplus(x, -d).T_ac)
+        ) / (2 * eps)
         assert np.abs(column - H[:, k]).max() < 1e-9, k
 
 
@@ -86,7 +95,9 @@ def test_half_angle_noise(x: State) -> None:
     one_degree = np.radians(1.0)
     C = np.diag([one_degree**2] * 3 + [0.01**2] * 3)
     R = registration_noise(
-        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0)
+        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C),
+        x,
+        (1.0, 1.0),
     )
     assert np.sqrt(np.diag(R)) == pytest.approx(np.repeat([0.01, one_degree / 2], 3))
 
@@ -96,9 +107,13 @@ def test_noise_is_the_spread_of_innovations(x: State) -> None:
     root = np.linalg.qr(rng.normal(size=(6, 6)))[0] * np.geomspace(1e-4, 3e-3, 6)
     C = root @ root.T
     d = rng.normal(size=(4000, 6)) @ root.T
-    noises = [innovation_vector(x, x.T_ac @ Pose(geometry.exp(-e[:3]), -e[3:])) for e in d]  # T_true = T_meas Exp(d)
+    noises = [
+        innovation_vector(x, x.T_ac @ Pose(geometry.exp(-e[:3]), -e[3:])) for e in d
+    ]  # T_true = T_meas Exp(d)
     R = registration_noise(
-        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0)
+        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C),
+        x,
+        (1.0, 1.0),
     )
     white = np.linalg.solve(np.linalg.cholesky(R), np.transpose(noises))
     assert np.abs(white @ white.T / 4000 - np.eye(6)).max() < 0.1
@@ -106,7 +121,9 @@ def test_noise_is_the_spread_of_innovations(x: State) -> None:
 
 def test_a_free_direction_is_not_measured(x: State) -> None:
     info = np.diag([1e6, 1e6, 1e6, 0.0, 1e6, 1e6])
-    R = registration_noise(Alignment(x.T_ac, 1, True, 9, 9, 0.0, info, AlignStatus.DEGENERATE), x, (1.0, 4.0))
+    R = registration_noise(
+        Alignment(x.T_ac, 1, True, 9, 9, 0.0, info, AlignStatus.DEGENERATE), x, (1.0, 4.0)
+    )
     free = x.T_ac.R[:, 0]
     assert free @ R[:3, :3] @ free == pytest.approx(16.0)
     assert np.linalg.eigvalsh(R[:3, :3])[1] < 1.1e-6
@@ -118,19 +135,28 @@ def test_grasp_rows_are_the_derivative(x: State) -> None:
     J, eps = grasp_jacobian(geometry.matrix(x.q_ab)[None], x.w_b[None], x.c_b)[0], 1e-6
 
     def seen(y: State) -> np.ndarray:
-        turn = geometry.multiply(geometry.multiply(geometry.conjugate(x.q_ab), y.T_ac.q), geometry.conjugate(x.q_bc))
+        turn = geometry.multiply(
+            geometry.multiply(geometry.conjugate(x.q_ab), y.T_ac.q), geometry.conjugate(x.q_bc)
+        )
         return np.concatenate([y.T_ac.t, y.fixture_velocity, geometry.normalise(turn)[:3]])
 
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        assert np.abs((seen(boxplus(x, d)) - seen(boxplus(x, -d))) / (2 * eps) - J[:, k]).max() < 1e-9, k
+        assert (
+            np.abs((seen(boxplus(x, d)) - seen(boxplus(x, -d))) / (2 * eps) - J[:, k]).max() < 1e-9
+        ), k
 
 
 def test_residual_is_the_innovation_at_the_posterior(x: State) -> None:
     pose = x.T_ac @ Pose(geometry.exp([0.02, -0.05, 0.01]), np.array([0.1, 0.2, 0.3]))
     posterior = boxplus(x, np.linspace(-0.02, 0.03, 20))
-    assert np.abs(residual(posterior, x, innovation_vector(x, pose)) - innovation_vector(posterior, pose)).max() < 1e-14
+    assert (
+        np.abs(
+            residual(posterior, x, innovation_vector(x, pose)) - innovation_vector(posterior, pose)
+        ).max()
+        < 1e-14
+    )
 
 
 def test_an_information_matrix_that_is_numerically_singular_gives_a_finite_covariance(monkeypatch):
@@ -160,7 +186,10 @@ def of_eigenvalues(x: State, m: tuple[float, float, float]) -> State:
 
 
 def retract(x: State, P: np.ndarray, d: np.ndarray) -> tuple[State, np.ndarray]:
-    """The oracle: the state displaced by the error d, and P about it, by the chart as the fit has it."""
+    """The oracle.
+
+    The state displaced by the error d, and P about it, by the chart as the fit has it.
+    """
     here = to_chart(x)
     T = to_errors(here)
     there = here.moved(np.linalg.solve(T, d))
@@ -176,8 +205,13 @@ def spread_of(x: State, rng: np.random.Generator) -> np.ndarray:
     return root @ root.T
 
 
-def aimed(x: State, size: float, rng: np.random.Generator, colour: np.ndarray = WHITE) -> tuple[float, float]:
-    """How far extension and oracle differ after a step of a given size: in the mean, and in P by its sigmas."""
+def aimed(
+    x: State, size: float, rng: np.random.Generator, colour: np.ndarray = WHITE
+) -> tuple[float, float]:
+    """How far extension and oracle differ after a step of a given size.
+
+    In the mean, and in P by its sigmas.
+    """
     P, R = spread_of(x, rng), np.diag(rng.uniform(1.0, 2.0, 6)) * 1e-4
     H, S, alpha = measurement_jacobian(x), np.eye(6), np.eye(6)[0]
     H[0] = rng.normal(size=20)
@@ -189,7 +223,9 @@ def aimed(x: State, size: float, rng: np.random.Generator, colour: np.ndarray = 
     assert np.array_equal(got.P, got.P.T)
     s = np.sqrt(np.diag(P_want))
     signs = max(np.abs(got.x.q_ab - want.q_ab).max(), np.abs(got.x.q_bc - want.q_bc).max())
-    return max(signs, np.abs(boxminus(got.x, want)).max()), np.abs((got.P - P_want) / np.outer(s, s)).max()
+    return max(signs, np.abs(boxminus(got.x, want)).max()), np.abs(
+        (got.P - P_want) / np.outer(s, s)
+    ).max()
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.1, 0.5])
@@ -201,9 +237,13 @@ def test_update_agrees_with_the_chart(seed: int, size: float) -> None:
     assert covariance < 1e-10
 
 
-@pytest.mark.parametrize("gaps", [(1e-6, 1.0), (1.0, 1e-6), (1e-6, 2e-6), (0.3, 0.4), (0.3, 1e4), (1e4, 3.0)])
+@pytest.mark.parametrize(
+    "gaps", [(1e-6, 1.0), (1.0, 1e-6), (1e-6, 2e-6), (0.3, 0.4), (0.3, 1e4), (1e4, 3.0)]
+)
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 0, 2)])
-def test_update_where_moments_are_nearly_equal(gaps: tuple[float, float], order: tuple[int, int, int]) -> None:
+def test_update_where_moments_are_nearly_equal(
+    gaps: tuple[float, float], order: tuple[int, int, int]
+) -> None:
     """Gaps in units of the least one, down to where rounding still tells which is the smaller."""
     m = np.cumsum([0.0, *gaps]) * LEAST_GAP
     x = of_eigenvalues(some_state(3), tuple((m - m.mean())[list(order)]))
@@ -214,7 +254,9 @@ def test_update_where_moments_are_nearly_equal(gaps: tuple[float, float], order:
 
 
 @pytest.mark.parametrize("m", [(0.0, 0.0, 0.0), (1.0, 1.0, -2.0), (0.1, -0.2, 0.1)])
-def test_update_of_a_body_with_equal_moments_is_that_of_nearly_the_same_body(m: tuple[float, float, float]) -> None:
+def test_update_of_a_body_with_equal_moments_is_that_of_nearly_the_same_body(
+    m: tuple[float, float, float],
+) -> None:
     """Between equals rounding puts the hair on either side; the motion and M agree to the hair."""
     x, rng = of_eigenvalues(some_state(3), m), np.random.Generator(np.random.PCG64(5))
     P, R = spread_of(x, rng), np.eye(6) * 1e-3
@@ -227,7 +269,9 @@ def test_update_of_a_body_with_equal_moments_is_that_of_nearly_the_same_body(m: 
     assert np.all(np.linalg.eigvalsh(got.P) > 0.0)
 
 
-@pytest.mark.parametrize("sigma", [(0.9999, 0.3), (-0.9999, 0.3), (0.2, 0.9999), (0.2, -0.9999), (0.999, -0.9999)])
+@pytest.mark.parametrize(
+    "sigma", [(0.9999, 0.3), (-0.9999, 0.3), (0.2, 0.9999), (0.2, -0.9999), (0.999, -0.9999)]
+)
 def test_update_of_slender_and_flat_bodies(sigma: tuple[float, float]) -> None:
     x = replace(some_state(5), sigma=np.array(sigma))
     for k in range(8):
@@ -238,7 +282,10 @@ def test_update_of_slender_and_flat_bodies(sigma: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_steps_beyond_a_half_turn_and_new_names(seed: int) -> None:
-    """A half angle over 1 is cut to a half turn; inertia that turns far takes the nearest of the 24 names."""
+    """A half angle over 1 is cut to a half turn.
+
+    Inertia that turns far takes the nearest of the 24 names.
+    """
     mean, covariance = aimed(some_state(seed), 2.0, np.random.Generator(np.random.PCG64([seed, 4])))
     assert mean < 1e-11
     assert covariance < 1e-9
@@ -268,8 +315,14 @@ def test_values_that_are_not_numbers_terminate() -> None:
     x, rng = some_state(1), np.random.Generator(np.random.PCG64(0))
     P, H, S = spread_of(x, rng), measurement_jacobian(x), np.eye(6)
     bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]))
-    for state, covariance, alpha in ((bad, P, np.ones(6)), (x, P * np.nan, np.ones(6)), (x, P, np.ones(6) * np.inf)):
-        got = chart_update(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0, 0.0), WHITE)
+    for state, covariance, alpha in (
+        (bad, P, np.ones(6)),
+        (x, P * np.nan, np.ones(6)),
+        (x, P, np.ones(6) * np.inf),
+    ):
+        got = chart_update(
+            Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0, 0.0), WHITE
+        )
         assert not np.all(np.isfinite(got.P))
     with pytest.raises(ValueError, match="an inertia ratio must be between -1 and 1"):
         chart_update(
@@ -288,7 +341,9 @@ def test_an_innovation_covariance_is_definite_also_where_rounding_has_spoilt_the
     R = np.diag([1e-8, 1e-8, 1e-8, 1e-10, 1e-10, 1e-10])
     root = rng.normal(size=(20, 20))
     P = root @ root.T
-    spoilt = root[:, :3] @ root[:, :3].T - 1e-6 * np.eye(20)  # rounding errors of large variances exceed R
+    spoilt = root[:, :3] @ root[:, :3].T - 1e-6 * np.eye(
+        20
+    )  # rounding errors of large variances exceed R
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.cholesky(H @ spoilt @ H.T + R)
     found = innovation_of(spoilt, H, np.full(6, 1e-3), R)
@@ -304,17 +359,24 @@ def test_the_innovation_and_its_covariances_are_those_of_general_linear_algebra(
     rng = np.random.default_rng(11)
     for trial in range(20):
         x, H = some_state(trial), rng.normal(size=(6, 20))
-        P, R, part = (a @ a.T * 10.0 ** rng.uniform(-6, 6) for a in (rng.normal(size=(n, n)) for n in (20, 6, 6)))
+        P, R, part = (
+            a @ a.T * 10.0 ** rng.uniform(-6, 6)
+            for a in (rng.normal(size=(n, n)) for n in (20, 6, 6))
+        )
         e = rng.normal(size=6)
         S, definite, nis = _motion.innovation(P, H, e, R)
         expected = H @ P @ H.T + R
         np.testing.assert_allclose(S, expected, atol=1e-13 * np.abs(expected).max())
         assert definite
         assert nis == pytest.approx(float(e @ np.linalg.inv(expected) @ e), rel=1e-6)
-        np.testing.assert_allclose(_motion.pose_covariance(P, H), H @ P @ H.T, atol=1e-13 * np.abs(H @ P @ H.T).max())
+        np.testing.assert_allclose(
+            _motion.pose_covariance(P, H), H @ P @ H.T, atol=1e-13 * np.abs(H @ P @ H.T).max()
+        )
         B = np.linalg.inv(R) @ part
         assert _motion.trace_of_ratio(part, R) == pytest.approx(np.trace(B), rel=1e-6)
-        assert _motion.squared_traces(part, R) == pytest.approx(np.trace(B @ B) + np.trace(B) ** 2, rel=1e-6)
+        assert _motion.squared_traces(part, R) == pytest.approx(
+            np.trace(B @ B) + np.trace(B) ** 2, rel=1e-6
+        )
         squares, known = _motion.block_squares(R, e, part)
         for k, block in enumerate((slice(0, 3), slice(3, 6))):
             info = np.linalg.inv(R[block, block])
@@ -332,32 +394,46 @@ def test_the_innovation_and_its_covariances_are_those_of_general_linear_algebra(
 
 @pytest.mark.parametrize("dof", [40.0, 120.0])
 def test_the_gate_on_an_estimated_noise_is_that_of_hotelling(dof: float) -> None:
-    """With R drawn from Wishart's distribution and P zero, NIS is T^2, whose law is an F distribution."""
+    """With R drawn from Wishart's distribution and P zero, NIS is T^2, whose law is an F
+    distribution.
+    """
     rng, H, n = np.random.default_rng(6), np.zeros((6, 20)), 2000
     noise = wishart(dof, np.eye(6) / dof).rvs(n, random_state=rng)
     alphas = np.clip(0.01 * rng.normal(size=(n, 6)), -1.0, 1.0)
     none = np.zeros((20, 20))
-    seen = [innovation_of(none, H, a, 1e-4 * R, True, 0.0, dof) for a, R in zip(alphas, noise, strict=True)]
+    seen = [
+        innovation_of(none, H, a, 1e-4 * R, True, 0.0, dof)
+        for a, R in zip(alphas, noise, strict=True)
+    ]
     exact = f.sf([s.nis * (dof - 5.0) / (6.0 * dof) for s in seen], 6, dof - 5.0)
     converted = np.array([s.chi2 for s in seen])
     for probability in (0.05, 0.01):
         rate = np.mean(converted > chi2.isf(probability, 6))
         assert rate == pytest.approx(np.mean(exact < probability), rel=0.05, abs=1e-9)
         assert rate == pytest.approx(probability, abs=3.0 * np.sqrt(probability / n))
-        assert np.mean([s.nis > chi2.isf(probability, 6) for s in seen]) > probability + 3.0 * np.sqrt(probability / n)
+        assert np.mean(
+            [s.nis > chi2.isf(probability, 6) for s in seen]
+        ) > probability + 3.0 * np.sqrt(probability / n)
 
 
 def test_the_weight_of_a_pose_begins_at_the_gate_of_its_degrees_of_freedom() -> None:
-    """A pose at twice the 99.99 % point of T^2 has half the weight; a known noise has the point of chi-square."""
+    """A pose at twice the 99.99 % point of T^2 has half the weight.
+
+    A known noise has the point of chi-square.
+    """
     H, R = np.zeros((6, 20)), np.eye(6)
     for dof, point in ((50.0, 6.0 * 50.0 / 45.0 * f.isf(1e-4, 6, 45)), (np.inf, chi2.isf(1e-4, 6))):
         alpha = np.array([np.sqrt(2.0 * point), 0.0, 0.0, 0.0, 0.0, 0.0])
-        assert innovation_of(np.zeros((20, 20)), H, alpha, R, True, 0.0, dof).weight == pytest.approx(0.5, rel=0.01)
+        assert innovation_of(
+            np.zeros((20, 20)), H, alpha, R, True, 0.0, dof
+        ).weight == pytest.approx(0.5, rel=0.01)
         assert innovation_of(np.zeros((20, 20)), H, 0.69 * alpha, R, True, 0.0, dof).weight == 1.0
 
 
 def test_a_noise_that_is_a_small_part_of_the_innovation_counts_as_known() -> None:
-    """The variance of z' S z, with S the sum of a known part and of a Wishart matrix, by simulation."""
+    """The variance of z' S z, with S the sum of a known part and of a Wishart matrix, by
+    simulation.
+    """
     rng, dof = np.random.default_rng(7), 15.0
     R, known = np.diag([1.0, 2.0, 0.5, 1.0, 1.0, 1.0]), np.diag([9.0, 4.0, 2.0, 1.0, 0.0, 3.0])
     root = np.diag(np.diagonal(R + known) ** -0.5)
@@ -423,5 +499,12 @@ def test_the_command_prints_one_document() -> None:
     assert len(found["lines"]) == 3
     assert found["lines"][-1]["two"]["of"] == 20
     assert set(found["weakest"]) == {"two", "three", "known"}
-    keys = set(found["lines"][-1]["two"])  # the Gramian of the rows is another one, which has other names
-    assert keys == {"rank_fitted_motion", "of", "log10_cond_fitted_motion", "log10_cond_scaled_fitted_motion"}
+    keys = set(
+        found["lines"][-1]["two"]
+    )  # the Gramian of the rows is another one, which has other names
+    assert keys == {
+        "rank_fitted_motion",
+        "of",
+        "log10_cond_fitted_motion",
+        "log10_cond_scaled_fitted_motion",
+    }

@@ -21,7 +21,15 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
     to_fixture,
 )
-from avsreplay.estimate.mixture import Component, carried, mixture_forecast, moments, not_worse, volumes, worn
+from avsreplay.estimate.mixture import (
+    Component,
+    carried,
+    mixture_forecast,
+    moments,
+    not_worse,
+    volumes,
+    worn,
+)
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
@@ -41,19 +49,28 @@ def body(seed: int) -> tuple[State, Array]:
 def seen(x: State, h: float) -> Pose:
     """The pose h seconds later, with an error."""
     there = dynamics.propagate_state(x, h)[0].T_ac
-    return Pose(geometry.multiply(there.q, geometry.exp(np.array([1e-4, 2e-4, -1e-4]))), there.t + 1e-3)
+    return Pose(
+        geometry.multiply(there.q, geometry.exp(np.array([1e-4, 2e-4, -1e-4]))), there.t + 1e-3
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_component_is_corrected_as_the_filter_corrects_its_estimate(seed: int) -> None:
     x, P = body(seed)
-    T, pose, factors, weight = to_errors(to_chart(x)), seen(x, T_NS * 1e-9), np.array([1.5, 0.7]), 0.5
+    T, pose, factors, weight = (
+        to_errors(to_chart(x)),
+        seen(x, T_NS * 1e-9),
+        np.array([1.5, 0.7]),
+        0.5,
+    )
     prior, _ = dynamics.propagate(Belief(0, x, T @ P @ T.T), T_NS, *NOISE)
     H, alpha = measurement_jacobian(prior.x), innovation_vector(prior.x, pose)
     scale = np.repeat(factors, 3)
     R = in_camera(C * np.outer(scale, scale) / weight, pose.q, prior.x.q_bc)
     expected = chart_update(prior, H, innovation_of(prior.P, H, alpha, R), np.ones(2))
-    (found,) = carried((Component(1.0, 1.0, 0, to_chart(x), P),), T_NS, pose, ROOT, factors, weight, NOISE)
+    (found,) = carried(
+        (Component(1.0, 1.0, 0, to_chart(x), P),), T_NS, pose, ROOT, factors, weight, NOISE
+    )
     U = to_errors(to_chart(expected.x))
     assert np.abs(found.chart.minus(to_chart(expected.x))).max() < 1e-10
     in_chart = np.linalg.solve(U, np.linalg.solve(U, expected.P).T)
@@ -62,37 +79,59 @@ def test_a_component_is_corrected_as_the_filter_corrects_its_estimate(seed: int)
 
 @pytest.mark.parametrize("arc", [None, RelativeOrbit(1e-2, np.eye(3), 0).at(5_000_000_000)])
 @pytest.mark.parametrize("h", [-3.0, 0.0, 7.3])
-def test_steps_of_a_chart_are_carried_as_the_error_states_are(h: float, arc: OrbitArc | None) -> None:
+def test_steps_of_a_chart_are_carried_as_the_error_states_are(
+    h: float, arc: OrbitArc | None
+) -> None:
     x, _ = body(5)
     later, Phi = dynamics.propagate_state(x, h, arc)
     there, step = propagate_chart(to_chart(x), h, arc)
     assert np.abs(there.minus(to_chart(later))).max() < 1e-12
-    assert np.abs(step - np.linalg.solve(to_errors(to_chart(later)), Phi @ to_errors(to_chart(x)))).max() < 1e-11
+    assert (
+        np.abs(
+            step - np.linalg.solve(to_errors(to_chart(later)), Phi @ to_errors(to_chart(x)))
+        ).max()
+        < 1e-11
+    )
 
 
 def spin_claims(axis: int) -> Array:
     """(80, 2) predicted 1 sigma at one instant after each pose of a spin without disturbances.
 
-    In the columns, the Jacobians are taken along the trajectory of the fit, and at the corrected mean.
+    In the columns, the Jacobians are taken along the trajectory of the fit, and at the corrected
+    mean.
     """
-    x = replace(tumbling.draw(axis, seconds=1.0, hz=1.0).states[0], w_b=0.1 * np.eye(3)[axis] + 1e-5)
+    x = replace(
+        tumbling.draw(axis, seconds=1.0, hz=1.0).states[0], w_b=0.1 * np.eye(3)[axis] + 1e-5
+    )
     rng = np.random.Generator(np.random.PCG64(axis))
     widths = np.repeat([1e-3, 1e-4, 2e-3, 2e-4, 0.5, 1e-3], [3, 3, 3, 3, 5, 3])
     along_the_fit = at_the_mean = (Component(1.0, 1.0, 0, to_chart(x), np.diag(widths**2)),)
     claims = []
     for t in range(1, 81):
-        there, d = dynamics.propagate_state(x, float(t))[0].T_ac, rng.normal(size=6) * np.repeat([1e-3, 2e-3], 3)
-        seen_there = (Pose(geometry.multiply(there.q, geometry.exp(d[:3])), there.t + d[3:]), ROOT, np.ones(2), 1.0)
+        there, d = (
+            dynamics.propagate_state(x, float(t))[0].T_ac,
+            rng.normal(size=6) * np.repeat([1e-3, 2e-3], 3),
+        )
+        seen_there = (
+            Pose(geometry.multiply(there.q, geometry.exp(d[:3])), there.t + d[3:]),
+            ROOT,
+            np.ones(2),
+            1.0,
+        )
         along_the_fit = carried(along_the_fit, t * 1_000_000_000, *seen_there, (0.0, 0.0))
         (corrected,) = carried(at_the_mean, t * 1_000_000_000, *seen_there, (0.0, 0.0))
         at_the_mean, ahead = (replace(corrected, reference=None),), np.array([110.0 - t])
-        found = [mixture_forecast(c, c[0].t_ns, ahead, 0.0, 0.0) for c in (along_the_fit, at_the_mean)]
+        found = [
+            mixture_forecast(c, c[0].t_ns, ahead, 0.0, 0.0) for c in (along_the_fit, at_the_mean)
+        ]
         claims.append([float(each.pos_1s_m[0]) for each in found])
     return np.array(claims)
 
 
 def test_in_a_spin_no_pose_makes_a_future_instant_less_certain() -> None:
-    rises = np.array([(claims[1:] / claims[:-1]).max(axis=0) for claims in map(spin_claims, range(3))])
+    rises = np.array(
+        [(claims[1:] / claims[:-1]).max(axis=0) for claims in map(spin_claims, range(3))]
+    )
     assert np.all(rises[:, 0] < 1.0 + 1e-9)
     assert rises[:, 1].max() > 1.02  # with a point of linearisation that follows the mean
 
@@ -103,7 +142,10 @@ def test_the_forecast_of_a_mixture_has_its_second_moments() -> None:
     alone = mixture_forecast((Component(1.0, 1.0, 0, here, P),), 0, times, *NOISE)
     T = to_errors(here)
     expected = dynamics.grasp_forecast(Belief(0, x, T @ P @ T.T), times, *NOISE)
-    for found, wanted in ((alone.pos_1s_m, expected.pos_1s_m), (alone.vel_1s_mps, expected.vel_1s_mps)):
+    for found, wanted in (
+        (alone.pos_1s_m, expected.pos_1s_m),
+        (alone.vel_1s_mps, expected.vel_1s_mps),
+    ):
         assert found == pytest.approx(wanted, rel=1e-9)
     assert alone.rot_1s_rad == pytest.approx(expected.rot_1s_rad, rel=1e-9)
     off[9] = 0.01  # m/s
@@ -128,7 +170,8 @@ def test_weights_follow_the_likelihood_of_the_poses_and_the_mean_follows_the_wei
     off = np.zeros(20)
     off[6] = 0.05  # m, far beyond the error of a pose
     fitted = tuple(
-        Component(w, w, 0, here.moved(side * off), 1e-4 * P) for w, side in ((4 / 6, 0.0), (1 / 6, 1.0), (1 / 6, -1.0))
+        Component(w, w, 0, here.moved(side * off), 1e-4 * P)
+        for w, side in ((4 / 6, 0.0), (1 / 6, 1.0), (1 / 6, -1.0))
     )
     assert np.abs(moments(fitted).x.T_ac.t - x.T_ac.t).max() < 1e-12
     moved = Pose(x.T_ac.q, x.T_ac.t + off[6:9])
@@ -163,9 +206,12 @@ def test_between_fits_the_pose_is_known_better_than_from_the_last_scan(seed: int
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_pose(seed: int) -> None:
-    """The pose's covariance afterwards is the measured one in the directions in which it was larger, and the mean moves
-    by the share 1 - C/S of the residual there; the other directions remain."""
+def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_pose(
+    seed: int,
+) -> None:
+    """The pose's covariance afterwards is the measured one in the directions in which it was
+    larger, and the mean moves by the share 1 - C/S of the residual there; the other directions
+    remain."""
     x, _ = body(seed)
     rng = np.random.default_rng(seed)
     J = to_fixture(x.T_ac.q, x.q_bc) @ measurement_jacobian(x) @ to_errors(to_chart(x))
@@ -179,9 +225,15 @@ def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_
     pose = Pose(geometry.multiply(x.T_ac.q, geometry.exp(off[:3])), x.T_ac.t + x.T_ac.R @ off[3:])
     after = not_worse(fitted, T_NS, pose, C, 1.0, (0.0, 0.0))
     there = moments(after).x
-    J2 = to_fixture(there.T_ac.q, there.q_bc) @ measurement_jacobian(there) @ to_errors(to_chart(there))
+    J2 = (
+        to_fixture(there.T_ac.q, there.q_bc)
+        @ measurement_jacobian(there)
+        @ to_errors(to_chart(there))
+    )
     white = np.linalg.inv(root)
-    assert np.diag(white @ J2 @ after[0].P @ J2.T @ white.T) == pytest.approx(np.minimum(ratios, 1.0), rel=2e-3)
+    assert np.diag(white @ J2 @ after[0].P @ J2.T @ white.T) == pytest.approx(
+        np.minimum(ratios, 1.0), rel=2e-3
+    )
     between = x.T_ac.inverse() @ there.T_ac
     moved = white @ np.concatenate([geometry.log(between.q), between.t])
     asked = np.maximum(1.0 - 1.0 / ratios, 0.0) * (white @ off)
@@ -192,7 +244,9 @@ def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_fit_is_compared_with_a_pose_at_the_instant_of_that_pose(seed: int) -> None:
-    """A fit whose pose is precise at its scan and not half a second later, where the mean instant of the points is."""
+    """A fit whose pose is precise at its scan and not half a second later, where the mean instant
+    of the points is.
+    """
     x, _ = body(seed)
     T = to_errors(to_chart(x))
     Phi = dynamics.propagate_state(x, 0.5)[1]
@@ -209,9 +263,13 @@ def test_a_fit_is_compared_with_a_pose_at_the_instant_of_that_pose(seed: int) ->
     after = moments(not_worse(fitted, late, seen(x, 0.5), C, 1.0, (0.0, 0.0)))
     assert after.t_ns == late
     H = to_fixture(after.x.T_ac.q, after.x.q_bc) @ measurement_jacobian(after.x)
-    assert np.linalg.eigvalsh(white @ H @ after.P @ H.T @ white.T)[-1] == pytest.approx(1.0, rel=0.01)
+    assert np.linalg.eigvalsh(white @ H @ after.P @ H.T @ white.T)[-1] == pytest.approx(
+        1.0, rel=0.01
+    )
     exact = moments(not_worse(fitted, T_NS, x.T_ac, C, 1.0, (0.0, 0.0)))
-    np.testing.assert_allclose(exact.P, np.diag(variances), atol=1e-15)  # at its own instant it is precise enough
+    np.testing.assert_allclose(
+        exact.P, np.diag(variances), atol=1e-15
+    )  # at its own instant it is precise enough
 
 
 def after_scans(times: Array, states: list[State], seed: int) -> tuple[Estimator, Track]:
@@ -220,7 +278,9 @@ def after_scans(times: Array, states: list[State], seed: int) -> tuple[Estimator
     track = estimator.initial(0, states[0].T_ac)
     for t, x in zip(times, states, strict=True):
         prediction = estimator.predict(track, round(t * 1e9))
-        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 2e-3, np.radians(0.1)))
+        seen = estimator.innovate(
+            prediction, tumbling.alignment(x.T_ac, rng, 2e-3, np.radians(0.1))
+        )
         track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), False)
     return estimator, track
 
@@ -241,7 +301,10 @@ def test_a_gap_before_convergence_leaves_the_estimate_consistent(seed: int) -> N
 
 
 def test_no_weight_of_a_mixture_in_a_pure_spin_is_negative() -> None:
-    """More than three directions are not Gaussian: the weights of Gauss-Hermite would give the mean a negative one."""
+    """More than three directions are not Gaussian.
+
+    The weights of Gauss-Hermite would give the mean a negative one.
+    """
     world = tumbling.draw(54, seconds=60.0, hz=1.0, sigma_max=0.85)
     spin = replace(world.states[0], w_b=np.array([0.0, 0.1, 0.0]))
     _, track = after_scans(world.times, tumbling.follow(world.times, world.moments, spin), 54)

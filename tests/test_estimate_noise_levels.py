@@ -1,4 +1,7 @@
-"""Levels of the noise from simulated poses whose noise is known: white, common to near views, and disturbances."""
+"""Levels of the noise from simulated poses whose noise is known.
+
+White, common to near views, and disturbances.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,10 @@ HZ = 2.0
 
 
 def fixes(states, seed: int, *, share: float = 0.0, claimed: float = 0.0, factor: float = 1.0):
-    """Poses with ``share`` of the variance a smooth random function of the direction of view; ``claimed`` is theirs."""
+    """Poses with ``share`` of the variance a smooth random function of the direction of view.
+
+    ``claimed`` is theirs.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, 40]))
     waves, phases = rng.normal(size=(300, 3)) / 0.5, rng.uniform(0.0, 2.0 * np.pi, 300)
     sizes = rng.normal(size=(300, 6)) * np.sqrt(2.0 / 300)
@@ -95,8 +101,11 @@ def test_a_density_that_the_poses_cannot_tell_is_the_mean_of_what_they_allow() -
 
 
 @pytest.mark.parametrize(("force", "step"), [(0.0, 0.0), (1e-4, 0.0), (0.0, 0.01)])
-def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(force: float, step: float) -> None:
-    """The torque turns the body by more than a fit of free motion can use; the positions are linear all the same.
+def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(
+    force: float, step: float
+) -> None:
+    """The torque turns the body by more than a fit of free motion can use; the positions are linear
+    all the same.
 
     A manoeuvre, whose instant is known to 0.1 s, does not count as a force.
     """
@@ -108,9 +117,12 @@ def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(
         moved = np.cumsum(speed, axis=0) / HZ
         moved[:, 1] += step * np.maximum(np.arange(len(moved)) / HZ - 40.3, 0.0)
         seen = [
-            replace(f, T_ac=Pose(f.T_ac.q, f.T_ac.t + m)) for f, m in zip(fixes(world.states, seed), moved, strict=True)
+            replace(f, T_ac=Pose(f.T_ac.q, f.T_ac.t + m))
+            for f, m in zip(fixes(world.states, seed), moved, strict=True)
         ]
-        change = Manoeuvre(round(40.2e9), 0.1, np.array([0.0, step, 0.0]), np.zeros(3), np.eye(6), 0)
+        change = Manoeuvre(
+            round(40.2e9), 0.1, np.array([0.0, step, 0.0]), np.zeros(3), np.eye(6), 0
+        )
         arm, one = to_chart(world.states[0]).arm_c, np.ones(len(seen))
         rows = position_rows(poses_of(tuple(seen)), one, arm, 36, 0, [change] if step else [])
         found.append(density_in_use(_of_positions(_variances(NO_LEVELS), rows), rows.present))
@@ -133,7 +145,9 @@ def test_errors_that_near_views_share_are_found_and_widen_the_covariance() -> No
     for seed in range(4):
         world = tumbling.draw(seed, seconds=100.0, hz=HZ, sigma_max=0.85)
         for share in (0.0, 0.4):
-            levels, problem = levels_of(fixes(world.states, seed, share=share, claimed=0.1), world.states[0])
+            levels, problem = levels_of(
+                fixes(world.states, seed, share=share, claimed=0.1), world.states[0]
+            )
             _, inflation = sandwich(problem, problem.poses, levels)
             found.append((*(0.1 * np.array(levels.common) / levels.factors(0.1) ** 2), *inflation))
     white, shared = np.mean(found[::2], axis=0), np.mean(found[1::2], axis=0)
@@ -145,7 +159,9 @@ def test_errors_that_near_views_share_are_found_and_widen_the_covariance() -> No
 def test_normal_points_know_the_noise_within_them() -> None:
     world = tumbling.draw(5, seconds=300.0, hz=HZ, sigma_max=0.85)
     poses = poses_of(fixes(world.states, 5, factor=3.0))
-    points = normal_points(poses, to_chart(world.states[0]), 3.0 * np.ones(2), MOST_POINTS, scatter=True)
+    points = normal_points(
+        poses, to_chart(world.states[0]), 3.0 * np.ones(2), MOST_POINTS, scatter=True
+    )
     assert points.within is not None
     squares, dof = points.within
     assert dof > 500.0

@@ -1,4 +1,6 @@
-"""A relative orbit in propagation, transition matrix and fit, against an integration of the equations of motion."""
+"""A relative orbit in propagation, transition matrix and fit, against an integration of the
+equations of motion.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,11 @@ from avsreplay.records import Belief, State
 
 N = 0.00113  # mean motion at an altitude of 400 km
 RADIAL, NORMAL = np.array([0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0])
-SETTINGS = {"orbit_rate_radps": N, "orbit_radial_a": tuple(RADIAL.tolist()), "orbit_normal_a": tuple(NORMAL.tolist())}
+SETTINGS = {
+    "orbit_rate_radps": N,
+    "orbit_radial_a": tuple(RADIAL.tolist()),
+    "orbit_normal_a": tuple(NORMAL.tolist()),
+}
 EPOCH_NS = 3_000_000_000
 
 
@@ -32,10 +38,14 @@ def orbit(n: float = N) -> RelativeOrbit:
     return found
 
 
-def integrated(r: np.ndarray, v: np.ndarray, start_s: float, times_s: np.ndarray, n: float = N) -> np.ndarray:
-    """Centre and velocity (n, 6) in {A}: the equations in turning axes, integrated, and turned back by rotations.
+def integrated(
+    r: np.ndarray, v: np.ndarray, start_s: float, times_s: np.ndarray, n: float = N
+) -> np.ndarray:
+    """Centre and velocity (n, 6) in {A}: the equations in turning axes, integrated, and turned back
+    by rotations.
 
-    x'' = 3 n^2 x + 2 n y', y'' = -2 n x', z'' = -n^2 z (Clohessy and Wiltshire); x radial, y along the track.
+    x'' = 3 n^2 x + 2 n y', y'' = -2 n x', z'' = -n^2 z (Clohessy and Wiltshire); x radial, y along
+    the track.
     """
     along = np.cross(NORMAL, RADIAL)
 
@@ -49,7 +59,9 @@ def integrated(r: np.ndarray, v: np.ndarray, start_s: float, times_s: np.ndarray
     turn, spin = axes(start_s), n * NORMAL
     begin = np.concatenate([turn @ r, turn @ (v - np.cross(spin, r))])
     ends = sorted({0.0, *times_s.tolist()})
-    found = solve_ivp(slope, (ends[0], ends[-1]), begin, t_eval=ends, method="DOP853", rtol=1e-12, atol=1e-14)
+    found = solve_ivp(
+        slope, (ends[0], ends[-1]), begin, t_eval=ends, method="DOP853", rtol=1e-12, atol=1e-14
+    )
     out = []
     for t in times_s:
         s = found.y[:, ends.index(t)]
@@ -78,7 +90,9 @@ def test_a_slow_orbit_is_free_motion() -> None:
 
 
 def test_mean_and_phi_of_a_step_are_those_of_the_orbit() -> None:
-    """The state after the step against the integration, Phi against differences, the attitude as in free motion."""
+    """The state after the step against the integration, Phi against differences, the attitude as in
+    free motion.
+    """
     x, at_ns, h = tumbling.draw(5, seconds=1.0).states[0], EPOCH_NS + 200_000_000_000, 40.0
     belief = Belief(at_ns, x, np.eye(20) * 1e-6)
     there, Phi = propagate(belief, at_ns + round(h * 1e9), 0.0, 0.0, orbit())
@@ -87,7 +101,9 @@ def test_mean_and_phi_of_a_step_are_those_of_the_orbit() -> None:
     np.testing.assert_allclose(np.concatenate([there.x.r_a, there.x.v_a]), true, atol=1e-9)
     assert np.linalg.norm(there.x.r_a - free.x.r_a) > 1e-3
     np.testing.assert_array_equal(there.x.q_ab, free.x.q_ab)
-    np.testing.assert_array_equal(np.delete(Phi, np.r_[6:12], axis=1), np.delete(plain, np.r_[6:12], axis=1))
+    np.testing.assert_array_equal(
+        np.delete(Phi, np.r_[6:12], axis=1), np.delete(plain, np.r_[6:12], axis=1)
+    )
     arc = orbit().at(at_ns)
     for k in (*range(20)[RHO], *range(20)[VEL]):
         d = np.zeros(20)
@@ -98,7 +114,9 @@ def test_mean_and_phi_of_a_step_are_those_of_the_orbit() -> None:
     np.testing.assert_allclose(seen[:3, 6:12], Phi[6:9, 6:12], atol=1e-12)
 
 
-def orbiting(seed: int, seconds: float, hz: float) -> tuple[tumbling.World, list[State], list[Pose]]:
+def orbiting(
+    seed: int, seconds: float, hz: float
+) -> tuple[tumbling.World, list[State], list[Pose]]:
     """A tumbling body on the orbit: true states and measured poses (2 mm, 0.003 rad)."""
     world = tumbling.draw(seed, seconds=seconds, hz=hz, rate=0.1)
     rng = np.random.Generator(np.random.PCG64([seed, 9]))
@@ -110,7 +128,10 @@ def orbiting(seed: int, seconds: float, hz: float) -> tuple[tumbling.World, list
 
 
 def test_the_fit_finds_the_motion_over_600_s() -> None:
-    """Its residuals are the noise, and its initial values the truth; a fit of free motion leaves decimetres."""
+    """Its residuals are the noise, and its initial values the truth.
+
+    A fit of free motion leaves decimetres.
+    """
     world, states, poses = orbiting(2, 600.0, 0.5)
     t_ns = [EPOCH_NS + round(t * 1e9) for t in world.times]
     on_orbit = reference_fit(t_ns, poses, None, 2.0, EstimatorParams(**SETTINGS))
@@ -124,12 +145,17 @@ def test_the_fit_finds_the_motion_over_600_s() -> None:
 
 
 def test_the_estimator_follows_the_orbit(tmp_path: Path) -> None:
-    """A run over 600 s: errors within the claims with the orbit; without it they are several times as large."""
+    """A run over 600 s: errors within the claims with the orbit.
+
+    Without it they are several times as large.
+    """
     world, states, poses = orbiting(4, 600.0, 0.5)
     times = [EPOCH_NS + round(t * 1e9) for t in world.times]
     log = tum(tmp_path / "orbit.tum", times, poses)
     truth = tum(tmp_path / "truth.tum", times, [x.T_ac for x in states])
-    given = [f"estimator.{key}={list(v) if isinstance(v, tuple) else v}" for key, v in SETTINGS.items()]
+    given = [
+        f"estimator.{key}={list(v) if isinstance(v, tuple) else v}" for key, v in SETTINGS.items()
+    ]
     known, _ = rows(log, *given, extent_m=2.0, truth_file=truth)
     unknown, _ = rows(log, extent_m=2.0, truth_file=truth)
     settled = known[50:]
@@ -139,7 +165,9 @@ def test_the_estimator_follows_the_orbit(tmp_path: Path) -> None:
     assert np.mean([row.nis for row in settled]) == pytest.approx(6.0, rel=0.15)
     with_claims = [row.pos_err_m / row.pos_1s_m for row in settled]
     assert np.mean(np.square(with_claims)) < 3.0 * 1.3  # at most the three axes
-    rms = [math.sqrt(np.mean([row.pos_err_m**2 for row in found[50:]])) for found in (known, unknown)]
+    rms = [
+        math.sqrt(np.mean([row.pos_err_m**2 for row in found[50:]])) for found in (known, unknown)
+    ]
     assert rms[1] > 2.0 * rms[0]
 
 

@@ -18,11 +18,15 @@ from avsreplay.records import Alignment, AlignStatus, Belief
 
 
 def skewed(rate: float, span: float, at: float):
-    """Points on the body in {C}, what a scanner sees of them over ``span`` s around ``at``, and the true cloud then."""
+    """Points on the body in {C}, what a scanner sees of them over ``span`` s around ``at``, and the
+    true cloud then.
+    """
     times = np.sort(np.random.Generator(np.random.PCG64(0)).uniform(-span / 2, span / 2, 500))
     world = tumbling.draw(3, rate=rate, seconds=1.0)
     states = tumbling.follow(
-        np.append(at + times, at)[np.argsort(np.append(at + times, at))], world.moments, world.states[0]
+        np.append(at + times, at)[np.argsort(np.append(at + times, at))],
+        world.moments,
+        world.states[0],
     )
     order = int(np.searchsorted(times, 0.0))
     now = states.pop(order)
@@ -46,7 +50,12 @@ def test_points_come_back_to_one_instant(rate: float, span: float) -> None:
 
 def test_float32_points_and_one_instant() -> None:
     seen, times, now, whole = skewed(0.1, 1.0, 2.0)
-    assert np.abs(deskew(seen.astype(np.float32), times.astype(np.float32), predict(now).belief.x) - whole).max() < 1e-4
+    assert (
+        np.abs(
+            deskew(seen.astype(np.float32), times.astype(np.float32), predict(now).belief.x) - whole
+        ).max()
+        < 1e-4
+    )
     assert np.array_equal(deskew(seen, np.zeros(500), predict(now).belief.x), seen)
     assert deskew(np.zeros((0, 3)), np.zeros(0), predict(now).belief.x).shape == (0, 3)
 
@@ -63,7 +72,10 @@ def test_inputs_of_inconsistent_size_are_refused() -> None:
 
 
 def surface_points(seed: int, late_half: bool):
-    """(500, 3) points with normals; with ``late_half`` the second half of them lies on one side of the body."""
+    """(500, 3) points with normals.
+
+    With ``late_half`` the second half of them lies on one side of the body.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     p, n = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -78,9 +90,16 @@ def mean_instants(p, n, times):
     return np.linalg.solve(J.T @ J, (J.T * times) @ J), J
 
 
-@pytest.mark.parametrize(("late_half", "begin"), [(False, 0.0), (False, -0.5), (True, 0.0), (True, -0.25)])
-def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin: float, late_half: bool) -> None:
-    """A prior off by dx carries the points; least squares over surface distances then gives the pose: no H in it."""
+@pytest.mark.parametrize(
+    ("late_half", "begin"), [(False, 0.0), (False, -0.5), (True, 0.0), (True, -0.25)]
+)
+def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(
+    begin: float, late_half: bool
+) -> None:
+    """A prior off by dx carries the points.
+
+    Least squares over surface distances then gives the pose: no H in it.
+    """
     world = tumbling.draw(3, rate=0.2, seconds=1.0)
     times = begin + np.sort(np.random.Generator(np.random.PCG64(5)).uniform(0.0, 0.5, 500))
     at = 2.0
@@ -95,7 +114,9 @@ def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin
         dx = 1e-3 * rng.normal(size=20)
         prior = predict(boxplus(now, -dx))
         guess = prior.belief.x.T_ac
-        found = guess.inverse().apply(deskew(seen, times, prior.belief.x))  # in the prior's {C}: p + J' d
+        found = guess.inverse().apply(
+            deskew(seen, times, prior.belief.x)
+        )  # in the prior's {C}: p + J' d
         d = np.linalg.lstsq(J, np.einsum("ij,ij->i", n, found - p), rcond=None)[0]
         alpha = innovation_vector(prior.belief.x, guess @ Pose(geometry.exp(d[:3]), d[3:]))
         told = with_scan_duration(prior, M, times)
@@ -128,7 +149,9 @@ def test_points_all_late_by_the_same_time_test_the_pose_then() -> None:
 
 
 def symmetric_track(seed: int) -> tuple[Track, Pose, np.ndarray]:
-    """A track that does not know the rotation about an axis in {C}, a turn G about it, and the error of its pose."""
+    """A track that does not know the rotation about an axis in {C}, a turn G about it, and the
+    error of its pose.
+    """
     rng = np.random.default_rng(seed)
     now = tumbling.draw(seed, seconds=1.0).states[0]
     axis, centre, error = rng.normal(size=3), rng.normal(size=3), 1e-6 * rng.normal(size=6)
@@ -137,7 +160,11 @@ def symmetric_track(seed: int) -> tuple[Track, Pose, np.ndarray]:
     G = Pose(q, centre - geometry.matrix(q) @ centre)
     d = 2.0 * np.concatenate([axis, np.cross(centre, axis)])[:, None]
     fix = PoseFix(0, now.T_ac, np.outer(error, error))
-    return Track(Belief(0, now, np.eye(20) * 1e-6), "filter", fixes=(fix,), undetermined=d), G, error
+    return (
+        Track(Belief(0, now, np.eye(20) * 1e-6), "filter", fixes=(fix,), undetermined=d),
+        G,
+        error,
+    )
 
 
 def aligned(T_ac: Pose, status: AlignStatus = AlignStatus.ALIGNED) -> Alignment:
@@ -151,8 +178,17 @@ def test_a_determined_rotation_turns_the_whole_track(seed: int) -> None:
     measured = x.T_ac @ G
     after = turned(track, x.T_ac, measured, aligned(measured))
     np.testing.assert_allclose(after.belief.x.T_ac.t, measured.t, atol=1e-12)
-    assert geometry.angle(geometry.multiply(geometry.conjugate(after.belief.x.T_ac.q), measured.q)) < 1e-7
-    for name in ("q_ab", "w_b", "r_a", "v_a", "sigma"):  # the body moves as before; only the model on it is turned
+    assert (
+        geometry.angle(geometry.multiply(geometry.conjugate(after.belief.x.T_ac.q), measured.q))
+        < 1e-7
+    )
+    for name in (
+        "q_ab",
+        "w_b",
+        "r_a",
+        "v_a",
+        "sigma",
+    ):  # the body moves as before; only the model on it is turned
         np.testing.assert_array_equal(getattr(after.belief.x, name), getattr(x, name))
     fix = after.fixes[0]
     truth = x.T_ac @ Pose(geometry.exp(error[:3]), error[3:]) @ G
@@ -166,9 +202,14 @@ def test_other_differences_do_not_turn_the_track() -> None:
     x = track.belief.x
     measured = x.T_ac @ G
     assert turned(track, x.T_ac, measured, aligned(measured, AlignStatus.DEGENERATE)) is track
-    two = Track(track.belief, "filter", undetermined=np.hstack([track.undetermined, np.eye(6)[:, 3:4]]))
+    two = Track(
+        track.belief, "filter", undetermined=np.hstack([track.undetermined, np.eye(6)[:, 3:4]])
+    )
     assert turned(two, x.T_ac, measured, aligned(measured)) is two
-    assert turned(Track(track.belief, "filter"), x.T_ac, measured, aligned(measured)).undetermined.size == 0
+    assert (
+        turned(Track(track.belief, "filter"), x.T_ac, measured, aligned(measured)).undetermined.size
+        == 0
+    )
     across = np.cross(track.undetermined[:3, 0], [0.3, -0.5, 0.8])
     other = Pose(geometry.exp(0.5 * across / np.linalg.norm(across)), np.zeros(3))
     assert turned(track, x.T_ac, measured @ other, aligned(measured)) is track

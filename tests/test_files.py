@@ -1,4 +1,6 @@
-"""Outputs of every kind of file node, failures while writing, and numpy archives and JSON that are not as declared."""
+"""Outputs of every kind of file node, failures while writing, and numpy archives and JSON that are
+not as declared.
+"""
 
 from __future__ import annotations
 
@@ -65,14 +67,22 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path: Path) -> None
 def test_a_full_disk_is_one_line_and_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(UnreadableInput, match="No space left on device; nothing was changed"), output_path(path):
+    with (
+        pytest.raises(UnreadableInput, match="No space left on device; nothing was changed"),
+        output_path(path),
+    ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert path.read_text() == "old"
 
 
-def test_an_error_in_a_file_of_a_folder_names_the_folder_and_not_its_temporary_name(tmp_path: Path) -> None:
+def test_an_error_in_a_file_of_a_folder_names_the_folder_and_not_its_temporary_name(
+    tmp_path: Path,
+) -> None:
     with (
-        pytest.raises(UnreadableInput, match=rf"{re.escape(str(tmp_path / 'result' / 'a.txt'))}: cannot be written"),
+        pytest.raises(
+            UnreadableInput,
+            match=rf"{re.escape(str(tmp_path / 'result' / 'a.txt'))}: cannot be written",
+        ),
         output_folder(tmp_path / "result") as part,
         output_path(part / "a.txt"),
     ):
@@ -122,8 +132,12 @@ def test_a_symbolic_link_is_followed_and_never_replaced(tmp_path: Path) -> None:
         check_output(tmp_path / "a")
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "x" * 256, "a\0b", "a\udcff", "missing/a", "file/a", "folder"])
-def test_names_that_cannot_be_written_are_refused_before_any_work(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "x" * 256, "a\0b", "a\udcff", "missing/a", "file/a", "folder"]
+)
+def test_names_that_cannot_be_written_are_refused_before_any_work(
+    name: str, tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     path = tmp_path / name if name.strip(".") else Path(name)
@@ -135,7 +149,9 @@ def test_names_that_cannot_be_written_are_refused_before_any_work(name: str, tmp
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "-", "file", "x" * 256])
-def test_folders_that_cannot_be_written_are_refused_before_any_work(name: str, tmp_path: Path) -> None:
+def test_folders_that_cannot_be_written_are_refused_before_any_work(
+    name: str, tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     path = tmp_path / name if name in ("file", "x" * 256) else Path(name)
     with pytest.raises(UsageError):
@@ -151,7 +167,10 @@ def test_an_existing_output_needs_overwrite(tmp_path: Path) -> None:
 
 def test_two_writers_at_once_leave_one_complete_file(tmp_path: Path) -> None:
     path, texts, done = tmp_path / "a.txt", [str(k) * 200_000 for k in range(8)], []
-    threads = [threading.Thread(target=lambda text: done.append(write(path, text)), args=(text,)) for text in texts]
+    threads = [
+        threading.Thread(target=lambda text: done.append(write(path, text)), args=(text,))
+        for text in texts
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -176,14 +195,18 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
 
 
 @posix
-def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kept(tmp_path: Path) -> None:
+def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kept(
+    tmp_path: Path,
+) -> None:
     code = (
         "import sys, time; from pathlib import Path; from avsreplay.files import output_text\n"
         "with output_text(Path(sys.argv[1])) as stream:\n"
         "    stream.write('half'); stream.flush(); print('ready', flush=True); time.sleep(60)"
     )
     path = tmp_path / "a.txt"
-    other = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+    )
     assert other.stdout is not None
     assert other.stdout.readline() == "ready\n"
     write(path)
@@ -198,7 +221,9 @@ def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kep
 @posix
 @pytest.mark.parametrize("locked", [False, True])
 @pytest.mark.parametrize("output", [output_path, output_folder])
-def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(tmp_path, monkeypatch, output, locked) -> None:
+def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(
+    tmp_path, monkeypatch, output, locked
+) -> None:
     """The other process comes between the creation and the lock, or waits for the lock."""
     lock, taken = files.lock, []
 
@@ -214,7 +239,9 @@ def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(tmp_path
     with output(tmp_path / "x") as part:
         (part / "file" if part.is_dir() else part).write_text("complete")
     assert taken
-    assert (tmp_path / "x" / "file" if output is output_folder else tmp_path / "x").read_text() == "complete"
+    assert (
+        tmp_path / "x" / "file" if output is output_folder else tmp_path / "x"
+    ).read_text() == "complete"
     assert only(tmp_path, "x")
 
 
@@ -234,7 +261,9 @@ def test_a_folder_that_another_process_writes_is_refused_before_any_work(tmp_pat
             (part / "rows").write_text("mine")
 
     command = [sys.executable, "-c", code, str(place)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "ready\n"
         with pytest.raises(UsageError, match="result: another process is writing it"):
@@ -310,7 +339,10 @@ def archive(tmp_path: Path, **arrays: np.ndarray) -> Path:
 
 
 def test_arrays_come_back_as_they_were_written(tmp_path: Path) -> None:
-    n, x = np.arange(5, dtype=np.int32), np.asfortranarray(np.random.default_rng(1).normal(size=(3, 2)))
+    n, x = (
+        np.arange(5, dtype=np.int32),
+        np.asfortranarray(np.random.default_rng(1).normal(size=(3, 2))),
+    )
     found = read_npz(archive(tmp_path, n=n, x=x), SHAPES, limit=1 << 20, hint="hint")
     assert np.array_equal(found["n"], n)
     assert np.array_equal(found["x"], x)
@@ -327,7 +359,9 @@ def test_arrays_come_back_as_they_were_written(tmp_path: Path) -> None:
         {"n": np.arange(3), "x": np.array([[{}, 1]], dtype=object)},
     ],
 )
-def test_other_arrays_than_declared_are_refused(arrays: dict[str, np.ndarray], tmp_path: Path) -> None:
+def test_other_arrays_than_declared_are_refused(
+    arrays: dict[str, np.ndarray], tmp_path: Path
+) -> None:
     with pytest.raises(UnreadableInput):
         read_npz(archive(tmp_path, **arrays), SHAPES, limit=1 << 20, hint="hint")
 

@@ -12,7 +12,9 @@ from avsreplay.geometry import Pose
 
 finite = st.floats(-10.0, 10.0, allow_nan=False)
 vectors = arrays(np.float64, 3, elements=finite)
-quaternions = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: np.linalg.norm(q) > 1e-3)
+quaternions = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(
+    lambda q: np.linalg.norm(q) > 1e-3
+)
 
 
 def batch(n=200, seed=3):
@@ -27,7 +29,9 @@ def test_matrix_is_the_active_rotation():
 def test_product_multiplies_the_matrices_in_the_same_order():
     a, b = batch(seed=1), batch(seed=2)
     np.testing.assert_allclose(
-        geometry.matrix(geometry.multiply(a, b)), geometry.matrix(a) @ geometry.matrix(b), atol=1e-14
+        geometry.matrix(geometry.multiply(a, b)),
+        geometry.matrix(a) @ geometry.matrix(b),
+        atol=1e-14,
     )
 
 
@@ -63,7 +67,9 @@ def test_log_inverts_exp_within_half_a_turn(v):
 @pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 1.0, 3.0])
 def test_exp_agrees_with_rotvec_at_every_size(size):
     v = size * np.array([0.6, -0.0, 0.8])
-    np.testing.assert_allclose(geometry.matrix(geometry.exp(v)), Rotation.from_rotvec(v).as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(
+        geometry.matrix(geometry.exp(v)), Rotation.from_rotvec(v).as_matrix(), atol=1e-15
+    )
 
 
 @given(quaternions)
@@ -74,7 +80,9 @@ def test_normalise_gives_one_of_the_two_signs(q):
 def test_skew_is_the_cross_product():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 50, 3))
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", geometry.skew(a), b), np.cross(a, b), atol=1e-15)
+    np.testing.assert_allclose(
+        np.einsum("nij,nj->ni", geometry.skew(a), b), np.cross(a, b), atol=1e-15
+    )
 
 
 def test_pose_inverse_and_composition():
@@ -123,7 +131,9 @@ def test_a_single_value_equals_the_row_of_the_batch_bit_for_bit(function):
 
 def test_a_single_product_equals_the_row_of_the_batch_bit_for_bit():
     a, b = batch(300, seed=6), batch(300, seed=7)
-    assert np.array_equal([geometry.multiply(p, q) for p, q in zip(a, b, strict=True)], geometry.multiply(a, b))
+    assert np.array_equal(
+        [geometry.multiply(p, q) for p, q in zip(a, b, strict=True)], geometry.multiply(a, b)
+    )
 
 
 def test_a_single_skew_matrix_equals_the_row_of_the_batch_bit_for_bit():
@@ -131,7 +141,9 @@ def test_a_single_skew_matrix_equals_the_row_of_the_batch_bit_for_bit():
     assert np.array_equal([geometry.skew(one) for one in v], geometry.skew(v))
 
 
-@pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, 0.0, 0.8], [2 / 3, -1 / 3, 2 / 3]])
+@pytest.mark.parametrize(
+    "axis", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, 0.0, 0.8], [2 / 3, -1 / 3, 2 / 3]]
+)
 def test_the_vector_across_an_axis_has_unit_length_and_a_right_angle(axis):
     side = geometry.across(np.array(axis))
     assert np.linalg.norm(side) == pytest.approx(1.0, abs=1e-15)

@@ -1,4 +1,7 @@
-"""Every built-in case through the command line: the golden rows are reproduced, and the comparison can fail."""
+"""Every built-in case through the command line.
+
+The golden rows are reproduced, and the comparison can fail.
+"""
 
 import json
 from pathlib import Path
@@ -18,7 +21,9 @@ def test_there_are_cases():
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_golden_rows_hold(case, cli, fixtures_folder):
-    done = cli("run", fixtures_folder / f"{case}.mcap", "--golden", fixtures_folder / f"{case}.rows.jsonl")
+    done = cli(
+        "run", fixtures_folder / f"{case}.mcap", "--golden", fixtures_folder / f"{case}.rows.jsonl"
+    )
     assert done.code == 0, done.out + done.err
     assert "golden rows agree" in done.err
 
@@ -76,10 +81,14 @@ def test_a_missing_golden_is_named_before_the_replay(cli, fixtures_folder, tmp_p
     assert "no such golden file" in done.err
 
 
-def test_an_update_writes_the_rows_of_this_machine_and_the_committed_rows_hold_for_them(cli, fixtures_folder, tmp_path):
-    """Bytes are compared with a second run on the same machine; with the committed file, the golden tolerances hold.
+def test_an_update_writes_the_rows_of_this_machine_and_the_committed_rows_hold_for_them(
+    cli, fixtures_folder, tmp_path
+):
+    """Bytes are compared with a second run on the same machine; with the committed file, the golden
+    tolerances hold.
 
-    Another processor or BLAS build may change the last digits (relative differences of 2e-11 were measured).
+    Another processor or BLAS build may change the last digits (relative differences of 2e-11 were
+    measured).
     """
     log, golden = fixtures_folder / "tumble.mcap", tmp_path / "new.jsonl"
     done = cli("run", log, "--update-golden", golden)

@@ -56,7 +56,9 @@ def test_drift_of_200_ppm_over_an_hour_is_followed() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1, 8, 30, 59])
-@pytest.mark.parametrize("jump", [3 * SECOND, -3 * SECOND, 40_000_000 * SECOND, -40_000_000 * SECOND])
+@pytest.mark.parametrize(
+    "jump", [3 * SECOND, -3 * SECOND, 40_000_000 * SECOND, -40_000_000 * SECOND]
+)
 @pytest.mark.parametrize("long", [1, 2])
 def test_isolated_wrong_stamps_are_replaced_by_the_log_clock(at: int, jump: int, long: int) -> None:
     log, header = clocks(offset_ns=123_456)
@@ -151,7 +153,9 @@ def test_the_chosen_clock_is_used() -> None:
 
 def test_no_scan_and_a_single_scan() -> None:
     assert place([], [], [], ClockChoice.HEADER)[0] == []
-    assert [p.t_ns for p in place([START], [START], [START + 5], ClockChoice.HEADER)[0]] == [START + 5]
+    assert [p.t_ns for p in place([START], [START], [START + 5], ClockChoice.HEADER)[0]] == [
+        START + 5
+    ]
     placed, summary = place([START], [START], [0], ClockChoice.HEADER)
     assert placed[0].t_ns == START
     assert "never set" in summary.note

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 
-from avsreplay.cli import entry_point
+from avsreplay.cli.main import entry_point
 from avsreplay.log import open_source
 from avsreplay.log.cdr import point_cloud2, schema_text
 from avsreplay.log.doctor import Severity, examine, repair
@@ -35,7 +35,9 @@ def run(*args: object) -> subprocess.CompletedProcess[str]:
             entry_point()
     finally:
         sys.argv = before
-    return subprocess.CompletedProcess(sys.argv, int(ended.value.code or 0), out.getvalue(), err.getvalue())
+    return subprocess.CompletedProcess(
+        sys.argv, int(ended.value.code or 0), out.getvalue(), err.getvalue()
+    )
 
 
 def test_the_command_itself(whole: Path) -> None:
@@ -73,7 +75,14 @@ def about(path: Path) -> dict[str, list[tuple[Severity, str]]]:
 def test_info_describes_a_log(whole: Path) -> None:
     done = run("info", whole)
     assert done.returncode == 0
-    for word in ("/points", "part.ply", "seed 7", "occlusion", "20 on /points", "median period 0.5000 s"):
+    for word in (
+        "/points",
+        "part.ply",
+        "seed 7",
+        "occlusion",
+        "20 on /points",
+        "median period 0.5000 s",
+    ):
         assert word in done.stdout
     told = json.loads(run("info", whole, "--json").stdout)
     assert told["scans"] == 20
@@ -123,7 +132,9 @@ def test_a_repaired_log_opens_in_other_readers_with_all_intact_records(damaged: 
         assert sum(c.topic == "/points" for c, _, _ in reader.messages()) == len(kept)
     with out.open("rb") as file:
         reader2 = make_reader(file, validate_crcs=True)
-        assert reader2.get_summary().statistics.message_count == sum(1 for _ in reader2.iter_messages())
+        assert reader2.get_summary().statistics.message_count == sum(
+            1 for _ in reader2.iter_messages()
+        )
 
 
 def test_repair_does_not_overwrite_and_rejects_other_formats(damaged: Path) -> None:
@@ -142,7 +153,9 @@ def test_clouds_that_cannot_be_decoded_are_left_out_of_a_repair(tmp_path: Path) 
     stream = io.BytesIO()
     writer = McapWriter(stream)
     writer.start("ros2")
-    channel = writer.register_channel("/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+    channel = writer.register_channel(
+        "/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD))
+    )
     for c in CLOUDS:
         payload = point_cloud2(c.t_ns, "s", c.points, None)
         writer.add_message(channel, c.log_ns, payload[:100] if c.seq == 3 else payload, c.log_ns)
@@ -195,7 +208,9 @@ def test_damage_outside_chunks_is_found_by_the_data_checksum(whole: Path) -> Non
     at = data.index(b"application/octet-stream")
     data[at - 30] ^= 0x20  # a time in the head of the attachment: its own checksum holds it
     whole.write_bytes(data)
-    assert any(severity is Severity.ERROR for texts in about(whole).values() for severity, _ in texts)
+    assert any(
+        severity is Severity.ERROR for texts in about(whole).values() for severity, _ in texts
+    )
 
 
 def test_control_characters_in_names_are_escaped(tmp_path: Path) -> None:
@@ -203,9 +218,13 @@ def test_control_characters_in_names_are_escaped(tmp_path: Path) -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream)
     writer.start("ros2\x1b[2J")
-    channel = writer.register_channel(nasty, "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+    channel = writer.register_channel(
+        nasty, "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD))
+    )
     for c in CLOUDS[:3]:
-        writer.add_message(channel, c.log_ns, point_cloud2(c.t_ns, "f\x1b[1m", c.points, None), c.log_ns)
+        writer.add_message(
+            channel, c.log_ns, point_cloud2(c.t_ns, "f\x1b[1m", c.points, None), c.log_ns
+        )
     writer.finish()
     (tmp_path / "a.mcap").write_bytes(stream.getvalue())
     for args in (
@@ -224,8 +243,12 @@ def test_an_attachment_with_a_parent_path_writes_nothing_outside(tmp_path: Path)
     stream = io.BytesIO()
     writer = McapWriter(stream)
     writer.start("ros2")
-    writer.add_attachment(0, 0, "../../evil.ply", "x", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    channel = writer.register_channel("/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+    writer.add_attachment(
+        0, 0, "../../evil.ply", "x", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"
+    )
+    channel = writer.register_channel(
+        "/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD))
+    )
     writer.add_message(channel, 5, point_cloud2(5, "c", CLOUDS[0].points, None), 5)
     writer.finish()
     inner = tmp_path / "a" / "b"
@@ -234,4 +257,7 @@ def test_an_attachment_with_a_parent_path_writes_nothing_outside(tmp_path: Path)
     for args in (("info",), ("doctor",), ("doctor", "--repair", inner / "out.mcap")):
         done = run(args[0], inner / "a.mcap", *args[1:])
         assert "Traceback" not in done.stderr
-    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) in (["a.mcap"], ["a.mcap", "out.mcap"])
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) in (
+        ["a.mcap"],
+        ["a.mcap", "out.mcap"],
+    )

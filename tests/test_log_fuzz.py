@@ -1,4 +1,5 @@
-"""The short fuzz campaign: mutated bytes give scans or a one-line error, within limits of time and memory.
+"""The short fuzz campaign: mutated bytes give scans or a one-line error, within limits of time and
+memory.
 
 The long one is ``python tests/benchmarks/fuzz_logs.py``; docs/reliability-tests.md has its figures.
 """
@@ -32,7 +33,9 @@ CORPUS = seeds()
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="the campaign limits its processes by means of POSIX")
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="the campaign limits its processes by means of POSIX"
+)
 def test_mutated_files_give_scans_or_one_error_line() -> None:
     tally, findings, peak = campaign(7, list(range(800)), 800)
     assert not findings
@@ -61,7 +64,10 @@ def test_the_seeds_themselves_are_read(tmp_path: Path, name: str) -> None:
 @settings(max_examples=300)
 @given(st.binary(max_size=200), st.sampled_from(["cdr", "ros1"]))
 def test_any_bytes_as_a_message(data: bytes, encoding: str) -> None:
-    """What is read from any bytes is no larger than they are, and finite where it must be; the rest is refused."""
+    """What is read from any bytes is no larger than they are, and finite where it must be.
+
+    The rest is refused.
+    """
     for prefix in (b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"):
         message = prefix + data
         with suppress(BadMessage):
@@ -103,16 +109,35 @@ def test_any_bytes_as_lzf(data: bytes, size: int) -> None:
 
 HEADER_LINES = st.lists(
     st.one_of(
-        st.sampled_from([
-            "format ascii 1.0", "format binary_little_endian 1.0", "element vertex 3", "element face 2", "element x 1",
-            "property float x", "property double y", "property uchar z", "property list uchar int vertex_indices",
-            "property list float double q", "VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1",
-            "WIDTH 2", "HEIGHT 1", "POINTS 2", "DATA ascii", "DATA binary", "DATA binary_compressed",
-        ]),
+        st.sampled_from(
+            [
+                "format ascii 1.0",
+                "format binary_little_endian 1.0",
+                "element vertex 3",
+                "element face 2",
+                "element x 1",
+                "property float x",
+                "property double y",
+                "property uchar z",
+                "property list uchar int vertex_indices",
+                "property list float double q",
+                "VERSION 0.7",
+                "FIELDS x y z",
+                "SIZE 4 4 4",
+                "TYPE F F F",
+                "COUNT 1 1 1",
+                "WIDTH 2",
+                "HEIGHT 1",
+                "POINTS 2",
+                "DATA ascii",
+                "DATA binary",
+                "DATA binary_compressed",
+            ]
+        ),
         st.text(max_size=20),
     ),
     max_size=14,
-)  # fmt: skip
+)
 
 
 @settings(max_examples=300)

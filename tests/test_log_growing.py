@@ -1,4 +1,7 @@
-"""A growing log: scans are replayed when they are complete, and the rows are those of the whole log."""
+"""A growing log.
+
+Scans are replayed when they are complete, and the rows are those of the whole log.
+"""
 
 from __future__ import annotations
 
@@ -120,7 +123,8 @@ def test_a_clock_that_steps_later_makes_the_rows_outdated(tmp_path):
     outdated = growing.outdated()
     with open_source(path) as whole:
         same = [scan.t_ns for scan in whole.scans()] == [used.t_ns for used, _ in growing._used]
-        # the stages were made from the scans of the first opening, whose number depends on the writer
+        # the stages were made from the scans of the first opening, whose number depends on the
+        # writer
         same = same and growing._clock == (whole.first_ns, whole.clock.period_s)
     assert outdated != same
 
@@ -129,7 +133,9 @@ class Written(GrowingLog):
     """A file that is longer by a piece at each look."""
 
     def __init__(self, path, data, count):
-        self.pieces = [bytes(piece) for piece in np.array_split(np.frombuffer(data, np.uint8), count)]
+        self.pieces = [
+            bytes(piece) for piece in np.array_split(np.frombuffer(data, np.uint8), count)
+        ]
         path.write_bytes(self.pieces.pop(0))
         super().__init__(path)
 
@@ -140,8 +146,13 @@ class Written(GrowingLog):
         return super()._advance()
 
 
-def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay(fixtures_folder, tmp_path):
-    """A strong robot arrives before the log ends; the true poses at its arrival come after the plan."""
+def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay(
+    fixtures_folder, tmp_path
+):
+    """A strong robot arrives before the log ends.
+
+    The true poses at its arrival come after the plan.
+    """
     log, settings = fixtures_folder / "tumble.mcap", ("plan.a_max_mps2=5",)
     growing = Written(tmp_path / "log.mcap", log.read_bytes(), 20)
     job = Job(source=log, assignments=settings)
@@ -182,7 +193,9 @@ def test_a_log_written_to_a_pipe_has_the_bytes_of_a_file(tmp_path):
     def write(path):
         with LogWriter(path, LogHeader()) as writer:
             for k in range(5):
-                writer.write(Scan(k, (k + 1) * 10**9, np.ones((9, 3), np.float32), log_ns=(k + 1) * 10**9))
+                writer.write(
+                    Scan(k, (k + 1) * 10**9, np.ones((9, 3), np.float32), log_ns=(k + 1) * 10**9)
+                )
         return writer.bytes
 
     fifo, got = tmp_path / "fifo", []
@@ -209,7 +222,10 @@ def test_a_stream_that_breaks_off_is_a_loss_and_never_taken_for_the_end(log, tmp
     growing = GrowingLog(tmp_path / "stream", Broken(data[: 2 * len(data) // 3], sizes(1, 5000)))
     with Run(Job(source=growing.path, growing=growing)) as run:
         count = len(list(run.rows()))
-        assert any("broke off" in loss.what and "Input/output error" in loss.what for loss in run.source.losses)
+        assert any(
+            "broke off" in loss.what and "Input/output error" in loss.what
+            for loss in run.source.losses
+        )
     with open_source(log) as source:
         assert 1 < count < len(source)
 
@@ -221,8 +237,12 @@ def test_a_stream_that_breaks_off_before_a_scan_states_the_cause(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
-def test_a_stream_whose_folder_is_removed_at_once_writes_nothing_to_the_terminal(tmp_path, monkeypatch, capfd):
-    """A command may end with an error and remove its folder before the thread that copies the stream has begun."""
+def test_a_stream_whose_folder_is_removed_at_once_writes_nothing_to_the_terminal(
+    tmp_path, monkeypatch, capfd
+):
+    """A command may end with an error and remove its folder before the thread that copies the
+    stream has begun.
+    """
     begun = []
     monkeypatch.setattr(threading.Thread, "start", lambda thread: begun.append(thread))
     folder = tmp_path / "folder"

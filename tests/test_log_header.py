@@ -57,18 +57,42 @@ def with_(name: str, new: object) -> Callable[[object], object]:
     return lambda value: {**value, name: new}  # type: ignore[dict-item]
 
 
-@pytest.mark.parametrize(("name", "text"), [
-    ("seed", '"7"'), ("seed", "7.5"), ("seed", "true"), ("seed", "NaN"), ("seed", "[" * 100_000),
-    ("seed", "1" * 10_000),
-    ("labels", "7"), ("labels", '[{"kind": "x"}]'), ("labels", '[{"kind": 1, "start_ns": 0, "end_ns": 1}]'),
-    ("labels", '[{"kind": "x", "start_ns": "0", "end_ns": 1}]'), ("labels", '[{"evil": 1}]'), ("labels", "[null]"),
-    ("notes", "7"), ("notes", "[1]"), ("start", "{}"), ("start", "[1]"), ("truth", '{"q_ab": "x"}'), ("truth", "{"),
-    changed("truth", with_("q_ab", [0, 0, 0, 0])), changed("truth", with_("sigma", [0.5, 1.0])),
-    changed("truth", with_("w_b", [1, 2])), changed("truth", with_("r_a", [1e400, 0, 0])),
-    changed("truth", without("c_b")),
-    ("fixed_frame", "7"), ("fixed_frame", "null"), ("fixed_frame", json.dumps(257 * "m")),
-    changed("start", with_("P", [[1]])), changed("start", with_("x", None)), changed("start", with_("t_ns", "x")),
-])  # fmt: skip
-def test_an_invalid_header_is_rejected_although_its_checksum_is_correct(name: str, text: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("seed", '"7"'),
+        ("seed", "7.5"),
+        ("seed", "true"),
+        ("seed", "NaN"),
+        ("seed", "[" * 100_000),
+        ("seed", "1" * 10_000),
+        ("labels", "7"),
+        ("labels", '[{"kind": "x"}]'),
+        ("labels", '[{"kind": 1, "start_ns": 0, "end_ns": 1}]'),
+        ("labels", '[{"kind": "x", "start_ns": "0", "end_ns": 1}]'),
+        ("labels", '[{"evil": 1}]'),
+        ("labels", "[null]"),
+        ("notes", "7"),
+        ("notes", "[1]"),
+        ("start", "{}"),
+        ("start", "[1]"),
+        ("truth", '{"q_ab": "x"}'),
+        ("truth", "{"),
+        changed("truth", with_("q_ab", [0, 0, 0, 0])),
+        changed("truth", with_("sigma", [0.5, 1.0])),
+        changed("truth", with_("w_b", [1, 2])),
+        changed("truth", with_("r_a", [1e400, 0, 0])),
+        changed("truth", without("c_b")),
+        ("fixed_frame", "7"),
+        ("fixed_frame", "null"),
+        ("fixed_frame", json.dumps(257 * "m")),
+        changed("start", with_("P", [[1]])),
+        changed("start", with_("x", None)),
+        changed("start", with_("t_ns", "x")),
+    ],
+)
+def test_an_invalid_header_is_rejected_although_its_checksum_is_correct(
+    name: str, text: str
+) -> None:
     with pytest.raises(ValueError, match="header record"):
         record.decode_header(signed({**record.encode_header(HEAD), name: text}))

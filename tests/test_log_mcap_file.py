@@ -1,4 +1,7 @@
-"""Damage of every kind, at every place, under every compression: all intact data is read, and each loss is listed."""
+"""Damage of every kind, at every place, under every compression.
+
+All intact data is read, and each loss is listed.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("whole")
     head = header(np.random.Generator(np.random.PCG64(1)))
     for name in COMPRESSIONS:
-        write(folder / f"{name}.mcap", head, CLOUDS, compression=name)  # a chunk a second: two scans each
+        write(
+            folder / f"{name}.mcap", head, CLOUDS, compression=name
+        )  # a chunk a second: two scans each
     return {name: folder / f"{name}.mcap" for name in COMPRESSIONS}
 
 
@@ -73,13 +78,23 @@ def flipped(path: Path, out: Path, at: int, bit: int = 0) -> Path:
 
 @pytest.mark.parametrize("name", COMPRESSIONS)
 @pytest.mark.parametrize("which", [0, 3, -1])
-@pytest.mark.parametrize("place", ["opcode", "length", "start", "size", "crc", "compression", "inner", "data", "end"])
+@pytest.mark.parametrize(
+    "place", ["opcode", "length", "start", "size", "crc", "compression", "inner", "data", "end"]
+)
 def test_a_flipped_bit_loses_only_its_chunk(
     whole: dict[str, Path], tmp_path: Path, name: str, which: int, place: str
 ) -> None:
     spans = chunks(whole[name])
     begin, end = spans[which]
-    offset = {"opcode": 0, "length": 3, "start": 15, "size": 27, "crc": 34, "compression": 37, "inner": 45}
+    offset = {
+        "opcode": 0,
+        "length": 3,
+        "start": 15,
+        "size": 27,
+        "crc": 34,
+        "compression": 37,
+        "inner": 45,
+    }
     at = {"data": (begin + end) // 2, "end": end - 1}.get(place, begin + offset.get(place, 0))
     path = flipped(whole[name], tmp_path / "x.mcap", at, 4)
     found, losses = read(path)
@@ -95,7 +110,9 @@ def test_a_flipped_bit_loses_only_its_chunk(
 
 
 @pytest.mark.parametrize("name", COMPRESSIONS)
-def test_a_truncated_file_gives_every_complete_chunk(whole: dict[str, Path], tmp_path: Path, name: str) -> None:
+def test_a_truncated_file_gives_every_complete_chunk(
+    whole: dict[str, Path], tmp_path: Path, name: str
+) -> None:
     data, spans = whole[name].read_bytes(), chunks(whole[name])
     rng = np.random.Generator(np.random.PCG64(3))
     data_end = data_end_of(data, spans[-1][1])
@@ -116,7 +133,10 @@ def test_inserted_or_removed_bytes_damage_one_place(
 ) -> None:
     data, (begin, end) = whole[name].read_bytes(), chunks(whole[name])[4]
     middle = (begin + end) // 2
-    for broken in (data[:middle] + b"\x06" * size + data[middle:], data[: middle - size] + data[middle:]):
+    for broken in (
+        data[:middle] + b"\x06" * size + data[middle:],
+        data[: middle - size] + data[middle:],
+    ):
         (tmp_path / "x.mcap").write_bytes(broken)
         found, losses = read(tmp_path / "x.mcap")
         assert len(found) == len(CLOUDS) - 2
@@ -124,7 +144,9 @@ def test_inserted_or_removed_bytes_damage_one_place(
         assert losses
 
 
-def test_a_second_log_behind_the_first_one_is_a_loss(whole: dict[str, Path], tmp_path: Path) -> None:
+def test_a_second_log_behind_the_first_one_is_a_loss(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
     data, other = whole["none"].read_bytes(), whole["lz4"].read_bytes()
     for behind, count in ((other, 1), (bytes(1000), 0)):
         (tmp_path / "joined.mcap").write_bytes(data + behind)
@@ -134,7 +156,9 @@ def test_a_second_log_behind_the_first_one_is_a_loss(whole: dict[str, Path], tmp
         assert [(loss.offset, loss.bytes) for loss in losses] == [(len(data), len(other))] * count
 
 
-def test_a_lost_first_chunk_keeps_the_topics_of_the_summary(whole: dict[str, Path], tmp_path: Path) -> None:
+def test_a_lost_first_chunk_keeps_the_topics_of_the_summary(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
     begin, end = chunks(whole["zstd"])[0]
     found, losses = read(flipped(whole["zstd"], tmp_path / "x.mcap", (begin + end) // 2))
     assert len(found) == len(CLOUDS) - 2
@@ -155,19 +179,25 @@ def test_a_lost_first_chunk_of_a_truncated_recording_loses_only_that_chunk(
     assert len(found) == len(CLOUDS) - 4
     assert all(same(scan) for scan in found)
     assert all(scan.truth is not None and scan.body is not None for scan in found)
-    assert sum("definition" in loss.what for loss in losses) == 4  # three channels taken, the labels' one not
+    assert (
+        sum("definition" in loss.what for loss in losses) == 4
+    )  # three channels taken, the labels' one not
 
 
 def test_without_a_summary_nothing_is_lost(whole: dict[str, Path], tmp_path: Path) -> None:
     data = whole["zstd"].read_bytes()
     footer = struct.pack("<BQQQI", mcap.FOOTER, 20, 0, 0, 0)
-    (tmp_path / "x.mcap").write_bytes(data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MAGIC)
+    (tmp_path / "x.mcap").write_bytes(
+        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MAGIC
+    )
     found, losses = read(tmp_path / "x.mcap")
     assert len(found) == len(CLOUDS)
     assert not losses
 
 
-def test_a_damaged_model_is_a_loss_and_not_a_wrong_model(whole: dict[str, Path], tmp_path: Path) -> None:
+def test_a_damaged_model_is_a_loss_and_not_a_wrong_model(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
     at = whole["zstd"].read_bytes().index(b"property double x")
     path = flipped(whole["zstd"], tmp_path / "x.mcap", at + 200)
     with open_source(path) as source:
@@ -176,7 +206,9 @@ def test_a_damaged_model_is_a_loss_and_not_a_wrong_model(whole: dict[str, Path],
         assert len(list(source.scans())) == len(CLOUDS)
 
 
-def test_a_damaged_header_record_is_a_loss_and_not_a_wrong_header(whole: dict[str, Path], tmp_path: Path) -> None:
+def test_a_damaged_header_record_is_a_loss_and_not_a_wrong_header(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
     at = whole["zstd"].read_bytes().index(b'"strength"')
     path = flipped(whole["zstd"], tmp_path / "x.mcap", at + 1)
     with open_source(path) as source:
@@ -184,7 +216,9 @@ def test_a_damaged_header_record_is_a_loss_and_not_a_wrong_header(whole: dict[st
         assert "header record" in source.losses[0].what
 
 
-def test_a_chunk_that_declares_too_many_bytes_is_not_read(whole: dict[str, Path], tmp_path: Path) -> None:
+def test_a_chunk_that_declares_too_many_bytes_is_not_read(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
     data, (begin, _) = bytearray(whole["zstd"].read_bytes()), chunks(whole["zstd"])[2]
     struct.pack_into("<Q", data, begin + 25, 1 << 60)
     (tmp_path / "x.mcap").write_bytes(data)
@@ -201,7 +235,11 @@ def test_a_decompression_bomb_is_rejected(tmp_path: Path, compression: str) -> N
     squeeze = zstandard.compress if compression == "zstd" else lz4.frame.compress
     bomb = squeeze(bytes(64 << 20))
     for promised in (1000, 64 << 20):
-        head = struct.pack("<QQQI", 0, 1, promised, 0) + struct.pack("<I", len(compression)) + compression.encode()
+        head = (
+            struct.pack("<QQQI", 0, 1, promised, 0)
+            + struct.pack("<I", len(compression))
+            + compression.encode()
+        )
         chunk = head + struct.pack("<Q", len(bomb)) + bomb
         record = struct.pack("<BQ", mcap.CHUNK, len(chunk)) + chunk
         intact = tmp_path / "good.mcap"
@@ -223,7 +261,9 @@ def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -
 
     size = 32 << 20
     packed = zstandard.compress(bytes(size))
-    chunk = struct.pack("<QQQII", 0, 1, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    chunk = (
+        struct.pack("<QQQII", 0, 1, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    )
     record = struct.pack("<BQ", mcap.CHUNK, len(chunk)) + chunk
     intact = tmp_path / "good.mcap"
     write(intact, LogHeader(), CLOUDS[:4])
@@ -247,9 +287,13 @@ def test_a_file_without_chunks_is_read_beyond_damage(tmp_path: Path) -> None:
         writer = Writer(file, use_chunking=False, compression=CompressionType.NONE)
         writer.start("ros2")
         kind = "sensor_msgs/msg/PointCloud2"
-        channel = writer.register_channel("/p", "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind)))
+        channel = writer.register_channel(
+            "/p", "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind))
+        )
         for c in CLOUDS:
-            writer.add_message(channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns)
+            writer.add_message(
+                channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns
+            )
         writer.finish()
     found, losses = read(tmp_path / "flat.mcap")
     assert len(found) == len(CLOUDS)
@@ -265,7 +309,8 @@ def test_a_file_without_chunks_is_read_beyond_damage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"\x89MCAP0", b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"hello world, no log", bytes(4096)]
+    "content",
+    [b"", b"\x89MCAP0", b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"hello world, no log", bytes(4096)],
 )
 def test_a_file_of_another_format_gives_one_error_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "x.mcap").write_bytes(content)
@@ -319,7 +364,9 @@ def test_times_between_chunks_do_not_matter_to_the_order(tmp_path: Path) -> None
     assert found[0].t_ns == SECOND
 
 
-@pytest.mark.parametrize("what", ["private records", "bad chunks", "chunk heads", "index records", "noise"])
+@pytest.mark.parametrize(
+    "what", ["private records", "bad chunks", "chunk heads", "index records", "noise"]
+)
 @pytest.mark.slow
 def test_the_work_for_hostile_bytes_grows_with_their_number(tmp_path: Path, what: str) -> None:
     """Records that make a careless search quadratic."""
@@ -330,7 +377,9 @@ def test_the_work_for_hostile_bytes_grows_with_their_number(tmp_path: Path, what
         "bad chunks": struct.pack("<BQ", mcap.CHUNK, len(empty)) + empty + b"\x11",
         "chunk heads": struct.pack("<BQ", mcap.CHUNK, 1 << 40) + empty,
         "index records": struct.pack("<BQ", mcap.MESSAGE_INDEX, 6) + struct.pack("<HI", 1, 0),
-        "noise": np.random.Generator(np.random.PCG64(1)).integers(0, 256, 4096, dtype=np.uint8).tobytes(),
+        "noise": np.random.Generator(np.random.PCG64(1))
+        .integers(0, 256, 4096, dtype=np.uint8)
+        .tobytes(),
     }
     assert_linear(tmp_path / "x.mcap", mcap.MAGIC, pieces[what])
 
@@ -342,15 +391,23 @@ def test_the_work_for_a_hostile_bag_grows_with_its_size(tmp_path: Path, what: st
     head = b"".join(struct.pack("<I", len(f)) + f for f in fields)
     pieces = {
         "chunk marks": b"\x04\x00\x00\x00op=\x05",
-        "bad chunks": struct.pack("<I", len(head)) + head + struct.pack("<I", 3) + b"xyz" + b"\xff" * 5,
-        "noise": np.random.Generator(np.random.PCG64(1)).integers(0, 256, 4096, dtype=np.uint8).tobytes(),
+        "bad chunks": struct.pack("<I", len(head))
+        + head
+        + struct.pack("<I", 3)
+        + b"xyz"
+        + b"\xff" * 5,
+        "noise": np.random.Generator(np.random.PCG64(1))
+        .integers(0, 256, 4096, dtype=np.uint8)
+        .tobytes(),
     }
     assert_linear(tmp_path / "x.bag", b"#ROSBAG V2.0\n", pieces[what])
 
 
 def assert_linear(path: Path, head: bytes, piece: bytes) -> None:
     """Four times the bytes need at most five times the calls and the copied bytes."""
-    calls, read = np.transpose([work(path, head + piece * (size // len(piece))) for size in (1 << 18, 1 << 20)])
+    calls, read = np.transpose(
+        [work(path, head + piece * (size // len(piece))) for size in (1 << 18, 1 << 20)]
+    )
     assert calls[1] <= 5 * calls[0] + 1000
     assert read[1] <= 5 * read[0] + (1 << 16)
 
@@ -382,16 +439,25 @@ def test_an_attachment_over_the_limit_is_skipped(tmp_path: Path) -> None:
     from avsreplay.log.cdr import point_cloud2, schema_text
 
     rng = np.random.Generator(np.random.PCG64(2))
-    inner = [Scan(i, t, rng.normal(size=(9000, 3)).astype(np.float32), log_ns=t) for i, t in enumerate(range(1, 40))]
+    inner = [
+        Scan(i, t, rng.normal(size=(9000, 3)).astype(np.float32), log_ns=t)
+        for i, t in enumerate(range(1, 40))
+    ]
     write(tmp_path / "inner.mcap", LogHeader(), inner, compression="none", chunk_bytes=300_000)
     kind = "sensor_msgs/msg/PointCloud2"
     with (tmp_path / "x.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
-        writer.add_attachment(0, 0, "inner.mcap", "application/octet-stream", (tmp_path / "inner.mcap").read_bytes())
-        channel = writer.register_channel("/p", "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind)))
+        writer.add_attachment(
+            0, 0, "inner.mcap", "application/octet-stream", (tmp_path / "inner.mcap").read_bytes()
+        )
+        channel = writer.register_channel(
+            "/p", "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind))
+        )
         for c in CLOUDS:
-            writer.add_message(channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns)
+            writer.add_message(
+                channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns
+            )
         writer.finish()
     found, losses = read(tmp_path / "x.mcap", max_message_mib=2)
     assert len(found) == len(CLOUDS)

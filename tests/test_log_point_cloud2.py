@@ -20,22 +20,45 @@ ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC
 
 
 def message(  # type: ignore[no-untyped-def]
-    fields, raw: bytes, width: int, height: int, step: int, row: int, big: bool = False, encoding: str = "cdr"
+    fields,
+    raw: bytes,
+    width: int,
+    height: int,
+    step: int,
+    row: int,
+    big: bool = False,
+    encoding: str = "cdr",
 ) -> bytes:
     """A message as rosbags serialises it: (name, offset, numpy kind) a field."""
     store = ROS1 if encoding == "ros1" else ROS2
     t = store.types
     header_type, time_type = t["std_msgs/msg/Header"], t["builtin_interfaces/msg/Time"]
     stamp = time_type(sec=12, nanosec=345)
-    header = header_type(seq=3, stamp=stamp, frame_id="lidär") if encoding == "ros1" else header_type(stamp, "lidär")
-    made = [t["sensor_msgs/msg/PointField"](name=n, offset=o, datatype=CODES[k], count=1) for n, o, k in fields]
+    header = (
+        header_type(seq=3, stamp=stamp, frame_id="lidär")
+        if encoding == "ros1"
+        else header_type(stamp, "lidär")
+    )
+    made = [
+        t["sensor_msgs/msg/PointField"](name=n, offset=o, datatype=CODES[k], count=1)
+        for n, o, k in fields
+    ]
     cloud = t["sensor_msgs/msg/PointCloud2"](
-        header=header, height=height, width=width, fields=made, is_bigendian=big, point_step=step, row_step=row,
-        data=np.frombuffer(raw, np.uint8), is_dense=False,
-    )  # fmt: skip
+        header=header,
+        height=height,
+        width=width,
+        fields=made,
+        is_bigendian=big,
+        point_step=step,
+        row_step=row,
+        data=np.frombuffer(raw, np.uint8),
+        is_dense=False,
+    )
     if encoding == "ros1":
         return bytes(store.serialize_ros1(cloud, "sensor_msgs/msg/PointCloud2"))
-    return bytes(store.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2", little_endian=encoding == "cdr"))
+    return bytes(
+        store.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2", little_endian=encoding == "cdr")
+    )
 
 
 @settings(max_examples=60)
@@ -97,7 +120,9 @@ def test_the_order_of_points_without_times_counts_those_that_are_left_out() -> N
     cloud = decode_cloud(point_cloud2(5, "c", points, None))
     assert cloud.places is not None
     np.testing.assert_allclose(cloud.places, [0.0, 0.1, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9], atol=1e-7)
-    assert decode_cloud(point_cloud2(5, "c", points, np.arange(10, dtype=np.float32))).places is None
+    assert (
+        decode_cloud(point_cloud2(5, "c", points, np.arange(10, dtype=np.float32))).places is None
+    )
 
 
 @pytest.mark.parametrize("duration_s", [0.5, -0.5])
@@ -107,11 +132,15 @@ def test_the_duration_of_a_scan_gives_times_by_the_order_of_the_points(duration_
     options = SourceOptions(scan_duration_s=duration_s, crop_range=(8.0, 1e3))
     found = selected(decode_cloud(point_cloud2(5, "c", points, None)), options)
     np.testing.assert_array_equal(found.points, points[[2, 4, 5, 6, 7, 8, 9]])
-    np.testing.assert_allclose(found.times_s, duration_s * np.array([0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]), atol=1e-7)
+    np.testing.assert_allclose(
+        found.times_s, duration_s * np.array([0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]), atol=1e-7
+    )
     assert found.places is None
     given = np.arange(10, dtype=np.float32)
     own = selected(decode_cloud(point_cloud2(5, "c", points, given)), options)
-    np.testing.assert_array_equal(own.times_s, given[[2, 4, 5, 6, 7, 8, 9]])  # times of the message are kept
+    np.testing.assert_array_equal(
+        own.times_s, given[[2, 4, 5, 6, 7, 8, 9]]
+    )  # times of the message are kept
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
@@ -126,7 +155,9 @@ def test_points_that_are_too_far_away_are_left_out_and_counted(kind: str) -> Non
 
 def test_time_fields_in_all_their_forms() -> None:
     stamp = 1_600_000_000_500_000_000
-    base = np.zeros(4, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u8")])  # room for any
+    base = np.zeros(
+        4, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u8")]
+    )  # room for any
 
     def times(name: str, kind: str, values: object) -> np.ndarray:  # type: ignore[type-arg]
         table = np.zeros(4, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<" + kind)])
@@ -160,10 +191,24 @@ def test_every_prefix_of_a_message_is_rejected() -> None:
     ("what", "fields", "width", "height", "step", "row"),
     [
         ("in 120 bytes", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4")], 2**32 - 1, 1, 12, 12),
-        ("in 120 bytes", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4")], 2**28, 2**31, 12, 2**32 - 1),
+        (
+            "in 120 bytes",
+            [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4")],
+            2**28,
+            2**31,
+            12,
+            2**32 - 1,
+        ),
         ("row_step", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4")], 5, 2, 12, 12),
         ("past point_step", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 10, "f4")], 10, 1, 12, 120),
-        ("past point_step", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 2**32 - 4, "f4")], 10, 1, 12, 120),
+        (
+            "past point_step",
+            [("x", 0, "f4"), ("y", 4, "f4"), ("z", 2**32 - 4, "f4")],
+            10,
+            1,
+            12,
+            120,
+        ),
         ("past point_step", [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4")], 10, 1, 0, 0),
         ("overlap", [("x", 0, "f4"), ("y", 2, "f4"), ("z", 8, "f4")], 10, 1, 12, 120),
         ("no field 'z'", [("x", 0, "f4"), ("y", 4, "f4")], 10, 1, 12, 120),

@@ -1,4 +1,7 @@
-"""Folders of scans in every format, their order, times and poses; models; real data if it is available."""
+"""Folders of scans in every format, their order, times and poses; models.
+
+Real data if it is available.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,17 @@ def read(path: Path, **options: object) -> list[Scan]:
         return list(true_scans(source))
 
 
-FORMATS = ["ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "packed.pcd", "kitti.bin", "a.npy", "a.npz"]
+FORMATS = [
+    "ascii.ply",
+    "little.ply",
+    "big.ply",
+    "ascii.pcd",
+    "binary.pcd",
+    "packed.pcd",
+    "kitti.bin",
+    "a.npy",
+    "a.npz",
+]
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -68,10 +81,14 @@ def test_scans_are_ordered_by_number_at_one_hertz(tmp_path: Path) -> None:
     found = read(tmp_path)
     assert [s.points[0, 0] for s in found] == [0, 2, 9, 10, 100]
     assert [s.t_ns - found[0].t_ns for s in found] == [i * SECOND for i in range(5)]
-    assert [s.t_ns - found[0].t_ns for s in read(tmp_path, rate_hz=5.0)] == [i * SECOND // 5 for i in range(5)]
+    assert [s.t_ns - found[0].t_ns for s in read(tmp_path, rate_hz=5.0)] == [
+        i * SECOND // 5 for i in range(5)
+    ]
     thinned = read(tmp_path, every=2)
     assert [s.points[0, 0] for s in thinned] == [0, 9, 100]
-    assert [s.t_ns for s in thinned] == [s.t_ns for s in found][::2], "every second scan keeps its own time"
+    assert [s.t_ns for s in thinned] == [s.t_ns for s in found][::2], (
+        "every second scan keeps its own time"
+    )
 
 
 def test_the_file_of_the_model_is_not_a_scan(tmp_path: Path) -> None:
@@ -86,7 +103,9 @@ def test_the_file_of_the_model_is_not_a_scan(tmp_path: Path) -> None:
 def test_times_from_a_file_from_names_and_from_poses(tmp_path: Path) -> None:
     for stem in ("0", "1", "2"):
         np.save(tmp_path / f"{stem}.npy", POINTS)
-    (tmp_path / "poses.tum").write_text("".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in ("7.0", "7.125", "9.000000001")))
+    (tmp_path / "poses.tum").write_text(
+        "".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in ("7.0", "7.125", "9.000000001"))
+    )
     found = read(tmp_path)
     assert [s.t_ns for s in found] == [7_000_000_000, 7_125_000_000, 9_000_000_001]
     assert [s.truth.t[2] for s in found] == [7.0, 7.125, 9.000000001]
@@ -121,14 +140,25 @@ def test_a_conf_file_uses_the_conjugate_quaternion_and_names_the_scans(tmp_path:
     np.save(tmp_path / "s2.npy", POINTS)
     np.save(tmp_path / "unnamed.npy", POINTS)
     words = " ".join(repr(float(v)) for v in (*t, *q))
-    (tmp_path / "a.conf").write_text(f"camera 0 0 0 0 0 0 1\nmesh whole 1 2 3 0 0 0 1\nbmesh s2.npy {words}\r\n")
+    (tmp_path / "a.conf").write_text(
+        f"camera 0 0 0 0 0 0 1\nmesh whole 1 2 3 0 0 0 1\nbmesh s2.npy {words}\r\n"
+    )
     (scan,) = read(tmp_path)
     in_model = POINTS.astype(np.float64) @ geometry.matrix(q) + t  # row vectors: R' p
     np.testing.assert_allclose(scan.truth.inverse().apply(scan.points), in_model, atol=1e-12)
 
 
-@pytest.mark.parametrize("line", ["bmesh s.npy 0 0 0 0 0 1", "bmesh s.npy 0 0 0 0 0 0 0", "bmesh s.npy a b c d e f g",
-                                  "bmesh gone.npy 0 0 0 0 0 0 1", "bmesh ../s.npy 0 0 0 0 0 0 1", "bmesh"])  # fmt: skip
+@pytest.mark.parametrize(
+    "line",
+    [
+        "bmesh s.npy 0 0 0 0 0 1",
+        "bmesh s.npy 0 0 0 0 0 0 0",
+        "bmesh s.npy a b c d e f g",
+        "bmesh gone.npy 0 0 0 0 0 0 1",
+        "bmesh ../s.npy 0 0 0 0 0 0 1",
+        "bmesh",
+    ],
+)
 def test_a_malformed_conf_file(tmp_path: Path, line: str) -> None:
     np.save(tmp_path / "s.npy", POINTS)
     (tmp_path / "a.conf").write_text(line + "\n")
@@ -161,7 +191,12 @@ def test_a_file_that_cannot_be_read_is_a_damaged_scan(tmp_path: Path) -> None:
     np.save(tmp_path / "2.npy", np.full((3, 3), np.nan))
     np.save(tmp_path / "3.npy", np.zeros((4, 2)))
     found = read(tmp_path)
-    assert [s.status for s in found] == [ScanStatus.OK, ScanStatus.DAMAGED, ScanStatus.EMPTY, ScanStatus.DAMAGED]
+    assert [s.status for s in found] == [
+        ScanStatus.OK,
+        ScanStatus.DAMAGED,
+        ScanStatus.EMPTY,
+        ScanStatus.DAMAGED,
+    ]
     assert "1.npy" in found[1].note
 
 
@@ -170,23 +205,39 @@ def test_lzf_against_a_reference_implementation() -> None:
     assert unpack_lzf(b"\x00a\x20\x00", 4) == b"aaaa", "a reference that overlaps what it writes"
     assert unpack_lzf(b"\x02abc\x20\x02", 6) == b"abcabc"
     assert unpack_lzf(b"\x00a\xe0\x03\x00", 13) == b"a" * 13
-    for bad, size in ((b"\x20\x00", 3), (b"\x00a\x20\x01", 4), (b"\x05abc", 6), (b"\x00a\xe0", 9), (b"\x02abc", 2)):
+    for bad, size in (
+        (b"\x20\x00", 3),
+        (b"\x00a\x20\x01", 4),
+        (b"\x05abc", 6),
+        (b"\x00a\xe0", 9),
+        (b"\x02abc", 2),
+    ):
         with pytest.raises(BadFile):
             unpack_lzf(bad, size)
 
 
-@pytest.mark.parametrize("change", [
-    ("POINTS 24", "POINTS 4294967296"), ("WIDTH 24", "WIDTH 99999999999999999999"), ("SIZE 4", "SIZE 5"),
-    ("TYPE F", "TYPE Q"), ("COUNT 1", "COUNT 0"), ("DATA binary_compressed", "DATA zip"), ("FIELDS x", "FIELDS q"),
-    ("WIDTH 24", "WIDTH -1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("POINTS 24", "POINTS 4294967296"),
+        ("WIDTH 24", "WIDTH 99999999999999999999"),
+        ("SIZE 4", "SIZE 5"),
+        ("TYPE F", "TYPE Q"),
+        ("COUNT 1", "COUNT 0"),
+        ("DATA binary_compressed", "DATA zip"),
+        ("FIELDS x", "FIELDS q"),
+        ("WIDTH 24", "WIDTH -1"),
+    ],
+)
 def test_pcd_headers_with_wrong_sizes(change: tuple[str, str]) -> None:
     with pytest.raises(BadFile):
         read_pcd(SEEDS["packed.pcd"].replace(change[0].encode(), change[1].encode(), 1))
 
 
 def test_a_pcd_that_declares_too_many_bytes() -> None:
-    data = bytearray(SEEDS["packed.pcd"].replace(b"WIDTH 24", b"WIDTH 99").replace(b"POINTS 24", b"POINTS 99"))
+    data = bytearray(
+        SEEDS["packed.pcd"].replace(b"WIDTH 24", b"WIDTH 99").replace(b"POINTS 24", b"POINTS 99")
+    )
     at = data.index(b"binary_compressed\n") + 18
     struct.pack_into("<I", data, at + 4, 99 * 13)
     with pytest.raises(BadFile, match="declares"):
@@ -213,25 +264,32 @@ def test_models_of_every_format_are_the_same_box(kind: str) -> None:
 
 def test_an_obj_is_read_without_its_material_files(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text(
-        "mtllib ../../etc/nothing.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1/1 2 3\nf 1 1 2\n"
+        "mtllib ../../etc/nothing.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1/1 2 3\nf 1"
+        " 1 2\n"
     )
     surface = read_surface(tmp_path / "a.obj")
     assert surface.faces.tolist() == [[0, 1, 2]], "the triangle without an area is left out"
 
 
-ONE_VERTEX = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+ONE_VERTEX = (
+    b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty"
+    b" float z\n"
+)
 
 
-@pytest.mark.parametrize(("name", "content", "what"), [
-    ("a.ply", b"", "empty"),
-    ("a.stl", b"\x00" * 80 + b"\xff\xff\xff\xff", "declares"),
-    ("a.xyz", b"1 2 3", "not a known model format"),
-    ("a.ply", ONE_VERTEX + b"end_header\n1 2 3\n", "no faces"),
-    ("a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
-    ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "OBJ|not there"),
-    ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
-    ("a.glb", b"glTF\x02\x00\x00\x00", "GLB"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("a.ply", b"", "empty"),
+        ("a.stl", b"\x00" * 80 + b"\xff\xff\xff\xff", "declares"),
+        ("a.xyz", b"1 2 3", "not a known model format"),
+        ("a.ply", ONE_VERTEX + b"end_header\n1 2 3\n", "no faces"),
+        ("a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "OBJ|not there"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
+        ("a.glb", b"glTF\x02\x00\x00\x00", "GLB"),
+    ],
+)
 def test_invalid_models_are_rejected(tmp_path: Path, name: str, content: bytes, what: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UnreadableInput, match=what) as caught:
@@ -268,7 +326,10 @@ def test_a_cloud_is_accepted_as_a_model_if_requested(tmp_path: Path) -> None:
 
 
 def test_quads_and_mixed_polygons_become_triangles() -> None:
-    head = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    head = (
+        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty"
+        " float z\n"
+    )
     text = (
         head
         + "element face 2\nproperty list uchar int vertex_index\nend_header\n"
@@ -281,12 +342,25 @@ def test_quads_and_mixed_polygons_become_triangles() -> None:
 # --- the real data ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("folder", "first", "in_model", "count"), [
-    ("stanford-bunny", (-0.0075, 0.0342091, 0.0703997), (-0.0189424, 0.0346889, 0.0511931), 10),
-    ("stanford-dragon", (0.0382738, 0.0532166, 0.0375062), (0.0494966, 0.053107, 0.0175492), 15),
-])  # fmt: skip
-def test_the_stanford_scans(folder: str, first: tuple[float, ...], in_model: tuple[float, ...], count: int) -> None:
-    """The worked values of the data's own notes: the first vertex of one scan, in the scan and in the model."""
+@pytest.mark.parametrize(
+    ("folder", "first", "in_model", "count"),
+    [
+        ("stanford-bunny", (-0.0075, 0.0342091, 0.0703997), (-0.0189424, 0.0346889, 0.0511931), 10),
+        (
+            "stanford-dragon",
+            (0.0382738, 0.0532166, 0.0375062),
+            (0.0494966, 0.053107, 0.0175492),
+            15,
+        ),
+    ],
+)
+def test_the_stanford_scans(
+    folder: str, first: tuple[float, ...], in_model: tuple[float, ...], count: int
+) -> None:
+    """The worked values of the data's own notes.
+
+    The first vertex of one scan, in the scan and in the model.
+    """
     found = read(shared(folder))
     assert len(found) == count
     assert all(s.truth is not None for s in found)
@@ -297,13 +371,18 @@ def test_the_stanford_scans(folder: str, first: tuple[float, ...], in_model: tup
 def test_the_dragon_turns_24_degrees_a_scan() -> None:
     found = read(shared("stanford-dragon"))
     for one, two in pairwise(found):
-        turn = np.degrees(geometry.angle(geometry.multiply(two.truth.q, geometry.conjugate(one.truth.q))))
+        turn = np.degrees(
+            geometry.angle(geometry.multiply(two.truth.q, geometry.conjugate(one.truth.q)))
+        )
         assert 23.8 < turn < 24.2
 
 
 def test_the_kinect_scene() -> None:
     found = read(shared("kinect-milk-scene"))
-    assert [(len(s.points), s.dropped_points) for s in found] == [(12575, 0), (307200 - 65793, 65793)]
+    assert [(len(s.points), s.dropped_points) for s in found] == [
+        (12575, 0),
+        (307200 - 65793, 65793),
+    ]
     assert found[1].points[:, 2].max() < 0
 
 
@@ -315,7 +394,10 @@ def test_the_luminar_bag_uses_its_header_clock() -> None:
     assert [len(s.points) for s in found] == [35707, 36055, 36267, 36457, 36336]
     assert [s.t_ns for s in found][:2] == [1583971570015299642, 1583971570115569166]
     assert found[0].log_ns == 1604515190231374463
-    low, high = np.min([s.points.min(0) for s in found], 0), np.max([s.points.max(0) for s in found], 0)
+    low, high = (
+        np.min([s.points.min(0) for s in found], 0),
+        np.max([s.points.max(0) for s in found], 0),
+    )
     np.testing.assert_allclose(low, (-210, 4.6, -17.6), atol=0.6)
     np.testing.assert_allclose(high, (198, 251, 7.9), atol=0.6)
     assert all(np.ptp(s.times_s) < 0.2 for s in found), "two integer fields make one time"
@@ -327,10 +409,15 @@ def test_the_ouster_bag_has_packets_and_no_clouds() -> None:
     assert caught.value.exit_code == 3
 
 
-@pytest.mark.parametrize(("name", "counts"), [
-    ("cdr_test", {"/array_topic": 4, "/test_topic": 3}), ("rewriter_a", {"a_empty": 100, "b_basictypes": 50}),
-    ("multiple_files", {"/chatter": 3177}), ("test_bag_for_seek", {"topic1": 5}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("cdr_test", {"/array_topic": 4, "/test_topic": 3}),
+        ("rewriter_a", {"a_empty": 100, "b_basictypes": 50}),
+        ("multiple_files", {"/chatter": 3177}),
+        ("test_bag_for_seek", {"topic1": 5}),
+    ],
+)
 def test_the_bags_of_rosbag2(name: str, counts: dict[str, int]) -> None:
     with open_source(shared(f"mcap-rosbag2/{name}"), inspect=True) as source:
         assert not source.losses

@@ -1,4 +1,7 @@
-"""Logs of other writers: ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form."""
+"""Logs of other writers.
+
+ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,11 @@ from avsreplay.log.doctor import examine
 from avsreplay.records import Scan, ScanStatus
 
 CLOUDS = scans(12, 150)
-CLOUD, POSE, TF = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
+CLOUD, POSE, TF = (
+    "sensor_msgs/msg/PointCloud2",
+    "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+)
 
 
 def pose(i: int) -> Pose:
@@ -63,13 +70,24 @@ def header1(c: Scan, frame: str) -> bytes:
 
 def cloud1(c: Scan) -> bytes:
     """The wire form of ROS 1, by hand."""
-    fields = b"".join(text1(name) + struct.pack("<IBI", 4 * i, 7, 1) for i, name in enumerate("xyz"))
+    fields = b"".join(
+        text1(name) + struct.pack("<IBI", 4 * i, 7, 1) for i, name in enumerate("xyz")
+    )
     data = np.ascontiguousarray(c.points).tobytes()
     sizes = struct.pack("<?II", False, 12, len(data)) + struct.pack("<I", len(data))
-    return header1(c, "camera") + struct.pack("<III", 1, len(c.points), 3) + fields + sizes + data + b"\x01"
+    return (
+        header1(c, "camera")
+        + struct.pack("<III", 1, len(c.points), 3)
+        + fields
+        + sizes
+        + data
+        + b"\x01"
+    )
 
 
-def bag1(path: Path, compression: Ros1Writer.CompressionFormat | None = None, chunk: int = 1 << 20) -> Path:
+def bag1(
+    path: Path, compression: Ros1Writer.CompressionFormat | None = None, chunk: int = 1 << 20
+) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Ros1Writer(path)
     if compression is not None:
@@ -80,7 +98,9 @@ def bag1(path: Path, compression: Ros1Writer.CompressionFormat | None = None, ch
         truth = writer.add_connection("/gt", POSE, typestore=store)
         for i, c in enumerate(CLOUDS):
             writer.write(cloud, c.log_ns, cloud1(c))
-            writer.write(truth, c.log_ns, header1(c, "camera") + struct.pack("<7d", *pose(i).t, *pose(i).q))
+            writer.write(
+                truth, c.log_ns, header1(c, "camera") + struct.pack("<7d", *pose(i).t, *pose(i).q)
+            )
     return path
 
 
@@ -117,7 +137,9 @@ def test_ros1_bags(tmp_path: Path, compression: Ros1Writer.CompressionFormat | N
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 @pytest.mark.parametrize("lone", [False, True])
-def test_ros2_bags_as_a_folder_and_as_a_lone_file(tmp_path: Path, plugin: StoragePlugin, lone: bool) -> None:
+def test_ros2_bags_as_a_folder_and_as_a_lone_file(
+    tmp_path: Path, plugin: StoragePlugin, lone: bool
+) -> None:
     folder = bag2(tmp_path / "bag", plugin)
     path = next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap")) if lone else folder
     check(read(path, truth_topic="/gt"))
@@ -131,7 +153,8 @@ def test_a_split_bag_is_one_log_in_the_order_of_its_numbers(tmp_path: Path) -> N
         mcap(folder / f"bag_{number}.mcap", parts[start : start + 1])
     check(read(folder), with_truth=False)
     (folder / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  relative_file_paths:\n" + "".join(f"    - bag_{n}.mcap\n" for n in range(13))
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n"
+        + "".join(f"    - bag_{n}.mcap\n" for n in range(13))
     )
     with open_source(folder) as source:
         assert len(source) == 12
@@ -146,7 +169,9 @@ def test_a_truncated_ros1_bag_gives_its_complete_chunks(tmp_path: Path, share: f
         found = list(true_scans(source))
         assert bool(source.losses) == (share < 0.95)  # behind that only the index is cut
     assert len(found) >= int(12 * share) - 3
-    assert all(s.points.tobytes() == c.points.tobytes() for s, c in zip(found, CLOUDS, strict=False))
+    assert all(
+        s.points.tobytes() == c.points.tobytes() for s, c in zip(found, CLOUDS, strict=False)
+    )
 
 
 def test_a_damaged_chunk_of_a_ros1_bag_loses_only_that_chunk(tmp_path: Path) -> None:
@@ -167,7 +192,9 @@ def test_a_damaged_chunk_of_a_ros1_bag_loses_only_that_chunk(tmp_path: Path) -> 
 def test_a_database_with_damaged_pages_gives_what_can_be_read(tmp_path: Path, leaf: int) -> None:
     path = next(bag2(tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3"))
     data = bytearray(path.read_bytes())
-    rows = [at for at in range(6 * 4096, len(data), 4096) if data[at] == 0x0D]  # leaves of the table of messages
+    rows = [
+        at for at in range(6 * 4096, len(data), 4096) if data[at] == 0x0D
+    ]  # leaves of the table of messages
     data[rows[leaf] : rows[leaf] + 4096] = bytes(4096)
     path.write_bytes(data)
     with open_source(path) as source:
@@ -185,13 +212,23 @@ def test_a_truncated_database_is_reported_with_a_hint(tmp_path: Path) -> None:
         open_source(path)
 
 
-@pytest.mark.parametrize("stamps", [(2**63 - 2, 2**63 - 1), (0, 2**63 - 1), (5, 2**62), (-(2**63), 2**62)])
-def test_times_that_ros_cannot_hold_are_cut_and_can_be_recorded(stamps: tuple[int, int], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "stamps", [(2**63 - 2, 2**63 - 1), (0, 2**63 - 1), (5, 2**62), (-(2**63), 2**62)]
+)
+def test_times_that_ros_cannot_hold_are_cut_and_can_be_recorded(
+    stamps: tuple[int, int], tmp_path: Path
+) -> None:
     """sqlite stores 64 bits of nanoseconds, ROS 2 and with it every log 31 bits of seconds."""
     path = tmp_path / "x.db3"
     with closing(sqlite3.connect(path)) as db:
-        db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
-        db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        db.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format"
+            " TEXT)"
+        )
+        db.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+            " data BLOB)"
+        )
         db.execute("INSERT INTO topics VALUES(1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr')")
         for k, stamp in enumerate(stamps * 2):
             payload = point_cloud2(0, "c", np.ones((5, 3), np.float32), None)
@@ -205,16 +242,22 @@ def test_times_that_ros_cannot_hold_are_cut_and_can_be_recorded(stamps: tuple[in
         assert len(list(again.scans())) == 4
 
 
-@pytest.mark.parametrize("schema", [
-    "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c)"
-    " SELECT x AS id, 1 AS topic_id, x AS timestamp, x AS data FROM c",
-    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT,"
-    " data BLOB GENERATED ALWAYS AS (zeroblob(id)))",
-    "CREATE TABLE something_else(id INTEGER)",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "schema",
+    [
+        "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c)"
+        " SELECT x AS id, 1 AS topic_id, x AS timestamp, x AS data FROM c",
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT,"
+        " data BLOB GENERATED ALWAYS AS (zeroblob(id)))",
+        "CREATE TABLE something_else(id INTEGER)",
+    ],
+)
 def test_a_database_that_is_not_a_bag(tmp_path: Path, schema: str) -> None:
     with sqlite3.connect(tmp_path / "x.db3") as db:
-        db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        db.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format"
+            " TEXT)"
+        )
         db.execute(schema)
     with pytest.raises(UnreadableInput, match="without the table 'messages'"):
         open_source(tmp_path / "x.db3")
@@ -257,9 +300,12 @@ def test_a_truth_topic_that_is_missing_or_not_a_pose(tmp_path: Path) -> None:
 def test_truth_is_interpolated_between_stamps_but_not_across_a_gap(tmp_path: Path) -> None:
     start, half = CLOUDS[0].t_ns, SECOND // 4
     a, b = pose(0), pose(3)
-    messages = [*clouds(), ("/gt", POSE, 1, pose_stamped(start - half, "c", a)),
-                ("/gt", POSE, 2, pose_stamped(start + half, "c", b)),
-                ("/gt", POSE, 3, pose_stamped(start + 9 * SECOND, "c", b))]  # fmt: skip
+    messages = [
+        *clouds(),
+        ("/gt", POSE, 1, pose_stamped(start - half, "c", a)),
+        ("/gt", POSE, 2, pose_stamped(start + half, "c", b)),
+        ("/gt", POSE, 3, pose_stamped(start + 9 * SECOND, "c", b)),
+    ]
     found = read(mcap(tmp_path / "a.mcap", messages), truth_topic="/gt", truth_gap_s=0.6)
     middle = Pose(Slerp([0, 1], Rotation.from_quat([a.q, b.q]))(0.5).as_quat(), 0.5 * (a.t + b.t))
     np.testing.assert_allclose(found[0].truth.matrix, middle.matrix, atol=1e-15)
@@ -273,7 +319,13 @@ def covariance(i: int, c: Scan) -> bytes:
 
 def odometry(i: int, c: Scan) -> bytes:
     p = pose(i)
-    return Packer().header(c.t_ns, "c").string("t").f64s(*p.t, *p.q, *([0.0] * 36), *([0.0] * 42)).bytes()
+    return (
+        Packer()
+        .header(c.t_ns, "c")
+        .string("t")
+        .f64s(*p.t, *p.q, *([0.0] * 36), *([0.0] * 42))
+        .bytes()
+    )
 
 
 def stamped(i: int, c: Scan) -> bytes:
@@ -281,16 +333,21 @@ def stamped(i: int, c: Scan) -> bytes:
     return Packer().header(c.t_ns, "c").string("target").f64s(*p.t, *p.q).bytes()
 
 
-@pytest.mark.parametrize(("kind", "make"), [
-    ("geometry_msgs/msg/PoseWithCovarianceStamped", covariance),
-    ("nav_msgs/msg/Odometry", odometry),
-    ("geometry_msgs/msg/TransformStamped", stamped),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", covariance),
+        ("nav_msgs/msg/Odometry", odometry),
+        ("geometry_msgs/msg/TransformStamped", stamped),
+    ],
+)
 def test_truth_of_every_message_type(tmp_path: Path, kind: str, make) -> None:  # type: ignore[no-untyped-def]
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = McapWriter(file)
         writer.start("ros2")
-        one = writer.register_channel("/points", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+        one = writer.register_channel(
+            "/points", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD))
+        )
         two = writer.register_channel("/gt", "cdr", writer.register_schema(kind, "ros2msg", b""))
         for i, (c, (_, _, log_ns, payload)) in enumerate(zip(CLOUDS, clouds(), strict=True)):
             writer.add_message(one, log_ns, payload, log_ns)
@@ -316,7 +373,9 @@ def moving_sensor() -> list[tuple[str, str, int, bytes]]:
 
 
 def test_clouds_of_a_moving_sensor_are_transformed_to_a_fixed_frame(tmp_path: Path) -> None:
-    found = read(mcap(tmp_path / "a.mcap", moving_sensor()), fixed_frame="map", truth_frame="target")
+    found = read(
+        mcap(tmp_path / "a.mcap", moving_sensor()), fixed_frame="map", truth_frame="target"
+    )
     for i, (scan, c) in enumerate(zip(found, CLOUDS, strict=True)):
         T_map_lidar = pose(i).matrix @ pose(2).matrix
         want = c.points.astype(np.float64) @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
@@ -332,7 +391,10 @@ def test_truth_from_a_chain_in_the_sensors_own_frame(tmp_path: Path) -> None:
 
 
 def test_clouds_are_transformed_by_a_sensor_topic(tmp_path: Path) -> None:
-    poses = [("/cam", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(i))) for i, c in enumerate(CLOUDS[:-1])]
+    poses = [
+        ("/cam", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(i)))
+        for i, c in enumerate(CLOUDS[:-1])
+    ]
     found = read(mcap(tmp_path / "a.mcap", [*clouds(), *poses]), sensor_topic="/cam")
     np.testing.assert_allclose(found[4].points, pose(4).apply(CLOUDS[4].points), atol=1e-12)
     assert found[-1].status is ScanStatus.DAMAGED
@@ -340,7 +402,13 @@ def test_clouds_are_transformed_by_a_sensor_topic(tmp_path: Path) -> None:
 
 
 def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
-    loop = transforms(("a", "b", pose(1)), ("b", "a", pose(2)), ("b", "camera", pose(0)), ("x", "map", pose(0)), t_ns=0)
+    loop = transforms(
+        ("a", "b", pose(1)),
+        ("b", "a", pose(2)),
+        ("b", "camera", pose(0)),
+        ("x", "map", pose(0)),
+        t_ns=0,
+    )
     path = mcap(tmp_path / "a.mcap", [*clouds(), ("/tf_static", TF, 1, loop)])
     assert all(s.status is ScanStatus.DAMAGED for s in read(path, fixed_frame="map"))
     with pytest.raises(UsageError, match="no frame 'mars'"):
@@ -351,11 +419,21 @@ def test_pose_files_beside_a_log(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", clouds())
     tum, kitti, euroc = tmp_path / "t.tum", tmp_path / "k.txt", tmp_path / "e.csv"
     rows = [(c.t_ns, pose(i)) for i, c in enumerate(CLOUDS)]
-    lines = [f"{t // SECOND}.{t % SECOND:09d} {' '.join(repr(float(v)) for v in (*p.t, *p.q))}\n" for t, p in rows]
+    lines = [
+        f"{t // SECOND}.{t % SECOND:09d} {' '.join(repr(float(v)) for v in (*p.t, *p.q))}\n"
+        for t, p in rows
+    ]
     tum.write_text("# t x y z qx qy qz qw\n" + "".join(lines))
-    kitti.write_text("".join(" ".join(repr(float(v)) for v in p.matrix[:3].reshape(-1)) + "\n" for _, p in rows))
-    euroc.write_text("#timestamp [ns],p,q\n" + "".join(
-        f"{t},{','.join(repr(float(v)) for v in (*p.t, p.q[3], *p.q[:3]))},0,0,0\n" for t, p in rows))  # fmt: skip
+    kitti.write_text(
+        "".join(" ".join(repr(float(v)) for v in p.matrix[:3].reshape(-1)) + "\n" for _, p in rows)
+    )
+    euroc.write_text(
+        "#timestamp [ns],p,q\n"
+        + "".join(
+            f"{t},{','.join(repr(float(v)) for v in (*p.t, p.q[3], *p.q[:3]))},0,0,0\n"
+            for t, p in rows
+        )
+    )
     for file in (tum, kitti, euroc):
         for i, scan in enumerate(read(path, truth_file=file)):
             np.testing.assert_allclose(scan.truth.matrix, pose(i).matrix, atol=1e-14)
@@ -387,7 +465,12 @@ def test_a_cloud_that_cannot_be_decoded_is_a_damaged_scan(tmp_path: Path) -> Non
     messages[4] = (*messages[4][:3], messages[4][3][:200])
     messages[5] = (*messages[5][:3], b"")
     found = read(mcap(tmp_path / "a.mcap", messages))
-    assert [s.status for s in found][3:7] == [ScanStatus.OK, ScanStatus.DAMAGED, ScanStatus.DAMAGED, ScanStatus.OK]
+    assert [s.status for s in found][3:7] == [
+        ScanStatus.OK,
+        ScanStatus.DAMAGED,
+        ScanStatus.DAMAGED,
+        ScanStatus.OK,
+    ]
     assert len(found) == 12
 
 
@@ -395,15 +478,21 @@ def test_an_empty_cloud_is_an_empty_scan(tmp_path: Path) -> None:
     empty = np.zeros((0, 3), np.float32)
     nothing = np.full((7, 3), np.nan, np.float32)
     messages = [
-        ("/p", CLOUD, SECOND + i, point_cloud2(SECOND + i, "c", p, None)) for i, p in enumerate((empty, nothing))
+        ("/p", CLOUD, SECOND + i, point_cloud2(SECOND + i, "c", p, None))
+        for i, p in enumerate((empty, nothing))
     ]
     found = read(mcap(tmp_path / "a.mcap", messages))
-    assert [(s.status, s.dropped_points) for s in found] == [(ScanStatus.EMPTY, 0), (ScanStatus.EMPTY, 7)]
+    assert [(s.status, s.dropped_points) for s in found] == [
+        (ScanStatus.EMPTY, 0),
+        (ScanStatus.EMPTY, 7),
+    ]
 
 
 def test_the_log_clock_can_be_chosen(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", header(np.random.Generator(np.random.PCG64(1))), CLOUDS)
-    assert [s.t_ns for s in read(tmp_path / "a.mcap", clock=ClockChoice.LOG)] == [c.log_ns for c in CLOUDS]
+    assert [s.t_ns for s in read(tmp_path / "a.mcap", clock=ClockChoice.LOG)] == [
+        c.log_ns for c in CLOUDS
+    ]
 
 
 def test_model_and_truth_move_with_the_grasp_point() -> None:
@@ -412,7 +501,9 @@ def test_model_and_truth_move_with_the_grasp_point() -> None:
     with open_source(log) as plain, open_source(log, SourceOptions(grasp=grasp)) as moved:
         assert plain.header.surface is not None
         assert moved.header.surface is not None
-        np.testing.assert_allclose(moved.header.surface.vertices, plain.header.surface.vertices - grasp, atol=1e-12)
+        np.testing.assert_allclose(
+            moved.header.surface.vertices, plain.header.surface.vertices - grasp, atol=1e-12
+        )
         assert moved.header.start is None
         for seq in (0, len(plain) - 1):
             scan = plain.scan_at(seq)

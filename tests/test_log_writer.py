@@ -43,7 +43,12 @@ def test_a_log_read_back_is_the_log_written(tmp_path: Path, compression: str, ti
         assert scan.truth is not None
         assert scan.body is not None
         np.testing.assert_allclose(scan.truth.matrix, pose.matrix, rtol=0, atol=1e-15)
-        for name, constant in (("sigma", head.truth), ("c_b", head.truth), ("q_bc", head.truth), ("w_b", body)):
+        for name, constant in (
+            ("sigma", head.truth),
+            ("c_b", head.truth),
+            ("q_bc", head.truth),
+            ("w_b", body),
+        ):
             np.testing.assert_array_equal(getattr(scan.body, name), getattr(constant, name))
         np.testing.assert_allclose(scan.body.v_a, body.v_a, rtol=0, atol=1e-14)
     assert_same_header(head, again)
@@ -52,7 +57,9 @@ def test_a_log_read_back_is_the_log_written(tmp_path: Path, compression: str, ti
 def assert_same_header(head: LogHeader, again: LogHeader) -> None:
     assert (again.scenario, again.seed, again.notes) == (head.scenario, head.seed, head.notes)
     for one, two in zip(head.labels, again.labels, strict=True):
-        assert [getattr(one, f.name) for f in fields(one)] == [getattr(two, f.name) for f in fields(two)]
+        assert [getattr(one, f.name) for f in fields(one)] == [
+            getattr(two, f.name) for f in fields(two)
+        ]
     for one, two in ((head.truth, again.truth), (head.start.x, again.start.x)):
         for f in fields(one):
             np.testing.assert_array_equal(getattr(one, f.name), getattr(two, f.name))
@@ -65,8 +72,10 @@ def assert_same_header(head: LogHeader, again: LogHeader) -> None:
 
 def test_a_label_covers_a_half_open_window(tmp_path: Path) -> None:
     head = LogHeader(labels=(Label("clutter", 2 * SECOND, 3 * SECOND),))
-    clouds = [Scan(i, t, np.ones((1, 3), np.float32), log_ns=t) for i, t in enumerate(
-        [2 * SECOND - 1, 2 * SECOND, 3 * SECOND - 1, 3 * SECOND])]  # fmt: skip
+    clouds = [
+        Scan(i, t, np.ones((1, 3), np.float32), log_ns=t)
+        for i, t in enumerate([2 * SECOND - 1, 2 * SECOND, 3 * SECOND - 1, 3 * SECOND])
+    ]
     with LogWriter(tmp_path / "a.mcap", head) as writer:
         for scan in clouds:
             writer.write(scan)
@@ -76,7 +85,9 @@ def test_a_label_covers_a_half_open_window(tmp_path: Path) -> None:
 
 def test_labels_at_times_that_ros_cannot_hold_are_cut(tmp_path: Path) -> None:
     """The header record of a foreign log may state any whole number."""
-    head = LogHeader(labels=(Label("clutter", -(10**30), 3 * SECOND), Label("empty", 2 * SECOND, 10**30)))
+    head = LogHeader(
+        labels=(Label("clutter", -(10**30), 3 * SECOND), Label("empty", 2 * SECOND, 10**30))
+    )
     with LogWriter(tmp_path / "a.mcap", head) as writer:
         for k in range(4):
             writer.write(Scan(k, k * SECOND, np.ones((1, 3), np.float32), log_ns=k * SECOND))
@@ -86,16 +97,18 @@ def test_labels_at_times_that_ros_cannot_hold_are_cut(tmp_path: Path) -> None:
 
 def test_the_bytes_depend_on_the_input_alone(tmp_path: Path) -> None:
     script = (
-        "import sys; sys.path.insert(0, sys.argv[2])\n"
-        "import log_cases as t, numpy as np, pathlib\n"
-        "t.write(pathlib.Path(sys.argv[1]), t.header(np.random.Generator(np.random.PCG64(1))), t.scans())\n"
+        "import sys; sys.path.insert(0, sys.argv[2])\nimport log_cases as t, numpy as np,"
+        " pathlib\nt.write(pathlib.Path(sys.argv[1]),"
+        " t.header(np.random.Generator(np.random.PCG64(1))), t.scans())\n"
     )
     contents = []
     for seed in ("0", "1"):
         out = tmp_path / f"{seed}.mcap"
         env = {**os.environ, "PYTHONHASHSEED": seed, "TZ": f"UTC+{seed}"}
         subprocess.run(
-            [sys.executable, "-c", script, str(out), str(Path(log_cases.__file__).parent)], env=env, check=True
+            [sys.executable, "-c", script, str(out), str(Path(log_cases.__file__).parent)],
+            env=env,
+            check=True,
         )
         contents.append(out.read_bytes())
     assert contents[0] == contents[1]
@@ -109,8 +122,17 @@ def test_the_mcap_library_reads_it_with_every_checksum(tmp_path: Path) -> None:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        counts = {c.topic: summary.statistics.channel_message_counts[i] for i, c in summary.channels.items()}
-        assert counts == {"/tf_static": 1, "/points": 12, "/truth/pose": 12, "/truth/body": 12, "/faults": 6}
+        counts = {
+            c.topic: summary.statistics.channel_message_counts[i]
+            for i, c in summary.channels.items()
+        }
+        assert counts == {
+            "/tf_static": 1,
+            "/points": 12,
+            "/truth/pose": 12,
+            "/truth/body": 12,
+            "/faults": 6,
+        }
         assert [a.name for a in reader.iter_attachments()] == ["part.ply"]
         assert [m.name for m in reader.iter_metadata()] == ["avsreplay"]
         for schema, _, message in reader.iter_messages():
@@ -124,7 +146,9 @@ def test_rosbags_reads_every_message_with_the_schemas_inside(tmp_path: Path) -> 
     seen: dict[str, list[object]] = {}
     with AnyReader([tmp_path / "a.mcap"]) as reader:
         for connection, t_ns, raw in reader.messages():
-            seen.setdefault(connection.topic, []).append((t_ns, reader.deserialize(raw, connection.msgtype)))
+            seen.setdefault(connection.topic, []).append(
+                (t_ns, reader.deserialize(raw, connection.msgtype))
+            )
     assert set(seen) == {"/tf_static", "/points", "/truth/pose", "/truth/body", "/faults"}
     for (t_ns, cloud), scan in zip(seen["/points"], clouds, strict=True):
         assert t_ns == scan.log_ns
@@ -141,7 +165,9 @@ def test_rosbags_reads_every_message_with_the_schemas_inside(tmp_path: Path) -> 
         w = message.twist.twist.angular
         assert (w.x, w.y, w.z) == tuple(body.w_b)
     levels = [(m.status[0].name, m.status[0].level) for _, m in seen["/faults"]]
-    assert sorted(levels) == sorted((k, v) for k in ("occlusion", "bias", "dropped") for v in (0, 1))
+    assert sorted(levels) == sorted(
+        (k, v) for k in ("occlusion", "bias", "dropped") for v in (0, 1)
+    )
 
 
 @pytest.mark.parametrize("name", sorted(SCHEMAS))
@@ -190,7 +216,9 @@ class _Full(io.BufferedWriter):
         return super().write(data)  # type: ignore[arg-type]
 
 
-def test_a_full_disk_keeps_the_complete_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_complete_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def opened(self: Path, mode: str = "r") -> io.BufferedWriter:
         return _Full(io.FileIO(self, mode))
 
@@ -208,7 +236,9 @@ def test_a_full_disk_keeps_the_complete_chunks(tmp_path: Path, monkeypatch: pyte
     assert all(a.points.tobytes() == b.points.tobytes() for a, b in zip(back, clouds, strict=False))
 
 
-def test_a_full_disk_leaves_no_file_without_a_complete_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_no_file_without_a_complete_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Path, "open", lambda self, mode="r": _Full(io.FileIO(self, mode)))
     monkeypatch.setattr(_Full, "room", 10)
     with pytest.raises(UnreadableInput, match="No space left on device; nothing is kept"):
@@ -259,14 +289,14 @@ def test_crop_keeps_the_points_inside(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", LogHeader(), scans(2, timed=True))
     box = (-1.0, -0.5, 0.0, 1.0, 0.5, 2.0)
     with open_source(tmp_path / "a.mcap", SourceOptions(crop_box=box)) as source:
-        (one, _) = source.scans()
+        one, _ = source.scans()
     whole = scans(2, timed=True)[0]
     keep = ((whole.points >= np.array(box[:3])) & (whole.points <= np.array(box[3:]))).all(axis=1)
     assert 0 < keep.sum() < len(keep)
     assert one.points.tobytes() == whole.points[keep].tobytes()
     assert one.times_s.tobytes() == whole.times_s[keep].tobytes()
     with open_source(tmp_path / "a.mcap", SourceOptions(crop_range=(1.0, 2.0))) as source:
-        (two, _) = source.scans()
+        two, _ = source.scans()
     distance = np.linalg.norm(whole.points.astype(np.float64), axis=1)
     assert len(two.points) == ((distance >= 1.0) & (distance <= 2.0)).sum()
 
@@ -281,7 +311,10 @@ def test_a_state_that_is_not_finite_is_one_line_and_leaves_no_file(tmp_path: Pat
 @pytest.mark.parametrize("t_ns", [-1, 2**63])
 def test_a_time_that_a_log_cannot_hold_is_one_line(tmp_path, t_ns):
     scan = Scan(0, SECOND, np.zeros((1, 3), np.float32), log_ns=t_ns)
-    with pytest.raises(UnreadableInput, match="cannot be recorded"), LogWriter(tmp_path / "x.mcap", LogHeader()) as log:
+    with (
+        pytest.raises(UnreadableInput, match="cannot be recorded"),
+        LogWriter(tmp_path / "x.mcap", LogHeader()) as log,
+    ):
         log.write(scan)
     assert not (tmp_path / "x.mcap").exists()
 

@@ -1,4 +1,7 @@
-"""Winding of meshes: properties on random bodies, with trimesh's volume and containment as oracles."""
+"""Winding of meshes.
+
+Properties on random bodies, with trimesh's volume and containment as oracles.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, view
+from avsreplay.register.registrar import Registrar
 
 SEEDS = st.integers(0, 2**31)
 
@@ -33,7 +36,9 @@ def bodies(rng: np.random.Generator, count: int = 4) -> list[trimesh.Trimesh]:
 def test_components_are_numbered_in_the_order_of_their_first_nodes(nodes: int, edges: int) -> None:
     graph = np.random.default_rng(edges).integers(nodes, size=(2, edges))
     pairs = coo_array((np.ones(edges), tuple(graph)), shape=(nodes, nodes))
-    assert np.array_equal(mesh._components(nodes, *graph), connected_components(pairs, directed=False)[1])
+    assert np.array_equal(
+        mesh._components(nodes, *graph), connected_components(pairs, directed=False)[1]
+    )
 
 
 def convex(points: Array) -> tuple[Array, Array]:
@@ -51,7 +56,9 @@ def some_reversed(rng: np.random.Generator, faces: mesh.Faces, share: float) -> 
     """The faces, a share of them with the other winding and each with another first corner."""
     chosen = rng.random(len(faces)) < share
     turned = np.where(chosen[:, None], faces[:, ::-1], faces)
-    return np.take_along_axis(turned, (rng.integers(3, size=(len(faces), 1)) + np.arange(3)) % 3, axis=1)
+    return np.take_along_axis(
+        turned, (rng.integers(3, size=(len(faces), 1)) + np.arange(3)) % 3, axis=1
+    )
 
 
 def opened(vertices: Array, faces: mesh.Faces) -> Array:
@@ -77,7 +84,9 @@ def test_outward_faces_stay_and_any_reversed_ones_are_restored(seed: int) -> Non
     wrong = some_reversed(rng, faces, rng.uniform())
     found, count = mesh.outward(vertices, wrong)
     np.testing.assert_allclose(normals(vertices, found), normals(vertices, faces), atol=1e-12)
-    assert count == int((np.einsum("ij,ij->i", normals(vertices, wrong), normals(vertices, faces)) < 0.0).sum())
+    assert count == int(
+        (np.einsum("ij,ij->i", normals(vertices, wrong), normals(vertices, faces)) < 0.0).sum()
+    )
 
 
 @given(SEEDS)
@@ -108,7 +117,10 @@ def test_a_single_reversed_part_of_several_is_found() -> None:
 
 def test_a_reversed_rod_between_two_bodies_is_no_cavity() -> None:
     """All vertices of the rod are inside the bodies that it joins."""
-    boxes_, rod = [trimesh.creation.box((1, 1, 1)) for _ in range(2)], trimesh.creation.cylinder(0.03, 2.6, sections=12)
+    boxes_, rod = (
+        [trimesh.creation.box((1, 1, 1)) for _ in range(2)],
+        trimesh.creation.cylinder(0.03, 2.6, sections=12),
+    )
     for box, side in zip(boxes_, (-1.5, 1.5), strict=True):
         box.apply_translation((0, 0, side))
     vertices, right = joined([*boxes_, rod])
@@ -136,17 +148,25 @@ def test_open_parts_are_told_from_closed_ones() -> None:
     sheet.apply_translation((3, 0, 0))
     vertices, faces = joined([box, sheet])
     np.testing.assert_array_equal(opened(vertices, faces), np.arange(14) >= 12)
-    assert not opened(np.where(np.arange(len(vertices))[:, None] < 8, vertices, 0.01 * vertices), faces).any()
-    both = np.concatenate([faces, faces[12:, ::-1]])  # the other side of the sheet, as faces of their own
+    assert not opened(
+        np.where(np.arange(len(vertices))[:, None] < 8, vertices, 0.01 * vertices), faces
+    ).any()
+    both = np.concatenate(
+        [faces, faces[12:, ::-1]]
+    )  # the other side of the sheet, as faces of their own
     assert not opened(vertices, both).any()
     assert mesh.outward(vertices, both)[1] == 0
 
 
 @pytest.mark.parametrize("subdivisions", [1, 3, 5])
 @pytest.mark.parametrize(("height", "is_open"), [(0.0, True), (0.995, False), (1.1, False)])
-def test_the_openings_of_a_part_do_not_depend_on_its_triangles(subdivisions: int, height: float, is_open: bool) -> None:
+def test_the_openings_of_a_part_do_not_depend_on_its_triangles(
+    subdivisions: int, height: float, is_open: bool
+) -> None:
     """A sphere without the faces above a height: a bowl, one with a small hole, and a whole one."""
-    ball = trimesh.creation.icosphere(subdivisions=max(subdivisions, 4) if height == 0.995 else subdivisions)
+    ball = trimesh.creation.icosphere(
+        subdivisions=max(subdivisions, 4) if height == 0.995 else subdivisions
+    )
     ball.update_faces(ball.triangles_center[:, 2] < height)
     found = opened(np.array(ball.vertices), np.array(ball.faces, dtype=np.int32))
     assert found.all() if is_open else not found.any()
@@ -155,7 +175,9 @@ def test_the_openings_of_a_part_do_not_depend_on_its_triangles(subdivisions: int
 @given(SEEDS)
 @settings(max_examples=20)
 def test_corners_that_differ_by_rounding_are_one(seed: int) -> None:
-    """An STL file repeats each corner, and exports write 6e-17 in place of 0 for some of the faces."""
+    """An STL file repeats each corner, and exports write 6e-17 in place of 0 for some of the
+    faces.
+    """
     rng = np.random.default_rng(seed)
     vertices, faces = joined(bodies(rng, 2))
     apart = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
@@ -168,7 +190,10 @@ def test_corners_that_differ_by_rounding_are_one(seed: int) -> None:
 
 
 def test_a_sliver_does_not_separate_its_neighbours() -> None:
-    """A face whose corners are nearer than the tolerance: the mesh stays closed, and the winding is found across it."""
+    """A face whose corners are nearer than the tolerance.
+
+    The mesh stays closed, and the winding is found across it.
+    """
     box = trimesh.creation.box((1, 1, 1))
     vertices, faces = np.array(box.vertices), np.array(box.faces, dtype=np.int32)
     a, b, c = faces[0]
@@ -188,7 +213,9 @@ def test_a_body_that_lists_each_face_with_both_windings_is_wound_outwards(seed: 
     both = np.concatenate([faces, faces[:, ::-1]])[rng.permutation(2 * len(faces))]
     found, count = mesh.outward(vertices, both)
     assert count == len(faces)
-    assert mesh.signed_volume(vertices, found) == pytest.approx(2.0 * mesh.signed_volume(vertices, faces))
+    assert mesh.signed_volume(vertices, found) == pytest.approx(
+        2.0 * mesh.signed_volume(vertices, faces)
+    )
 
 
 def test_a_mesh_without_a_volume_is_open() -> None:
@@ -205,12 +232,21 @@ def test_a_moebius_strip_is_left_as_it_is() -> None:
     k = np.arange(12)
     angle, half = 2.0 * np.pi * k / 12, np.pi * k / 12
     rim = [
-        np.stack([(1 + w * np.cos(half)) * np.cos(angle), (1 + w * np.cos(half)) * np.sin(angle), w * np.sin(half)], 1)
+        np.stack(
+            [
+                (1 + w * np.cos(half)) * np.cos(angle),
+                (1 + w * np.cos(half)) * np.sin(angle),
+                w * np.sin(half),
+            ],
+            1,
+        )
         for w in (-0.3, 0.3)
     ]
     ahead, other = np.append(k[1:], 12), np.append(k[1:] + 12, 0)
     ahead[-1] = 12  # the strip closes with a half turn: the lower rim continues as the upper one
-    faces = np.concatenate([np.stack([k, ahead, k + 12], 1), np.stack([k + 12, ahead, other], 1)]).astype(np.int32)
+    faces = np.concatenate(
+        [np.stack([k, ahead, k + 12], 1), np.stack([k + 12, ahead, other], 1)]
+    ).astype(np.int32)
     assert mesh.outward(np.concatenate(rim), faces)[1] == 0
 
 
@@ -234,11 +270,18 @@ def test_merged_vertices_are_those_of_a_dictionary(seed: int) -> None:
 
 
 def test_a_sheet_beside_closed_parts_is_registered_from_both_sides() -> None:
-    """The points of either side of a panel without thickness are matched; the closed parts are matched on one side."""
+    """The points of either side of a panel without thickness are matched.
+
+    The closed parts are matched on one side.
+    """
     body = boxes()
-    panel = np.array([[-2, -0.6, 0.0], [-0.6, -0.6, 0.0], [-0.6, 0.6, 0.3], [-2, 0.6, 0.3]]) - np.array([1.0, 0.0, 0.0])
+    panel = np.array(
+        [[-2, -0.6, 0.0], [-0.6, -0.6, 0.0], [-0.6, 0.6, 0.3], [-2, 0.6, 0.3]]
+    ) - np.array([1.0, 0.0, 0.0])
     vertices = np.concatenate([body.vertices, panel])
-    faces = np.concatenate([body.faces, len(body.vertices) + np.array([[0, 1, 2], [0, 2, 3]], np.int32)])
+    faces = np.concatenate(
+        [body.faces, len(body.vertices) + np.array([[0, 1, 2], [0, 2, 3]], np.int32)]
+    )
     model = Surface(vertices, faces.astype(np.int32), "with a sheet", "")
     rng = np.random.default_rng(3)
     for side in (-1.0, 1.0):

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from avsreplay.monitor.convergence import Consistency, ConsistencyParams, ConsistencyTrack, mean_band, violations
+from avsreplay.monitor.convergence import (
+    Consistency,
+    ConsistencyParams,
+    ConsistencyTrack,
+    mean_band,
+    violations,
+)
 from avsreplay.records import Belief, Innovation, State
 
 STRICT = ConsistencyParams(slack=1.0)
@@ -52,7 +58,10 @@ def test_an_over_confident_filter_is_detected_and_a_conservative_one_is_accepted
 
 
 def test_a_small_error_that_all_innovations_share_is_inconsistent() -> None:
-    """0.8 standard deviations along one axis: the mean NIS is 6.6, inside its band, the sum of 50 is 5.7 of its own."""
+    """0.8 standard deviations along one axis.
+
+    The mean NIS is 6.6, inside its band, the sum of 50 is 5.7 of its own.
+    """
     shifted, held = 0, 0
     for seed in range(40):
         alphas, S = draws(seed)
@@ -64,7 +73,9 @@ def test_a_small_error_that_all_innovations_share_is_inconsistent() -> None:
     assert held == 40
 
 
-def test_errors_that_near_views_have_in_common_shift_the_innovations_without_an_error_of_the_estimate() -> None:
+def test_errors_that_near_views_have_in_common_shift_the_innovations_without_an_error_of_the_estimate() -> (
+    None
+):
     wrong, allowed, n, share = 0, 0, 50, 0.1
     for seed in range(40):
         alphas, S = draws(seed, n=n + 1)
@@ -100,7 +111,9 @@ def test_params_refuse() -> None:
 
 
 def belief_of(P: np.ndarray, sigma: tuple[float, float] = (0.1, 0.2)) -> Belief:
-    return Belief(0, State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0]), P)
+    return Belief(
+        0, State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0]), P
+    )
 
 
 def test_each_check_of_the_estimate_fails_where_it_should() -> None:
@@ -108,7 +121,13 @@ def test_each_check_of_the_estimate_fails_where_it_should() -> None:
     pose = 0.5 * R
     assert violations(belief_of(good), True, pose, np.zeros(6), R, none, 27.86) == ()
     assert violations(belief_of(good), False, pose, np.zeros(6), R, none, 27.86) == ("covariance",)
-    assert violations(belief_of(good, (1.2, 0.0)), True, pose, np.zeros(6), R, none, 27.86) == ("sigma",)
-    assert violations(belief_of(good), True, 1.3 * R, np.zeros(6), R, none, 27.86) == ("worse_than_measured",)
+    assert violations(belief_of(good, (1.2, 0.0)), True, pose, np.zeros(6), R, none, 27.86) == (
+        "sigma",
+    )
+    assert violations(belief_of(good), True, 1.3 * R, np.zeros(6), R, none, 27.86) == (
+        "worse_than_measured",
+    )
     assert violations(belief_of(good), True, 1.3 * R, np.zeros(6), R, 2.0 * none, 27.86) == ()
-    assert violations(belief_of(good), True, pose, np.full(6, 0.1), R, none, 27.86) == ("outside_gate",)
+    assert violations(belief_of(good), True, pose, np.full(6, 0.1), R, none, 27.86) == (
+        "outside_gate",
+    )

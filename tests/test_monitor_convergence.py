@@ -1,4 +1,7 @@
-"""t_1: thresholds by block, the dwell time, both criteria; an inconsistent filter does not converge."""
+"""t_1: thresholds by block, the dwell time, both criteria.
+
+An inconsistent filter does not converge.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,9 @@ def test_predictive_test_ignores_an_unobservable_parameter() -> None:
 
 @pytest.mark.parametrize("wide", [{"pos": 0.2}, {"vel": 0.1}, {"rot": 0.1}])
 def test_predictive_test_counts_each_of_three(wide: dict[str, float]) -> None:
-    assert not fold(Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(**wide)) for t in range(9)]).converged
+    assert not fold(
+        Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(**wide)) for t in range(9)]
+    ).converged
 
 
 def test_an_inconsistent_filter_is_not_converged() -> None:
@@ -83,7 +88,9 @@ def test_an_inconsistent_filter_is_not_converged() -> None:
 
 
 def test_the_test_of_the_paper_looks_at_the_covariance_only() -> None:
-    """Consistency of the innovations and a possible change of the motion are additions to the printed method."""
+    """Consistency of the innovations and a possible change of the motion are additions to the
+    printed method.
+    """
     convergence = Convergence(PAPER, 8.0)
     track = fold(convergence, [(belief(t), ahead(), False, ahead(1e9)) for t in range(9)])
     assert track.converged
@@ -94,7 +101,9 @@ def test_not_a_number_is_not_converged() -> None:
     P = np.full((20, 20), np.nan)
     nothing = Belief(0, X, P)
     assert not fold(Convergence(PAPER, 8.0), [(nothing,)] * 3).covariance_converged
-    assert not fold(Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(np.nan)) for t in range(9)]).converged
+    assert not fold(
+        Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(np.nan)) for t in range(9)]
+    ).converged
 
 
 def test_blocks_are_roots_of_traces() -> None:
@@ -103,7 +112,9 @@ def test_blocks_are_roots_of_traces() -> None:
 
 
 def test_params() -> None:
-    assert ConvergenceParams(horizon_s=20.0, horizon_steps=4).times_s == pytest.approx([5.0, 10.0, 15.0, 20.0])
+    assert ConvergenceParams(horizon_s=20.0, horizon_steps=4).times_s == pytest.approx(
+        [5.0, 10.0, 15.0, 20.0]
+    )
     assert ConvergenceParams().resolved(8.0).grasp_pos_m == pytest.approx(0.08)
     with pytest.raises(ValueError, match="dwell_s"):
         ConvergenceParams(dwell_s=-1.0)
@@ -114,6 +125,8 @@ def test_params() -> None:
 def test_a_possible_change_withholds_convergence_and_does_not_interrupt_the_dwell() -> None:
     convergence, far = Convergence(ConvergenceParams(), 8.0), ahead(pos=1.0)
     steps = [(belief(float(t)), ahead(), True, far if t in (1, 6) else ahead()) for t in range(9)]
-    assert [fold(convergence, steps[: n + 1]).converged for n in range(9)] == [t >= 2 and t != 6 for t in range(9)]
+    assert [fold(convergence, steps[: n + 1]).converged for n in range(9)] == [
+        t >= 2 and t != 6 for t in range(9)
+    ]
     assert fold(convergence, steps[:7]).predictive_converged
     assert fold(convergence, steps).t1_ns == 0

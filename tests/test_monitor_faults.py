@@ -1,4 +1,7 @@
-"""The fault rule: every reason, their order, both policies, and a limit that grows with the predicted 1 sigma."""
+"""The fault rule.
+
+Every reason, their order, both policies, and a limit that grows with the predicted 1 sigma.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,23 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import Pose
-from avsreplay.monitor import FaultDetector, FaultParams, Policy, pose_limit, weighted_norm
+from avsreplay.monitor.fault_detection import (
+    FaultDetector,
+    FaultParams,
+    Policy,
+    pose_limit,
+    weighted_norm,
+)
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, State
 
-PRIOR = Belief(0, State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0]), np.eye(20))
-GOOD = Alignment(Pose.identity(), 5, True, 4000, 3900, 0.008, np.eye(6), AlignStatus.ALIGNED, np.eye(6))
+PRIOR = Belief(
+    0,
+    State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0]),
+    np.eye(20),
+)
+GOOD = Alignment(
+    Pose.identity(), 5, True, 4000, 3900, 0.008, np.eye(6), AlignStatus.ALIGNED, np.eye(6)
+)
 SMALL = np.eye(6) * 1e-8
 
 
@@ -22,7 +37,12 @@ def seen(distance: float = 0.0, angle: float = 0.0, S: np.ndarray = SMALL) -> In
     return Innovation(alpha, S, S, nis, nis, distance, angle)
 
 
-def judge(alignment: Alignment | None = GOOD, innovation: Innovation | None = None, status=ScanStatus.OK, **params):
+def judge(
+    alignment: Alignment | None = GOOD,
+    innovation: Innovation | None = None,
+    status=ScanStatus.OK,
+    **params,
+):
     detector = FaultDetector(FaultParams(**params), 8.0)
     return detector.judge(status, alignment, seen() if innovation is None else innovation, PRIOR)
 
@@ -56,7 +76,10 @@ def test_missing_and_empty_scans_are_faults() -> None:
     assert judge(status=ScanStatus.EMPTY).reason is Reason.NO_SCAN
     assert judge(status=ScanStatus.DAMAGED).reason is Reason.NO_SCAN
     assert judge(status=ScanStatus.CLOCK).reason is Reason.CLOCK
-    assert FaultDetector(FaultParams(), 8.0).judge(ScanStatus.OK, None, None, PRIOR).reason is Reason.NOT_ALIGNED
+    assert (
+        FaultDetector(FaultParams(), 8.0).judge(ScanStatus.OK, None, None, PRIOR).reason
+        is Reason.NOT_ALIGNED
+    )
 
 
 def test_a_degenerate_view_is_not_a_fault() -> None:
@@ -89,7 +112,9 @@ def test_policy_all_needs_both() -> None:
 
 
 def test_the_limit_grows_with_the_predicted_sigma() -> None:
-    """After a blackout with 0.3 m and 5 deg predicted 1 sigma an innovation of that size takes the track up again."""
+    """After a blackout with 0.3 m and 5 deg predicted 1 sigma an innovation of that size takes the
+    track up again.
+    """
     half = np.radians(2.5)
     S = np.diag(np.repeat([0.3**2, half**2], 3))
     predicted = np.sqrt(3 * 0.3**2 + 4 * 2.0**2 * 3 * half**2)

@@ -1,4 +1,7 @@
-"""The joints of a manipulator during the last metres, against an independent forward kinematics; needs pinocchio."""
+"""The joints of a manipulator during the last metres, against an independent forward kinematics.
+
+Needs pinocchio.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,15 @@ from scipy.spatial.transform import Rotation
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan import (
-    Guidance,
-    Limits,
-    PlannerInput,
-    PlanParams,
-    RobotParams,
-    Scene,
-    StepPath,
-    Supervisor,
-    SupervisorParams,
-    constrained,
-    path_of,
-)
 from avsreplay.plan.arm import Arm, with_arm
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
-from avsreplay.plan.robot import slowed
+from avsreplay.plan.limits import Scene
+from avsreplay.plan.path import StepPath, path_of
+from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits, RobotParams, slowed
+from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.records import Forecast
 
 LENGTHS = (0.4, 1.2, 1.0, 0.3, 0.2, 0.15)
@@ -42,12 +38,12 @@ def _urdf(path: Path, rate: float = 1.0, effort: float = 50.0, bound: float = 2.
     for k, (axis, length) in enumerate(zip(AXES, LENGTHS, strict=True)):
         parent = f"link{k - 1}" if k else "base"
         out.append(
-            f'<joint name="joint{k}" type="revolute"><parent link="{parent}"/><child link="link{k}"/>'
-            f'<origin xyz="0 0 {height}"/><axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
-            f'<limit lower="{-bound}" upper="{bound}" velocity="{rate}" effort="{effort}"/></joint>'
-            f'<link name="link{k}">'
-            f'<inertial><origin xyz="0 0 {length}"/><mass value="{5.0 * length}"/>'
-            '<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<joint name="joint{k}" type="revolute"><parent link="{parent}"/><child'
+            f' link="link{k}"/><origin xyz="0 0 {height}"/><axis xyz="{axis[0]} {axis[1]}'
+            f' {axis[2]}"/><limit lower="{-bound}" upper="{bound}" velocity="{rate}"'
+            f' effort="{effort}"/></joint><link name="link{k}"><inertial><origin xyz="0 0'
+            f' {length}"/><mass value="{5.0 * length}"/><inertia ixx="0.02" iyy="0.02" izz="0.02"'
+            ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
         )
         height = length
     tip = '<joint name="tip" type="fixed"><parent link="link5"/><child link="gripper"/>'
@@ -79,7 +75,9 @@ BASE, AHEAD = np.array(LIMITS.base_m), Rotation.from_quat(LIMITS.base_attitude_x
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Arm:
-    pytest.importorskip("pinocchio", reason="pinocchio is not installed: pip install 'avsreplay[arm]'")
+    pytest.importorskip(
+        "pinocchio", reason="pinocchio is not installed: pip install 'avsreplay[arm]'"
+    )
     return Arm(_urdf(tmp_path / "arm.urdf"), "gripper")
 
 
@@ -136,13 +134,20 @@ START, NEAR = np.array([0.8, 0.3, 1.2]), Limits(final_deg=15.0, final_range_m=0.
 
 def _fitted(arm: Arm, scene: Scene, horizon_s: float = 90.0) -> tuple[Plan, Plan, JointPath | None]:
     """The plan without the arm, the one that the arm can fly, and its joints."""
-    limits, params = replace(NEAR, reach_max_m=arm.reach_m), PlanParams(a_max_mps2=0.05, horizon_s=horizon_s)
+    limits, params = (
+        replace(NEAR, reach_max_m=arm.reach_m),
+        PlanParams(a_max_mps2=0.05, horizon_s=horizon_s),
+    )
 
     def make(earliest_s: float, share: float) -> Plan:
         slower, fewer = slowed(params, limits, share)
-        return constrained(scene, START, np.zeros(3), slower, fewer, extent_m=2.0, earliest_s=earliest_s)
+        return constrained(
+            scene, START, np.zeros(3), slower, fewer, extent_m=2.0, earliest_s=earliest_s
+        )
 
-    made, joints = arm.fitted(make, lambda p: path_of(p, START, np.zeros(3)), scene, limits, 0.0, horizon_s)
+    made, joints = arm.fitted(
+        make, lambda p: path_of(p, START, np.zeros(3)), scene, limits, 0.0, horizon_s
+    )
     return make(0.0, 1.0), made, joints
 
 
@@ -168,8 +173,12 @@ def test_the_later_capture_is_not_one_of_a_coarse_grid(arm: Arm) -> None:
     scene, limits = _turning(phase=3.6, rate=-0.05), replace(NEAR, reach_max_m=arm.reach_m)
     free, made, _ = _fitted(arm, scene)
     params, zero = PlanParams(a_max_mps2=0.05, horizon_s=90.0), np.zeros(3)
-    for capture_s in np.arange(free.t_go_s, made.t_go_s - 0.1, 0.1)[::-1][:8]:  # the joints miss those shortly before
-        earlier = constrained(scene, START, zero, params, limits, extent_m=2.0, earliest_s=capture_s)
+    for capture_s in np.arange(free.t_go_s, made.t_go_s - 0.1, 0.1)[::-1][
+        :8
+    ]:  # the joints miss those shortly before
+        earlier = constrained(
+            scene, START, zero, params, limits, extent_m=2.0, earliest_s=capture_s
+        )
         assert not arm.last_metres(path_of(earlier, START, zero), scene, limits).possible
 
 
@@ -201,10 +210,16 @@ def test_no_reachable_pose_is_called_out_of_reach(arm: Arm) -> None:
     for q in rng.uniform(-2.9, 2.9, (200, 6)):
         position, turn = _forward(q)
         assert arm.missing_m(Pose(turn.as_quat(), position)) <= 1e-9
-    position, turn = _forward(np.zeros(6))  # the straight arm: the wrist is as far from the shoulder as it can be
+    position, turn = _forward(
+        np.zeros(6)
+    )  # the straight arm: the wrist is as far from the shoulder as it can be
     assert arm.missing_m(Pose(turn.as_quat(), position)) == pytest.approx(0.0, abs=1e-9)
-    assert arm.missing_m(Pose(turn.as_quat(), position + np.array([0.0, 0.0, 0.2]))) == pytest.approx(0.2)
-    aside = turn * Rotation.from_rotvec([0.5 * np.pi, 0.0, 0.0])  # the same place with the gripper across
+    assert arm.missing_m(
+        Pose(turn.as_quat(), position + np.array([0.0, 0.0, 0.2]))
+    ) == pytest.approx(0.2)
+    aside = turn * Rotation.from_rotvec(
+        [0.5 * np.pi, 0.0, 0.0]
+    )  # the same place with the gripper across
     assert arm.missing_m(Pose(aside.as_quat(), position)) > 0.3
 
 
@@ -219,8 +234,14 @@ def test_guidance_flies_a_capture_that_the_arm_reaches(arm: Arm) -> None:
     scene, start = _turning(phase=3.6, rate=-0.05), (0.8, 0.3, 1.2)
     params = PlanParams(a_max_mps2=0.05, horizon_s=90.0, robot_position_m=start)
     exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = (PlannerInput(round(t * 1e9), 1, True, scene.after(t), exact) for t in np.arange(0.0, 90.0, 2.0))
-    limits, supervisor = replace(NEAR, reach_max_m=arm.reach_m), Supervisor(SupervisorParams().resolved(2.0))
+    known = (
+        PlannerInput(round(t * 1e9), 1, True, scene.after(t), exact)
+        for t in np.arange(0.0, 90.0, 2.0)
+    )
+    limits, supervisor = (
+        replace(NEAR, reach_max_m=arm.reach_m),
+        Supervisor(SupervisorParams().resolved(2.0)),
+    )
     state = None
     for _, state in Guidance(params, supervisor, limits, 2.0, arm=arm).fly(known):
         if state.captured_ns is not None:
@@ -259,7 +280,11 @@ def test_files_that_are_no_manipulator_are_refused(arm: Arm, tmp_path: Path) -> 
         Arm(tmp_path / "missing.urdf")
 
 
-def test_without_the_library_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_library_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(UsageError, match=r"pinocchio, which is not installed; pip install 'avsreplay\[arm\]'"):
+    with pytest.raises(
+        UsageError, match=r"pinocchio, which is not installed; pip install 'avsreplay\[arm\]'"
+    ):
         Arm(_urdf(tmp_path / "arm.urdf"))

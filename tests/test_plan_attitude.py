@@ -1,4 +1,7 @@
-"""The turn of the gripper: closed form, the angular bound, the end condition, and its coupling with the flight."""
+"""The turn of the gripper.
+
+Closed form, the angular bound, the end condition, and its coupling with the flight.
+"""
 
 import math
 
@@ -7,8 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
-from avsreplay.plan import Limits, PlanParams, Scene, constrained, path_of, rendezvous, turn_to
-from avsreplay.plan.attitude import Turn, angular_acceleration, without_turn
+from avsreplay.plan.attitude import Turn, angular_acceleration, turn_to, without_turn
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.limits import Scene
+from avsreplay.plan.path import path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 PARAMS = PlanParams(horizon_s=60.0)
@@ -52,7 +59,10 @@ def test_the_shorter_way_round_is_taken():
         PlanParams(a_max_mps2=0.02),
     )
     other = rendezvous(
-        lambda t: (np.outer(3.0 - 2 * np.pi + 0.05 * t, [0, 0, 1]), np.tile([0, 0, 0.05], (len(t), 1))),
+        lambda t: (
+            np.outer(3.0 - 2 * np.pi + 0.05 * t, [0, 0, 1]),
+            np.tile([0, 0, 0.05], (len(t), 1)),
+        ),
         REST,
         REST,
         PlanParams(a_max_mps2=0.02),
@@ -61,9 +71,13 @@ def test_the_shorter_way_round_is_taken():
     assert back.ready_s(0.0) < turn.ready_s(0.0)
 
 
-@pytest.mark.parametrize(("accel", "status"), [(0.0016, PlanStatus.INFEASIBLE), (0.0017, PlanStatus.NOT_FOUND)])
+@pytest.mark.parametrize(
+    ("accel", "status"), [(0.0016, PlanStatus.INFEASIBLE), (0.0017, PlanStatus.NOT_FOUND)]
+)
 def test_a_rate_out_of_reach_is_proven_impossible_and_no_other(accel, status):
-    """In 60 s the gripper reaches 60 s times its angular acceleration, the fixture has 0.1 rad/s."""
+    """In 60 s the gripper reaches 60 s times its angular acceleration, the fixture has 0.1
+    rad/s.
+    """
     target = spinning([0, 0, 1], 3.0, 0.1)
     assert turn_to(target, IDENTITY, REST, accel, PARAMS, 0) is None
     answer = without_turn(Turn(0, IDENTITY), target, accel, PARAMS, 0)
@@ -86,7 +100,8 @@ def test_attitude_and_rate_agree_at_the_end_within_the_bound(seed):
     assert (before.inv() * exact).magnitude() < 1e-4
     rates = [
         (
-            Rotation.from_quat(f(np.array([end - 2e-3]))[0]).inv() * Rotation.from_quat(f(np.array([end - 1e-3]))[0])
+            Rotation.from_quat(f(np.array([end - 2e-3]))[0]).inv()
+            * Rotation.from_quat(f(np.array([end - 1e-3]))[0])
         ).as_rotvec()
         / 1e-3
         for f in (turn.at, target)
@@ -107,7 +122,12 @@ def test_the_bound_holds_at_the_end_of_the_turn_where_the_acceleration_is_larges
 
 
 def test_the_capture_is_the_later_of_flight_and_turn():
-    goal = lambda t: (np.stack([0 * t, 4.0 + 0.01 * t, 0 * t], 1), np.tile([0.0, 0.01, 0.0], (len(t), 1)))  # noqa: E731
+    def goal(t):
+        return (
+            np.stack([0 * t, 4.0 + 0.01 * t, 0 * t], 1),
+            np.tile([0.0, 0.01, 0.0], (len(t), 1)),
+        )
+
     free = rendezvous(goal, REST, REST, PARAMS)
     assert rendezvous(goal, REST, REST, PARAMS, earliest_s=free.t_go_s - 1.0).t_go_s == free.t_go_s
     late = rendezvous(goal, REST, REST, PARAMS, earliest_s=free.t_go_s + 7.0)
@@ -115,8 +135,12 @@ def test_the_capture_is_the_later_of_flight_and_turn():
     assert late.t_go_s == pytest.approx(free.t_go_s + 7.0)
     assert late.u_max < free.u_max
     assert late.position_error_m < 1e-8
-    limited = constrained(Scene(goal), REST, REST, PARAMS, Limits(speed_max_mps=0.3), earliest_s=40.0)
+    limited = constrained(
+        Scene(goal), REST, REST, PARAMS, Limits(speed_max_mps=0.3), earliest_s=40.0
+    )
     assert limited.t_go_s >= 40.0 - 1e-9
     assert limited.t_go_s == pytest.approx(40.0, abs=1e-3)
-    speed = np.linalg.norm(path_of(limited, REST, REST).at(np.linspace(0.0, limited.t_go_s, 2001))[1], axis=1)
+    speed = np.linalg.norm(
+        path_of(limited, REST, REST).at(np.linspace(0.0, limited.t_go_s, 2001))[1], axis=1
+    )
     assert speed.max() <= 0.3 * (1 + 1e-6)

@@ -1,4 +1,6 @@
-"""The cone programme of one iteration against an independent solver, and invalid input of the extension."""
+"""The cone programme of one iteration against an independent solver, and invalid input of the
+extension.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from avsreplay.plan import Limits, PlanParams, _cone, margins
+from avsreplay.plan import _cone
 from avsreplay.plan.cone_programme import PointRows, Subproblem, solve
 from avsreplay.plan.convexification import ReferencePath, convex_subproblem, interval_fractions
-from avsreplay.plan.limits import Case, SampledScene
+from avsreplay.plan.limits import Case, SampledScene, margins
+from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from plan_scenes import problems
@@ -28,7 +32,12 @@ def _rows(rng, n, count, vectors, offset, slack=True):
     constant[:, 0] = offset
     first = np.tile(np.eye(1, group)[0] * slack, count)
     return PointRows(
-        interval, fraction, vectors.reshape(-1, 3), constant.ravel(), 0.1 * rng.normal(size=count * group), first
+        interval,
+        fraction,
+        vectors.reshape(-1, 3),
+        constant.ravel(),
+        0.1 * rng.normal(size=count * group),
+        first,
     )
 
 
@@ -57,12 +66,18 @@ def _problem(seed, n=8):
 
 
 def _independent(p):
-    """The same programme in Clarabel, its constraints collected by evaluating them: interval length and slack."""
+    """The same programme in Clarabel, its constraints collected by evaluating them.
+
+    Interval length and slack.
+    """
     clarabel = pytest.importorskip("clarabel", reason="the independent solver is not installed")
     from scipy import sparse
 
     def values(x):
-        """All constraints at x = (w, h/h_ref, slack), in metres; positive parts first, then cones of four rows."""
+        """All constraints at x = (w, h/h_ref, slack), in metres.
+
+        Positive parts first, then cones of four rows.
+        """
         w, g, slack = x[:-2].reshape(p.n, 3), x[-2], x[-1]
         q = p.v0 * p.h * g + np.concatenate([np.zeros((1, 3)), np.cumsum(w, axis=0)])
         r = p.r0 + np.concatenate([np.zeros((1, 3)), np.cumsum(q[:-1] + 0.5 * w, axis=0)])
@@ -70,9 +85,19 @@ def _independent(p):
         def at(rows):
             k, s = rows.interval, rows.fraction[:, None]
             point = r[k] + s * q[k] + 0.5 * s * s * w[k]
-            return np.sum(rows.vector * point, axis=1) + rows.offset + rows.rate * (g - 1.0) + rows.slack * slack
+            return (
+                np.sum(rows.vector * point, axis=1)
+                + rows.offset
+                + rows.rate * (g - 1.0)
+                + rows.slack * slack
+            )
 
-        positive = [g - max(1.0 - p.change, p.earliest / p.h), 1.0 + p.change - g, slack, *at(p.planes[0])]
+        positive = [
+            g - max(1.0 - p.change, p.earliest / p.h),
+            1.0 + p.change - g,
+            slack,
+            *at(p.planes[0]),
+        ]
         if p.axes is not None:
             bound = p.h**2 * (2.0 * g - 1.0)
             positive += [*(bound - w @ p.axes.T).ravel(), *(bound + w @ p.axes.T).ravel()]
@@ -104,12 +129,17 @@ def _independent(p):
 
 @pytest.mark.parametrize("seed", range(24))
 def test_a_programme_has_the_solution_of_an_independent_solver(seed):
-    """Cost, feasibility in the constraints written anew, and the interval length where the slack is zero in both."""
+    """Cost, feasibility in the constraints written anew, and the interval length where the slack is
+    zero in both.
+    """
     p = _problem(seed)
     h, slack, values, scale = _independent(p)
     found = solve(p)
     assert found is not None
-    ours, theirs = found.h / p.h + p.weight * found.slack / scale, h / p.h + p.weight * slack / scale
+    ours, theirs = (
+        found.h / p.h + p.weight * found.slack / scale,
+        h / p.h + p.weight * slack / scale,
+    )
     assert ours == pytest.approx(theirs, abs=3e-5 * max(1.0, abs(theirs)))
     x = np.concatenate([(found.u * found.h**2).ravel(), [found.h / p.h, found.slack]])
     s, positive = values(x)
@@ -122,7 +152,10 @@ def test_a_programme_without_a_solution_has_none():
     """A speed bound below the speed at the begin."""
     p = _problem(2)
     p = Subproblem(
-        **{name: getattr(p, name) for name in ("n", "h", "r0", "rho", "rate", "acceleration", "a_max")},
+        **{
+            name: getattr(p, name)
+            for name in ("n", "h", "r0", "rho", "rate", "acceleration", "a_max")
+        },
         v0=np.array([5.0, 0.0, 0.0]),
         change=0.25,
         speed=0.01,
@@ -135,9 +168,23 @@ def test_rows_that_do_not_fit_are_refused():
     C, d = np.zeros((2, 11)), np.zeros(2)
 
     def call(stage, cones):
-        return _cone.solve(2, (0.0, 0.0, 0.0), (1.0, 1.0), np.array(stage, np.int32), C, d, np.array(cones, np.int32))
+        return _cone.solve(
+            2,
+            (0.0, 0.0, 0.0),
+            (1.0, 1.0),
+            np.array(stage, np.int32),
+            C,
+            d,
+            np.array(cones, np.int32),
+        )
 
-    for stage, cones in (([0, 1], [2]), ([0, 0], [1]), ([0, 2], [1, 1]), ([0, 0], [5]), ([0, 0], [1, 0, 1])):
+    for stage, cones in (
+        ([0, 1], [2]),
+        ([0, 0], [1]),
+        ([0, 2], [1, 1]),
+        ([0, 0], [5]),
+        ([0, 0], [1, 0, 1]),
+    ):
         with pytest.raises(ValueError, match=r"cone|stage"):
             call(stage, cones)
 
@@ -147,7 +194,14 @@ def _reference(limits, entry=None):
     problem = problems(1, 5)[0]
     params = PlanParams(a_max_mps2=problem.a_max)
     resolved = limits.resolved(8.0)
-    case = Case(SampledScene(problem.scene, 120.0, 0.2, 60.0), resolved, params, problem.r0, np.zeros(3), 1e-4)
+    case = Case(
+        SampledScene(problem.scene, 120.0, 0.2, 60.0),
+        resolved,
+        params,
+        problem.r0,
+        np.zeros(3),
+        1e-4,
+    )
     s = interval_fractions(resolved.nodes)
     goal = problem.scene.goal(40.0 * s)[0]
     path = goal * s[:, None] + 0.3 * np.sin(7.0 * s)[:, None] + (1.0 - s)[:, None]
@@ -155,14 +209,19 @@ def _reference(limits, entry=None):
 
 
 def _values(p, rows, h=1.0):
-    """Rows at the positions of the reference, ``vector.r + offset + rate (h - 1)``, without slack."""
+    """Rows at the positions of the reference, ``vector.r + offset + rate (h - 1)``, without
+    slack.
+    """
     r = p[np.asarray(2 * rows.interval + (rows.fraction == 1.0), dtype=int)]
     return np.sum(rows.vector * r, axis=1) + rows.offset + rows.rate * (h - 1.0)
 
 
 @pytest.mark.parametrize("entry", [None, (0.5, 0.8)])
 def test_rows_of_the_constraints_have_the_margins_at_the_reference(entry):
-    """A plane has the margin of the second alternative there; in a cone the first row less the norm of the others."""
+    """A plane has the margin of the second alternative there.
+
+    In a cone the first row less the norm of the others.
+    """
     base = (0.0, 2.0, 0.0)
     workspace = Limits(reach_max_m=30.0, reach_min_m=0.01, base_m=base)
     limits = replace(workspace, cone_deg=35.0, final_deg=15.0, clearance_m=0.2, keepout_m=0.4)
@@ -183,7 +242,11 @@ def test_rows_of_the_constraints_have_the_margins_at_the_reference(entry):
         k = 2 * cones.interval[begin] + (cones.fraction[begin] == 1.0)
         margin = value[begin] - np.linalg.norm(value[begin + 1 : begin + size])
         rest = margin + tight[k]
-        balls = (case.limits.keepout_release_m - away[k], case.limits.final_range_m - away[k], 30.0 - from_base[k])
+        balls = (
+            case.limits.keepout_release_m - away[k],
+            case.limits.final_range_m - away[k],
+            30.0 - from_base[k],
+        )
         expected = balls if size == 4 else (found.first[k, 0], found.first[k, 1])
         assert np.abs(np.array(expected) - rest).min() < 1e-9
     value = _values(reference.r, planes)
@@ -223,7 +286,10 @@ def test_rows_change_with_the_end_time_as_the_target_moves():
 
 def test_motion_between_samples_is_the_cubic_spline():
     rng = np.random.default_rng(3)
-    x, times = np.linspace(0.0, 7.0, 29), np.concatenate([rng.uniform(0.0, 7.0, 200), [0.0, 7.0, 0.25, 7.1]])
+    x, times = (
+        np.linspace(0.0, 7.0, 29),
+        np.concatenate([rng.uniform(0.0, 7.0, 200), [0.0, 7.0, 0.25, 7.1]]),
+    )
     spline = CubicSpline(x, rng.normal(size=(29, 12)))
     for order in (0, 1):
         rho, turn = _cone.motion(np.ascontiguousarray(spline.c), x, times, order)
@@ -241,12 +307,19 @@ def test_coefficients_and_values_are_those_of_the_spline_of_scipy(n):
     spline, pieces, times = CubicSpline(x, y), _cone.spline(x, y), rng.uniform(x[0], x[-1], 100)
     np.testing.assert_allclose(pieces, spline.c, atol=1e-11 * np.abs(spline.c).max())
     for order in (0, 1):
-        np.testing.assert_allclose(_cone.values(pieces, x, times, order), spline(times, order), atol=1e-11)
+        np.testing.assert_allclose(
+            _cone.values(pieces, x, times, order), spline(times, order), atol=1e-11
+        )
 
 
 def test_nodes_of_a_spline_ascend_and_are_at_least_four():
     x = np.arange(5.0)
-    for nodes, values in ((x[:3], x[:3]), (x, x[:4]), (x[::-1].copy(), x), (np.array([0.0, 1.0, 1.0, 2.0]), x[:4])):
+    for nodes, values in (
+        (x[:3], x[:3]),
+        (x, x[:4]),
+        (x[::-1].copy(), x),
+        (np.array([0.0, 1.0, 1.0, 2.0]), x[:4]),
+    ):
         with pytest.raises(ValueError, match="spline"):
             _cone.spline(nodes, values[:, None].copy())
     with pytest.raises(ValueError, match="pieces"):

@@ -1,4 +1,7 @@
-"""Plans under limits: the limits hold between the nodes, and inactive limits do not change a plan."""
+"""Plans under limits.
+
+The limits hold between the nodes, and inactive limits do not change a plan.
+"""
 
 import math
 import sys
@@ -11,9 +14,12 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
-from avsreplay.plan import Limits, PlanParams, Scene, StepPath, constrained, path_of, rendezvous
 from avsreplay.plan.cone_programme import solve
-from avsreplay.plan.limits import margin
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.limits import Scene, margin
+from avsreplay.plan.path import StepPath, path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from plan_scenes import problems
@@ -24,7 +30,10 @@ CENTRE = np.array([0.0, 0.0, 5.0])
 
 
 def body(rate=0.03, arm=1.0, phase=0.5):
-    """A target that turns about y at ``rate``; the grasp point lies on an arm along +x of {C}, as does the axis."""
+    """A target that turns about y at ``rate``.
+
+    The grasp point lies on an arm along +x of {C}, as does the axis.
+    """
 
     def axis(t):
         return np.stack([np.sin(rate * t + phase), 0 * t, -np.cos(rate * t + phase)], 1)
@@ -54,7 +63,11 @@ def flown(plan, scene, per_second=2000):
 
 def across(r, apex, axis):
     along = np.sum((r - apex) * axis, axis=1)
-    return along, np.linalg.norm(r - apex - along[:, None] * axis, axis=1), np.linalg.norm(r - apex, axis=1)
+    return (
+        along,
+        np.linalg.norm(r - apex - along[:, None] * axis, axis=1),
+        np.linalg.norm(r - apex, axis=1),
+    )
 
 
 def test_no_limit_is_the_certified_plan():
@@ -82,7 +95,9 @@ def test_speed_limit_from_rest_to_rest_in_closed_form():
     assert plan.t_go_s == pytest.approx(exact, abs=5e-3)
     assert plan.t_go_s >= exact - 1e-6
     assert plan.status is PlanStatus.FEASIBLE
-    assert np.linalg.norm(path_of(plan, ORIGIN, ORIGIN).nodes()[1], axis=1).max() <= 0.3 * (1 + 1e-6)
+    assert np.linalg.norm(path_of(plan, ORIGIN, ORIGIN).nodes()[1], axis=1).max() <= 0.3 * (
+        1 + 1e-6
+    )
 
 
 def test_cone_holds_between_nodes_and_costs_time():
@@ -131,7 +146,9 @@ def test_sphere_is_kept_out_of_and_only_claimed_feasible():
     assert np.linalg.norm(r - CENTRE, axis=1)[away].min() >= 1.2 - 1e-6
     free = path_of(rendezvous(scene.goal, ORIGIN, ORIGIN, PARAMS), ORIGIN, ORIGIN)
     through = free.at(np.linspace(0, free.t_go_s, 500))[0]
-    assert np.linalg.norm(through - CENTRE, axis=1).min() < 1.1  # without the limit it would have gone through
+    assert (
+        np.linalg.norm(through - CENTRE, axis=1).min() < 1.1
+    )  # without the limit it would have gone through
 
 
 def test_steps_are_flown_as_an_integrator_would():
@@ -141,7 +158,9 @@ def test_steps_are_flown_as_an_integrator_would():
     y, at = np.r_[r0, v0], 0.0
     for stop in (0.7, *(0.7 + 0.5 * (k + 1) for k in range(12)), 8.0):
         push = flight.thrust(np.array([0.5 * (at + stop)]))[0]
-        y = solve_ivp(lambda t, y, push=push: np.r_[y[3:], push], [at, stop], y, method="DOP853", rtol=1e-12).y[:, -1]
+        y = solve_ivp(
+            lambda t, y, push=push: np.r_[y[3:], push], [at, stop], y, method="DOP853", rtol=1e-12
+        ).y[:, -1]
         at = stop
         got = np.concatenate([x[0] for x in flight.at(np.array([stop]))])
         assert np.allclose(got, y, atol=1e-12)
@@ -156,7 +175,9 @@ def test_latency_coasts_first():
 
 
 def test_what_is_proven_impossible_is_infeasible():
-    plan = constrained(body(0.1), ORIGIN, ORIGIN, PlanParams(horizon_s=30.0), Limits(speed_max_mps=0.05))
+    plan = constrained(
+        body(0.1), ORIGIN, ORIGIN, PlanParams(horizon_s=30.0), Limits(speed_max_mps=0.05)
+    )
     assert plan.status is PlanStatus.INFEASIBLE
     assert not plan.found
     assert math.isnan(plan.t_go_s)
@@ -174,7 +195,9 @@ def test_margin_is_positive_along_a_plan_and_negative_off_it():
         assert margin(then, limits, r, v + np.array([1.0, 0, 0])) < 0.0
     apex, axis = scene.goal(np.zeros(1))[0][0], axis_of(scene, np.zeros(1))[0]
     assert margin(scene, limits, apex - 0.5 * axis, ORIGIN) < 0.0
-    assert margin(scene, Limits(cone_deg=25.0).resolved(8.0), apex - 5.0 * axis, ORIGIN) == pytest.approx(3.0 + 0.01)
+    assert margin(
+        scene, Limits(cone_deg=25.0).resolved(8.0), apex - 5.0 * axis, ORIGIN
+    ) == pytest.approx(3.0 + 0.01)
 
 
 def test_a_search_that_fails_does_not_claim_impossibility():
@@ -188,9 +211,13 @@ def test_a_search_that_fails_does_not_claim_impossibility():
 
 def test_a_corridor_inside_the_clearance_is_proven_impossible():
     scene = replace(body(), surface=lambda y: (np.zeros_like(y), np.linalg.norm(y, axis=1)))
-    shut = constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.6, final_deg=15.0, final_range_m=0.5))
+    shut = constrained(
+        scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.6, final_deg=15.0, final_range_m=0.5)
+    )
     assert shut.status is PlanStatus.INFEASIBLE
-    assert constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.4, final_deg=15.0, final_range_m=0.5)).found
+    assert constrained(
+        scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.4, final_deg=15.0, final_range_m=0.5)
+    ).found
 
 
 def test_a_target_that_never_enters_the_workspace_is_proven_impossible():
@@ -202,7 +229,8 @@ def test_a_target_that_never_enters_the_workspace_is_proven_impossible():
     inside = constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(reach_max_m=most + 0.1))
     assert inside.found
     assert inside.t_go_s == pytest.approx(free.t_go_s, abs=1e-3)
-    # 26 - 10 cos(0.03 t + 0.5) is the squared distance of the grasp point; it reaches 5.5 m at 50.3 s
+    # 26 - 10 cos(0.03 t + 0.5) is the squared distance of the grasp point; it reaches 5.5 m at 50.3
+    # s
     late = constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(reach_min_m=5.5))
     exact = (math.acos((26.0 - 5.5**2) / 10.0) - 0.5) / 0.03
     assert exact - 0.5 <= late.lower_bound_s <= exact
@@ -210,7 +238,10 @@ def test_a_target_that_never_enters_the_workspace_is_proven_impossible():
 
 def test_a_warm_start_solves_few_programmes(monkeypatch):
     module = sys.modules["avsreplay.plan.constrained"]
-    scene, limits = replace(body(0.05, phase=1.8), surface=ball), Limits(final_deg=15.0, clearance_m=0.3)
+    scene, limits = (
+        replace(body(0.05, phase=1.8), surface=ball),
+        Limits(final_deg=15.0, clearance_m=0.3),
+    )
     plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
     path, solved = path_of(plan, ORIGIN, ORIGIN), []
     monkeypatch.setattr(module, "solve", lambda p: solved.append(p.n) or solve(p))
@@ -249,7 +280,9 @@ def test_the_robot_keeps_clear_of_the_body_and_arrives_from_outside(phase):
     assert plan.violation_m == 0.0
     _, r, _, apex, axis = flown(plan, scene)
     along, off, distance = across(r, apex, axis)
-    corridor = (off <= math.tan(math.radians(15.0)) * along + 0.01 + 1e-6) & (distance <= 0.5 + 1e-6)
+    corridor = (off <= math.tan(math.radians(15.0)) * along + 0.01 + 1e-6) & (
+        distance <= 0.5 + 1e-6
+    )
     gap = np.linalg.norm(r - CENTRE, axis=1) - 0.8
     assert np.all(corridor | (gap >= 0.3 - 1e-6))
     before = distance > 0.02
@@ -277,12 +310,18 @@ def test_an_abort_at_any_instant_outside_the_corridor_keeps_the_clearance(phase)
 
 
 def test_the_clearance_grows_with_the_predicted_uncertainty():
-    wide = replace(body(0.05, phase=1.8), surface=ball, sigma=lambda t: (np.full(len(t), 0.1), np.zeros(len(t))))
+    wide = replace(
+        body(0.05, phase=1.8),
+        surface=ball,
+        sigma=lambda t: (np.full(len(t), 0.1), np.zeros(len(t))),
+    )
     limits = Limits(final_deg=15.0, final_range_m=0.5, mouth_m=0.01, clearance_m=0.1)
     plan = constrained(wide, ORIGIN, ORIGIN, PARAMS, limits)
     _, r, _, apex, axis = flown(plan, wide)
     along, off, distance = across(r, apex, axis)
-    corridor = (off <= math.tan(math.radians(15.0)) * along + 0.01 + 1e-6) & (distance <= 0.5 + 1e-6)
+    corridor = (off <= math.tan(math.radians(15.0)) * along + 0.01 + 1e-6) & (
+        distance <= 0.5 + 1e-6
+    )
     gap = np.linalg.norm(r - CENTRE, axis=1) - 0.8
     assert np.all(corridor | (gap >= 0.1 + 3 * 0.1 - 1e-6))
 
@@ -317,17 +356,24 @@ def test_a_limit_without_what_it_needs_is_named():
 
 @pytest.mark.parametrize(("number", "known_s"), [(9, 19.776), (19, 28.902), (30, 25.119)])
 def test_plans_with_a_clearance_are_near_the_best_known(number, known_s):
-    """Times of IPOPT with 200 nodes (tests/benchmarks/plan_limits.py --kind body), whose excess is below 1 mm."""
+    """Times of IPOPT with 200 nodes (tests/benchmarks/plan_limits.py --kind body), whose excess is
+    below 1 mm.
+    """
     problem = problems(number + 1)[number]
     limits = Limits(final_deg=15.0, clearance_m=0.25, abort=False)
-    plan = constrained(problem.scene, problem.r0, ORIGIN, PlanParams(a_max_mps2=problem.a_max), limits)
+    plan = constrained(
+        problem.scene, problem.r0, ORIGIN, PlanParams(a_max_mps2=problem.a_max), limits
+    )
     assert plan.found
     assert plan.t_go_s <= known_s + 0.1
     assert plan.violation_m == 0.0
 
 
 def test_the_number_of_intervals_costs_less_than_a_tenth_of_a_second():
-    """Time of IPOPT with 200 nodes: plan_limits.py --kind cone --first 37 --count 1 --seed 71 --ipopt 38."""
+    """Time of IPOPT with 200 nodes.
+
+    Plan_limits.py --kind cone --first 37 --count 1 --seed 71 --ipopt 38.
+    """
     problem = problems(38, 71)[37]
     params = PlanParams(a_max_mps2=problem.a_max)
     plan = constrained(problem.scene, problem.r0, ORIGIN, params, Limits(cone_deg=35.0))
@@ -339,10 +385,14 @@ def test_an_earliest_capture_before_that_of_the_plan_does_not_change_the_plan(nu
     """Acceleration bounded per axis of a turned base, which makes drafts hard to refine."""
     base = (0.1830127, 0.1830127, 0.6830127, 0.6830127)
     shell = {"base_m": (0.0, 0.0, -1.0), "reach_min_m": 0.5, "reach_max_m": 9.0}
-    limits = Limits(final_deg=15.0, clearance_m=0.25, accel_axes_mps2=(0.075, 0.05, 0.0375), **shell)
+    limits = Limits(
+        final_deg=15.0, clearance_m=0.25, accel_axes_mps2=(0.075, 0.05, 0.0375), **shell
+    )
     limits = replace(limits, base_attitude_xyzw=base).resolved(8.0)
     scene, params = problems(number + 1)[number].scene, PlanParams(a_max_mps2=0.0375, latency_s=0.2)
-    alone, bounded = (constrained(scene, ORIGIN, ORIGIN, params, limits, earliest_s=e) for e in (0.0, earliest_s))
+    alone, bounded = (
+        constrained(scene, ORIGIN, ORIGIN, params, limits, earliest_s=e) for e in (0.0, earliest_s)
+    )
     assert alone.found
     assert bounded.found
     assert bounded.t_go_s >= earliest_s
@@ -353,7 +403,9 @@ def test_an_earliest_capture_before_that_of_the_plan_does_not_change_the_plan(nu
 
 
 def test_a_late_capture_of_a_target_that_turns_far_is_found():
-    """The coarse intervals are short enough for the turn of the target until the earliest capture that is allowed."""
+    """The coarse intervals are short enough for the turn of the target until the earliest capture
+    that is allowed.
+    """
     problem, limits = problems(22, 1)[21], Limits(final_deg=15.0, clearance_m=0.3)
     params = PlanParams(a_max_mps2=0.05, latency_s=0.5)
     plan = constrained(problem.scene, problem.r0, ORIGIN, params, limits, earliest_s=73.245)

@@ -1,4 +1,6 @@
-"""Properties of guidance over random sequences of healthy and faulty scans, lost convergence, growing uncertainty."""
+"""Properties of guidance over random sequences of healthy and faulty scans, lost convergence,
+growing uncertainty.
+"""
 
 from dataclasses import replace
 
@@ -6,24 +8,14 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import angle, conjugate, exp, multiply
-from avsreplay.plan import (
-    Action,
-    Guidance,
-    Limits,
-    PlannerInput,
-    PlanParams,
-    Scene,
-    Segment,
-    StepPath,
-    Supervisor,
-    SupervisorParams,
-    Tolerance,
-    closed_loop,
-    pushed,
-    rendezvous,
-    with_thrust_error,
-)
-from avsreplay.plan.limits import margin
+from avsreplay.plan.flights import closed_loop, pushed, with_thrust_error
+from avsreplay.plan.guidance import Guidance, PlannerInput, Segment
+from avsreplay.plan.limits import Scene, margin
+from avsreplay.plan.path import StepPath
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
+from avsreplay.plan.supervisor import Action, Supervisor, SupervisorParams
+from avsreplay.plan.uncertainty import Tolerance
 from avsreplay.records import Forecast
 
 RADIUS = 1.5
@@ -35,7 +27,9 @@ WITHDRAWN = (Action.HOLD, Action.RETREAT, Action.ABORT)
 
 
 def scene(rng):
-    """A target that turns at a random constant rate, with the grasp point 1 m from its centre of mass."""
+    """A target that turns at a random constant rate, with the grasp point 1 m from its centre of
+    mass.
+    """
     w = rng.normal(size=3)
     w *= rng.uniform(0.02, 0.12) / np.linalg.norm(w)
     arm, x = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
@@ -53,7 +47,10 @@ def scene(rng):
 
 
 def inputs(rng, end_s=160.0, step_s=0.5):
-    """Scans in random runs of healthy, faulty and unconverged; the uncertainty grows while no scan is healthy."""
+    """Scans in random runs of healthy, faulty and unconverged.
+
+    The uncertainty grows while no scan is healthy.
+    """
     target, growth = scene(rng), rng.uniform(0.0, 1.0)
     mode, until, healthy_s = "healthy", 3.0, 0.0
     for t in np.arange(0.0, end_s, step_s):
@@ -66,7 +63,9 @@ def inputs(rng, end_s=160.0, step_s=0.5):
             grown = 0.002 * (1.0 + growth * (since + dt))
             return Forecast(dt, grown, 0.3 * grown, 0.1 * grown)
 
-        yield PlannerInput(round(t * 1e9), int(mode == "healthy"), mode != "lost", target.after(t), forecast)
+        yield PlannerInput(
+            round(t * 1e9), int(mode == "healthy"), mode != "lost", target.after(t), forecast
+        )
 
 
 def flights(seed, limits=None, end_s=160.0):
@@ -89,7 +88,10 @@ def test_every_sequence_ends_and_attempts_are_limited(seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_withdrawal_comes_no_closer_than_braking_needs(seed):
-    """Distance d0, approach speed v0 along the line of sight: never nearer than d0 - v0^2 / (2 a)."""
+    """Distance d0, approach speed v0 along the line of sight.
+
+    Never nearer than d0 - v0^2 / (2 a).
+    """
     begin = None
     for known, state in flights(seed):
         t = known.t_ns * 1e-9
@@ -116,7 +118,10 @@ def test_limits_hold_in_every_plan_of_a_flight():
         if plan is None or not plan.found or plan.t_ns != known.t_ns:
             continue
         constrained += plan.thrust is not None
-        assert plan.margin_m >= 0.0 or margin(known.scene, limits, *state.segment.at(known.t_ns)) < limits.mouth_m
+        assert (
+            plan.margin_m >= 0.0
+            or margin(known.scene, limits, *state.segment.at(known.t_ns)) < limits.mouth_m
+        )
     assert constrained > 3
 
 
@@ -126,7 +131,10 @@ def test_the_gripper_has_the_attitude_of_the_fixture_at_the_capture(accel):
     target, start = scene(rng), exp(np.array([1.5, -1.0, 0.4]))
     guidance = Guidance(ROBOT, Supervisor(PARAMS), gripper=(start, accel))
     exact = lambda dt: Forecast(dt, *(1e-4 * np.ones((3, len(dt)))))  # noqa: E731
-    known = (PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in np.arange(0.0, 120.0, 0.5))
+    known = (
+        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
+        for t in np.arange(0.0, 120.0, 0.5)
+    )
     attitudes, state = [], None
     for each, state in guidance.fly(known):
         turn = state.segment.turn
@@ -150,13 +158,18 @@ def loop(noise_mps2, seed=0, latency_s=0.0):
     rng = np.random.default_rng(seed)
     target = scene(rng)
     exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = (PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in np.arange(0.4, 120.0, 0.2))
+    known = (
+        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
+        for t in np.arange(0.4, 120.0, 0.2)
+    )
     guidance = Guidance(replace(ROBOT, latency_s=latency_s), Supervisor(PARAMS))
     return closed_loop(guidance, known, target, 0, Tolerance(0.02, 0.01), noise_mps2, rng)[0]
 
 
 def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():
-    assert all(loop(0.0, seed, latency_s) == "captured" for seed in range(3) for latency_s in (0.0, 0.3))
+    assert all(
+        loop(0.0, seed, latency_s) == "captured" for seed in range(3) for latency_s in (0.0, 0.3)
+    )
     assert all(loop(0.001, seed, 0.3) == "captured" for seed in range(3))
     assert any(loop(0.2, seed, 0.3) != "captured" for seed in range(3))
 
@@ -169,15 +182,23 @@ def test_the_errors_of_the_thrust_over_one_second_do_not_depend_on_the_rate_of_t
         for _ in range(400):
             segment = Segment(0, path.r0, path.v0, path)
             for k in range(scans):
-                segment = with_thrust_error(segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng)
+                segment = with_thrust_error(
+                    segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng
+                )
             ends.append(segment.at(10**9)[1])
         spreads.append(np.std(ends))
-    assert spreads == pytest.approx([0.02, 0.02], rel=0.06)  # m/s after 1 s; 1200 values each: 2 % is 1 sigma
-    assert with_thrust_error(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None  # a coasting robot
+    assert spreads == pytest.approx(
+        [0.02, 0.02], rel=0.06
+    )  # m/s after 1 s; 1200 values each: 2 % is 1 sigma
+    assert (
+        with_thrust_error(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None
+    )  # a coasting robot
 
 
 def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
-    path = StepPath(np.zeros(3), np.zeros(3), np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, -0.1]]), 0.5, 6.5)
+    path = StepPath(
+        np.zeros(3), np.zeros(3), np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, -0.1]]), 0.5, 6.5
+    )
     segment = Segment(10**9, path.r0, path.v0, path)
     dr, dv = np.array([0.01, -0.02, 0.03]), np.array([0.002, 0.001, -0.003])
     moved = pushed(segment, 3 * 10**9, dr, dv)
@@ -188,7 +209,9 @@ def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
 
 
 @pytest.mark.parametrize(("off_m", "made_s"), [(0.0, [4.0]), (0.01, [4.0, 8.0])])
-def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_its_path(off_m, made_s):
+def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_its_path(
+    off_m, made_s
+):
     target, planned, state = scene(np.random.default_rng(3)), [], None
     guidance = Guidance(ROBOT, Supervisor(PARAMS))
     exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
@@ -196,7 +219,9 @@ def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_it
         t_ns = round(t * 1e9)
         state = state or guidance.initial(t_ns)
         if t == 8.0:
-            state = replace(state, segment=pushed(state.segment, t_ns, np.array([off_m, 0.0, 0.0]), np.zeros(3)))
+            state = replace(
+                state, segment=pushed(state.segment, t_ns, np.array([off_m, 0.0, 0.0]), np.zeros(3))
+            )
         state = guidance.step(state, PlannerInput(t_ns, int(t < 4.0), True, target.after(t), exact))
         planned += [state.plan.t_ns * 1e-9] if t > 4.0 else []
     assert state.decision.action is Action.APPROACH_ON_PREDICTION

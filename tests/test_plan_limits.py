@@ -1,4 +1,7 @@
-"""Constraints of the approach: margins of the alternatives, the workspace, and the limits in the rows of a run."""
+"""Constraints of the approach.
+
+Margins of the alternatives, the workspace, and the limits in the rows of a run.
+"""
 
 import math
 from pathlib import Path
@@ -8,9 +11,12 @@ import pytest
 
 from avsreplay import geometry, replay
 from avsreplay.build import target_geometry
-from avsreplay.plan import Limits, PlanParams, RobotParams, Scene, constrained, path_of
-from avsreplay.plan.limits import margins
-from avsreplay.simulate import builtin_surface
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.limits import Scene, margins
+from avsreplay.plan.path import path_of
+from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.simulate.target import builtin_surface
 
 X = np.array([1.0, 0.0, 0.0])
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -38,7 +44,9 @@ def test_a_change_of_alternative_between_two_points_is_seen():
     found = margins(still(), limits, y, y)
     assert found.values[:, 0].min() > 0.0
     t = np.linspace(0.0, 1.0, 1001)[:, None]
-    dense = margins(still(), limits, y[0] + t * (y[1] - y[0]), np.zeros((1001, 3))).values[:, 0].min()
+    dense = (
+        margins(still(), limits, y[0] + t * (y[1] - y[0]), np.zeros((1001, 3))).values[:, 0].min()
+    )
     assert dense < 0.0
     assert found.between[0, 0] == pytest.approx(dense, abs=0.05)
 
@@ -50,7 +58,9 @@ def test_signed_distance_of_the_built_in_target():
     assert target.surface(inside)[1][0] < 0.0
     foot, distance = target.surface(outside)
     assert distance[0] == pytest.approx(np.linalg.norm(outside - foot))
-    furthest = np.linalg.norm(surface.vertices + X, axis=1).max()  # from the centre of mass of ``still``
+    furthest = np.linalg.norm(
+        surface.vertices + X, axis=1
+    ).max()  # from the centre of mass of ``still``
     assert still(hull_c=target.hull_c).radius_m == pytest.approx(furthest)
 
 
@@ -59,7 +69,9 @@ def test_the_workspace_is_a_shell_about_the_base():
     plan = constrained(still(), np.zeros(3), np.array([0.0, 0.12, 0.0]), PlanParams(), limits)
     assert plan.found
     path = path_of(plan, np.zeros(3), np.array([0.0, 0.12, 0.0]))
-    away = np.linalg.norm(path.at(np.linspace(0.0, plan.t_go_s, 4001))[0] - np.array([0.0, 3.0, 0.0]), axis=1)
+    away = np.linalg.norm(
+        path.at(np.linspace(0.0, plan.t_go_s, 4001))[0] - np.array([0.0, 3.0, 0.0]), axis=1
+    )
     assert away.max() <= 6.0
     assert away.min() >= 2.0
     far = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(reach_max_m=4.0))
@@ -78,7 +90,9 @@ def test_thrust_and_size_of_the_robot():
     assert robot.limited(Limits(final_deg=10.0, clearance_m=0.1)).clearance_m == pytest.approx(0.25)
     assert robot.limited(Limits(final_deg=10.0)).clearance_m == pytest.approx(0.15)
     assert robot.limited(Limits()) == Limits()
-    assert "80 kg, at most 0.025 m/s2, attitude not planned, radius 0.15 m" in robot.described(PlanParams(), Limits())
+    assert "80 kg, at most 0.025 m/s2, attitude not planned, radius 0.15 m" in robot.described(
+        PlanParams(), Limits()
+    )
     with pytest.raises(ValueError, match="together"):
         RobotParams(mass_kg=80.0)
 
@@ -93,12 +107,23 @@ def test_a_robot_takes_precedence_over_plan_and_limits():
         reach_max_m=7.0,
         delay_s=0.3,
     )
-    params, limits = robot.applied(PlanParams()), robot.limited(Limits(reach_max_m=9.0, base_m=(5.0, 0.0, 0.0)))
+    params, limits = (
+        robot.applied(PlanParams()),
+        robot.limited(Limits(reach_max_m=9.0, base_m=(5.0, 0.0, 0.0))),
+    )
     assert (params.a_max_mps2, params.latency_s) == (0.02, 0.3)
-    assert (params.robot_position_m, params.robot_velocity_mps) == ((1.0, 0.0, 0.0), (0.0, 0.1, 0.0))
+    assert (params.robot_position_m, params.robot_velocity_mps) == (
+        (1.0, 0.0, 0.0),
+        (0.0, 0.1, 0.0),
+    )
     assert (limits.base_m, limits.reach_min_m, limits.reach_max_m) == ((0.0, 2.0, 0.0), 0.5, 7.0)
     line = robot.described(PlanParams(), Limits())
-    for part in ("(0.04, 0.02, 0.03) m/s2 per axis", "from (1, 0, 0) m", "0.5 to 7 m from the base", "delay 0.3 s"):
+    for part in (
+        "(0.04, 0.02, 0.03) m/s2 per axis",
+        "from (1, 0, 0) m",
+        "0.5 to 7 m from the base",
+        "delay 0.3 s",
+    ):
         assert part in line
     assert RobotParams().applied(PlanParams()) == PlanParams()
     with pytest.raises(ValueError, match="exclude"):
@@ -132,7 +157,9 @@ def test_every_plan_of_a_run_obeys_the_limits():
     rows = [row for row in replay(TUMBLE, *limits) if row.plan_status is not None]
     planned = [row for row in rows if row.plan_status in ("optimal", "feasible")]
     assert planned
-    assert all(row.plan_margin_m >= 0.0 and row.plan_limit in ("corridor", "body") for row in planned)
+    assert all(
+        row.plan_margin_m >= 0.0 and row.plan_limit in ("corridor", "body") for row in planned
+    )
     free = [row for row in replay(TUMBLE) if row.capture_time_s is not None]
     assert min(r.capture_time_s for r in planned) >= min(r.capture_time_s for r in free) - 1e-6
     assert all(row.plan_margin_m is None for row in free)

@@ -8,10 +8,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
-from avsreplay.plan import CostatePath, PlanParams, rendezvous
-from avsreplay.plan.path import sample_goal
+from avsreplay.plan.path import CostatePath, sample_goal
 from avsreplay.plan.reachable_set import _NODES, _WEIGHTS, Gauge, gauge, integrals, support
-from avsreplay.plan.rendezvous import _Margin
+from avsreplay.plan.rendezvous import PlanParams, _Margin, rendezvous
 
 ORIGIN = np.zeros(3)
 GAUSS = np.polynomial.legendre.leggauss(200)
@@ -23,18 +22,28 @@ def fixed(point, rate=(0.0, 0.0, 0.0)):
 
 
 def tumbling(rng, rate=(0.1, 0.35), arm=1.5):
-    """Grasp point of a torque-free body by DOP853: an oracle that shares nothing with the package."""
+    """Grasp point of a torque-free body by DOP853.
+
+    An oracle that shares nothing with the package.
+    """
     J, w, c = np.sort(rng.uniform(1, 3, 3)), rng.normal(size=3), rng.normal(size=3)
     w *= rng.uniform(*rate) / np.linalg.norm(w)
     c *= arm / np.linalg.norm(c)
-    centre, drift = rng.uniform(2, 8) * (d := rng.normal(size=3)) / np.linalg.norm(d), 0.02 * rng.normal(size=3)
+    centre, drift = (
+        rng.uniform(2, 8) * (d := rng.normal(size=3)) / np.linalg.norm(d),
+        0.02 * rng.normal(size=3),
+    )
 
     def flow(_, y):
         q, w = y[:4], y[4:]
-        return np.r_[0.5 * (q[3] * w + np.cross(q[:3], w)), -0.5 * q[:3] @ w, -np.cross(w, J * w) / J]
+        return np.r_[
+            0.5 * (q[3] * w + np.cross(q[:3], w)), -0.5 * q[:3] @ w, -np.cross(w, J * w) / J
+        ]
 
     start = np.r_[Rotation.random(random_state=int(rng.integers(1 << 30))).as_quat(), w]
-    path = solve_ivp(flow, [0, 125], start, method="DOP853", rtol=1e-11, atol=1e-12, dense_output=True).sol
+    path = solve_ivp(
+        flow, [0, 125], start, method="DOP853", rtol=1e-11, atol=1e-12, dense_output=True
+    ).sol
 
     def goal(t):
         y = path(np.asarray(t)).T
@@ -108,7 +117,9 @@ def test_rest_to_rest_is_bang_bang():
 
 def test_speed_alone_is_matched_along_one_straight_line():
     half = 0.5 * 0.4**2 / 0.05
-    goal = fixed([half - 8 * 0.4, 0, 0], [0.4, 0, 0])  # full thrust for 8 s meets it exactly: w is constant
+    goal = fixed(
+        [half - 8 * 0.4, 0, 0], [0.4, 0, 0]
+    )  # full thrust for 8 s meets it exactly: w is constant
     plan = rendezvous(goal, ORIGIN, ORIGIN, PlanParams(a_max_mps2=0.05))
     assert plan.t_go_s == pytest.approx(8.0, abs=1e-6)
 
@@ -125,7 +136,9 @@ def test_turning_the_whole_scene_turns_the_plan():
     one = rendezvous(goal, ORIGIN, ORIGIN)
     two = rendezvous(lambda t: tuple(R.apply(x) for x in goal(t)), ORIGIN, ORIGIN)
     assert two.t_go_s == pytest.approx(one.t_go_s, abs=1e-7)
-    assert np.allclose(R.apply(np.array(one.costate).reshape(2, 3)), two.costate.reshape(2, 3), atol=1e-6)
+    assert np.allclose(
+        R.apply(np.array(one.costate).reshape(2, 3)), two.costate.reshape(2, 3), atol=1e-6
+    )
 
 
 def test_a_moving_observer_sees_the_same_time():
@@ -149,7 +162,9 @@ def test_first_feasible_time_of_a_tumbling_goal(seed):
         return np.r_[y[3:], flight.thrust(np.array([t]))[0]]
 
     flight = CostatePath.of(plan, r0, v0)
-    end = solve_ivp(fly, [0, plan.t_go_s], np.r_[r0, v0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    end = solve_ivp(
+        fly, [0, plan.t_go_s], np.r_[r0, v0], method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
     rho, rate = goal(np.array([plan.t_go_s]))
     assert np.linalg.norm(end[:3] - rho[0]) < 1e-8
     assert np.linalg.norm(end[3:] - rate[0]) < 1e-8
@@ -164,8 +179,12 @@ def test_the_seventh_equation_is_an_identity_and_as_printed_is_false():
         flight = CostatePath(ORIGIN, v0, a, 0.0, end, c)
         ends = np.array([0.0, end])
         p, (_, v) = np.linalg.norm(flight.p(ends), axis=1), flight.at(ends)
-        assert a * (p[0] - p[1]) + c[:3] @ (v[1] - v[0]) == pytest.approx(0.0, abs=1e-10 * a * p.max() * end)
-        printed.append(a * (p[0] - p[1]))  # with the end met the printed velocity term is zero: this would have to be
+        assert a * (p[0] - p[1]) + c[:3] @ (v[1] - v[0]) == pytest.approx(
+            0.0, abs=1e-10 * a * p.max() * end
+        )
+        printed.append(
+            a * (p[0] - p[1])
+        )  # with the end met the printed velocity term is zero: this would have to be
     assert np.min(np.abs(printed)) > 1e-4
 
 
@@ -181,7 +200,9 @@ def test_latency_is_a_coast_and_then_the_same_problem():
 
 def test_a_goal_that_moves_away_is_infeasible_until_the_stated_time():
     plan = rendezvous(
-        lambda t: (0.5 * 0.06 * t[:, None] ** 2 + 1.0 + ORIGIN, 0.06 * t[:, None] + ORIGIN), ORIGIN, ORIGIN
+        lambda t: (0.5 * 0.06 * t[:, None] ** 2 + 1.0 + ORIGIN, 0.06 * t[:, None] + ORIGIN),
+        ORIGIN,
+        ORIGIN,
     )
     assert plan.status is PlanStatus.INFEASIBLE
     assert plan.lower_bound_s == pytest.approx(120.0)
@@ -191,7 +212,13 @@ def test_a_goal_that_moves_away_is_infeasible_until_the_stated_time():
 
 @pytest.mark.parametrize(
     "bad",
-    [{"a_max_mps2": 0.0}, {"a_max_mps2": math.nan}, {"horizon_s": 0.0}, {"latency_s": -1.0}, {"latency_s": 120.0}],
+    [
+        {"a_max_mps2": 0.0},
+        {"a_max_mps2": math.nan},
+        {"horizon_s": 0.0},
+        {"latency_s": -1.0},
+        {"latency_s": 120.0},
+    ],
 )
 def test_bad_parameters_are_named(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
@@ -206,8 +233,12 @@ def test_a_state_that_is_not_finite_is_named():
 
 
 def test_a_goal_without_relative_acceleration_does_not_divide_by_zero() -> None:
-    """With a steep slope and a margin at the limit of rounding, the bound moves by one step of the grid."""
-    goal = sample_goal(lambda t: (np.zeros((len(t), 3)),) * 2, np.ones(3), np.zeros(3), 0.0, 0.0, 10.0, 1.0)
+    """With a steep slope and a margin at the limit of rounding, the bound moves by one step of the
+    grid.
+    """
+    goal = sample_goal(
+        lambda t: (np.zeros((len(t), 3)),) * 2, np.ones(3), np.zeros(3), 0.0, 0.0, 10.0, 1.0
+    )
     found = Gauge(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, 0.0)
     reached = _Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
     assert 0.0 < reached <= goal.end

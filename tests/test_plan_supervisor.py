@@ -1,4 +1,7 @@
-"""The supervisor: every rule can apply, and their order holds. Guidance: flights on a constructed estimate."""
+"""The supervisor: every rule can apply, and their order holds. Guidance.
+
+Flights on a constructed estimate.
+"""
 
 import dataclasses
 import math
@@ -8,25 +11,21 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import IDENTITY_QUAT, Pose, exp
-from avsreplay.plan import (
+from avsreplay.plan.flights import execute, interpolated, miss
+from avsreplay.plan.guidance import Guidance, PlannerInput
+from avsreplay.plan.limits import Scene
+from avsreplay.plan.path import CostatePath
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
+from avsreplay.plan.supervisor import (
     RULES,
     Action,
-    CostatePath,
     Facts,
-    Guidance,
-    Limits,
-    PlannerInput,
-    PlanParams,
-    Scene,
     Supervisor,
     SupervisorMemory,
     SupervisorParams,
-    Tolerance,
-    execute,
-    interpolated,
-    miss,
-    rendezvous,
 )
+from avsreplay.plan.uncertainty import Tolerance
 from avsreplay.records import Forecast
 
 PARAMS = SupervisorParams().resolved(8.0)
@@ -48,7 +47,10 @@ POOR = {"pos_1s_m": 0.5}
 
 REACHED = {
     "aborted": (SupervisorMemory(Action.ABORT, "held_too_long", moving=True), {}),
-    "captured": (SupervisorMemory(Action.CAPTURE, "arrived_sure", moving=True), {"gamma": 0, "converged": False}),
+    "captured": (
+        SupervisorMemory(Action.CAPTURE, "arrived_sure", moving=True),
+        {"gamma": 0, "converged": False},
+    ),
     "held_too_long": (dataclasses.replace(HOLDING, held_since_s=-11.0), {}),
     "constraint_broken": (MOVING, {"margin": -0.01}),
     "too_long": (dataclasses.replace(MOVING, began_s=-600.0), {}),
@@ -128,8 +130,13 @@ def turning(rate=0.1, arm=1.0, distance=5.0):
     return at
 
 
-def inputs(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0, end=90.0, from_s=5.0):
-    """What a made-up estimator knows: the truth, moved by ``error`` [m]; sigmas grow with prediction time."""
+def inputs(
+    truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0, end=90.0, from_s=5.0
+):
+    """What a made-up estimator knows: the truth, moved by ``error`` [m].
+
+    Sigmas grow with prediction time.
+    """
     seen = 0.0
     for t in np.arange(0.0, end, 0.2):
         gamma = int(not any(a <= t < b for a, b in blind))
@@ -151,7 +158,10 @@ def inputs(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0,
 def fly(truth, **kwargs):
     guidance = Guidance(PlanParams(), Supervisor(PARAMS))
     return execute(
-        guidance, inputs(truth, **kwargs), truth, lambda known, dt: truth(np.array([known.t_ns * 1e-9 + dt]))[2][0]
+        guidance,
+        inputs(truth, **kwargs),
+        truth,
+        lambda known, dt: truth(np.array([known.t_ns * 1e-9 + dt]))[2][0],
     )
 
 
@@ -218,7 +228,9 @@ def test_latency_is_flown_on_the_current_segment():
         if memory.captured_ns is not None:
             break
     at_converged = round(5.0 / 0.2)
-    assert np.all(np.array(positions[: at_converged + 4]) == 0.0)  # the first plan's thrust begins 0.7 s later
+    assert np.all(
+        np.array(positions[: at_converged + 4]) == 0.0
+    )  # the first plan's thrust begins 0.7 s later
     jumps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert jumps.max() < 0.05 * 0.2 * 25  # no faster than thrust allows: the path is continuous
     assert execute(guidance, inputs(truth), truth).miss.distance_m < 1e-6
@@ -233,7 +245,9 @@ def test_a_violated_limit_makes_the_robot_retreat():
         if memory.decision.rule == "constraint_broken":
             break
     assert memory.decision.action is Action.RETREAT
-    speed = [np.linalg.norm(memory.segment.at(known.t_ns + round(s * 1e9))[1]) for s in (0.0, 2.0, 4.0)]
+    speed = [
+        np.linalg.norm(memory.segment.at(known.t_ns + round(s * 1e9))[1]) for s in (0.0, 2.0, 4.0)
+    ]
     assert speed[0] > speed[1] > speed[2]
 
 
@@ -243,7 +257,9 @@ def test_latency_leaves_a_costate_that_flies_the_plan():
     for known, memory in guidance.fly(inputs(truth)):  # noqa: B007
         if memory.plan is not None:
             break
-    flight = CostatePath.of(memory.plan, np.zeros(3), np.zeros(3))  # at rest the current segment is a coast
+    flight = CostatePath.of(
+        memory.plan, np.zeros(3), np.zeros(3)
+    )  # at rest the current segment is a coast
     assert flight.terminal_errors(known.scene.goal)[0] < 1e-8
     assert memory.segment.end_ns == pytest.approx(known.t_ns + flight.t_go_s * 1e9, abs=2)
 

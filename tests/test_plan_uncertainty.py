@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import exp, multiply
-from avsreplay.plan import PlanParams, Scene, Tolerance, draws, path_of, rendezvous, spread
+from avsreplay.plan.limits import Scene
+from avsreplay.plan.path import path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.uncertainty import Tolerance, draws, spread
 
 ORIGIN = np.zeros(3)
 PARAMS = PlanParams()
@@ -71,7 +74,9 @@ def test_miss_and_probability_follow_the_rayleigh_distribution():
     quick = PlanParams(grid_s=5.0)
     found = spread(plan(), futures, planner(quick), Tolerance(position_m=0.02))
     expected = 1.0 - math.exp(-0.5 * 2.0**2)  # Rayleigh
-    assert found.probability == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / count))
+    assert found.probability == pytest.approx(
+        expected, abs=4 * math.sqrt(expected * (1 - expected) / count)
+    )
     assert found.miss_m.mean == pytest.approx(sigma * math.sqrt(math.pi / 2), rel=0.05)
     assert found.miss_m.p95 == pytest.approx(sigma * math.sqrt(-2 * math.log(0.05)), rel=0.06)
 

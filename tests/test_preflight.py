@@ -53,10 +53,14 @@ class Log:
 
 
 def _seen(surface, n=6, wall=False, seed=1):
-    """Points of the half that faces the sensor while the target turns and moves, some with a wall behind."""
+    """Points of the half that faces the sensor while the target turns and moves, some with a wall
+    behind.
+    """
     rng = np.random.default_rng(seed)
     corners = surface.vertices[surface.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     clouds = []
     for k in range(n):
         pick = rng.choice(len(corners), 4000, p=area / area.sum())
@@ -122,7 +126,9 @@ def test_a_wall_is_background_and_the_crop_keeps_the_target(surface):
 
 
 class Located:
-    """A registrar that finds the target of `_seen` in every scan, whose poses follow one another."""
+    """A registrar that finds the target of `_seen` in every scan, whose poses follow one
+    another.
+    """
 
     def __init__(self, surface):
         self.scans = 0
@@ -136,16 +142,23 @@ class Located:
 def test_points_that_remain_inside_the_suggested_crop_lead_to_no_other_crop(surface, monkeypatch):
     rng = np.random.default_rng(3)
     clouds = _seen(surface, n=5)
-    low, high = np.min([c.min(axis=0) for c in clouds], axis=0), np.max([c.max(axis=0) for c in clouds], axis=0)
+    low, high = (
+        np.min([c.min(axis=0) for c in clouds], axis=0),
+        np.max([c.max(axis=0) for c in clouds], axis=0),
+    )
     around = 0.15 * surface.extent
-    cluttered = [np.vstack([cloud, rng.uniform(low - around, high + around, (600, 3))]) for cloud in clouds]
+    cluttered = [
+        np.vstack([cloud, rng.uniform(low - around, high + around, (600, 3))]) for cloud in clouds
+    ]
     monkeypatch.setattr(avsreplay.model_size, "Registrar", Located)
     found = _found(preflight(Log(cluttered), surface), "size")
     assert (found.grade, found.option) == ("ok", "")
     assert "the model was found in 5 of 5 examined scans" in found.text
 
 
-@pytest.mark.parametrize(("factor", "grade"), [(0.7, "check"), (0.8, "check"), (1.0, "ok"), (1.05, "ok")])
+@pytest.mark.parametrize(
+    ("factor", "grade"), [(0.7, "check"), (0.8, "check"), (1.0, "ok"), (1.05, "ok")]
+)
 def test_a_model_that_is_smaller_than_a_scan_is_doubtful(surface, factor, grade):
     found = _found(preflight(Log(_seen(surface)), scaled(surface, factor)), "size")
     assert found.grade == grade
@@ -163,7 +176,9 @@ class Undecodable(Log):
         if seq not in self.bad:
             return scan
         note = "no field 'x' among intensity"
-        return dataclasses.replace(scan, points=np.zeros((0, 3)), status=ScanStatus.DAMAGED, note=note)
+        return dataclasses.replace(
+            scan, points=np.zeros((0, 3)), status=ScanStatus.DAMAGED, note=note
+        )
 
 
 @pytest.mark.parametrize(("bad", "grade"), [((0, 1, 2, 3, 4), "fail"), ((2,), "check")])
@@ -172,7 +187,10 @@ def test_clouds_that_cannot_be_decoded_are_named_with_the_reason(surface, bad, g
     found = preflight(Undecodable(_seen(surface, n=5), bad=bad), surface)
     advice = _found(found, "scans")
     assert advice.grade == grade
-    assert advice.text == f"{len(bad)} of 5 examined scans cannot be used, the first: no field 'x' among intensity"
+    assert (
+        advice.text
+        == f"{len(bad)} of 5 examined scans cannot be used, the first: no field 'x' among intensity"
+    )
     assert any(other.about == "size" for other in found) == (grade == "check")
 
 
@@ -202,7 +220,9 @@ def test_unit_and_background_are_found_together(surface):
 
 @pytest.mark.parametrize("given", ["m", "inch"])
 def test_the_registration_decides_between_two_units_that_explain_the_sizes(surface, given):
-    """With its wall a scan has the size of the model in centimetres, a group of points that in millimetres."""
+    """With its wall a scan has the size of the model in centimetres, a group of points that in
+    millimetres.
+    """
     rng, clouds = np.random.default_rng(1), []
     for k in range(3):
         T_ac = Pose(exp([0.3 * k, 0.2, 0.1]), [0.0, 0.0, 20.0])
@@ -235,7 +255,10 @@ def test_a_unit_in_which_no_scan_shows_the_model_may_be_another_object(surface):
 
 @pytest.fixture(scope="module")
 def own_bag(tmp_path_factory):
-    """The log and the model of the tutorial: a camera that moves, a wall, a model in millimetres."""
+    """The log and the model of the tutorial.
+
+    A camera that moves, a wall, a model in millimetres.
+    """
     folder = tmp_path_factory.mktemp("own")
     subprocess.run([sys.executable, EXAMPLE, folder], check=True)
     return folder
@@ -260,7 +283,9 @@ def test_truth_at_other_times_and_in_another_frame_is_doubtful(own_bag, tmp_path
 
 
 def test_a_crop_refers_to_the_frame_of_the_cloud_also_with_a_fixed_frame(own_bag):
-    suggested = [_checks(own_bag, fixed_frame=frame)["background"].option for frame in (None, "map")]
+    suggested = [
+        _checks(own_bag, fixed_frame=frame)["background"].option for frame in (None, "map")
+    ]
     assert suggested[0] == suggested[1]
 
 
@@ -289,16 +314,25 @@ def test_of_several_topics_that_which_shows_the_target_is_suggested(cli, surface
     store, cloud = example["STORE"], example["cloud"]
     with Writer(tmp_path / "two.bag") as bag:
         kind = "sensor_msgs/msg/PointCloud2"
-        topics = {name: bag.add_connection(name, kind, typestore=store) for name in ("/another", "/camera")}
+        topics = {
+            name: bag.add_connection(name, kind, typestore=store)
+            for name in ("/another", "/camera")
+        }
         for k, points in enumerate(target):
             t_ns = (1_700_000_000 + k) * 10**9
-            for name, seen in (("/another", rng.uniform(-100.0, 100.0, (2000, 3))), ("/camera", points)):
+            for name, seen in (
+                ("/another", rng.uniform(-100.0, 100.0, (2000, 3))),
+                ("/camera", points),
+            ):
                 bag.write(topics[name], t_ns, store.serialize_ros1(cloud(t_ns, seen), kind))
     in_inches = dataclasses.replace(scaled(surface, 1.0 / 0.0254), data=b"")
     (tmp_path / "m.ply").write_bytes(surface_bytes(in_inches))
     done = cli("info", tmp_path / "two.bag", "--model", tmp_path / "m.ply", "--json")
     checks = {check["about"]: check for check in json.loads(done.out)["checks"]}
-    assert (checks["topic"]["option"], checks["unit"]["option"]) == ("--topic /camera", "--model-unit inch")
+    assert (checks["topic"]["option"], checks["unit"]["option"]) == (
+        "--topic /camera",
+        "--model-unit inch",
+    )
 
 
 def test_some_background_around_the_target_is_not_taken_for_a_unit(surface):
@@ -306,7 +340,9 @@ def test_some_background_around_the_target_is_not_taken_for_a_unit(surface):
     far = 1.6 * diameter(surface.vertices, trimmed=False)
     clouds = []
     for cloud in _seen(surface):
-        line = cloud.mean(axis=0) + np.outer(np.linspace(-0.5, 0.5, len(cloud) // 2), [far, 0.0, 0.0])
+        line = cloud.mean(axis=0) + np.outer(
+            np.linspace(-0.5, 0.5, len(cloud) // 2), [far, 0.0, 0.0]
+        )
         clouds.append(np.concatenate([cloud, line]))
     found = preflight(Log(clouds), surface)
     assert all(advice.about != "unit" and "--model-scale" not in advice.option for advice in found)
@@ -348,7 +384,10 @@ def test_an_assumed_rate_of_scans_is_doubtful_until_it_is_given(cli, tmp_path):
 
 
 def test_no_model_asks_for_one(surface):
-    assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE or --model auto"
+    assert (
+        _found(preflight(Log(_seen(surface)), None), "model").option
+        == "--model FILE or --model auto"
+    )
 
 
 def test_empty_scans_are_said():
@@ -359,19 +398,31 @@ def test_a_selection_without_a_scan_is_one_line(cli, fixtures_folder):
     done = cli("run", fixtures_folder / "tumble.mcap", "--start", "99")
     assert done.code == 3
     assert done.err.splitlines() == [
-        f"avsreplay: {fixtures_folder / 'tumble.mcap'}: no scan to replay; widen the selection, or see 'avsreplay info'"
+        f"avsreplay: {fixtures_folder / 'tumble.mcap'}: no scan to replay; widen the selection, or"
+        " see 'avsreplay info'"
     ]
 
 
 def test_a_crop_that_leaves_no_point_is_named(cli, fixtures_folder):
-    done = cli("run", fixtures_folder / "tumble.mcap", "--crop-range", "500,600", "--n-scans", "3", "--json")
+    done = cli(
+        "run",
+        fixtures_folder / "tumble.mcap",
+        "--crop-range",
+        "500,600",
+        "--n-scans",
+        "3",
+        "--json",
+    )
     assert "no points are left in the examined scans; widen the crop" in done.err
     assert "mostly no usable points" in done.err
 
 
 def test_a_pose_topic_is_offered_as_truth(surface):
     topics = (TopicInfo("/mocap/pose", "geometry_msgs/msg/PoseStamped", "cdr", 9, 0, 1),)
-    assert _found(preflight(Log(_seen(surface), topics), surface), "truth").option == "--truth-topic /mocap/pose"
+    assert (
+        _found(preflight(Log(_seen(surface), topics), surface), "truth").option
+        == "--truth-topic /mocap/pose"
+    )
     assert _found(preflight(Log(_seen(surface)), surface), "truth").option == "--reference fit"
 
 
@@ -380,7 +431,9 @@ def test_the_diameter_does_not_depend_on_the_attitude_or_a_stray_point():
     points = rng.uniform([-1, -0.5, -0.2], [1, 0.5, 0.2], (4000, 3))
     turned = Pose(exp([0.4, 1.0, -2.0]), [5.0, 6.0, 7.0]).apply(points)
     assert diameter(turned) == pytest.approx(diameter(points), rel=0.02)
-    assert diameter(np.vstack([points, [[900.0, 0, 0]]])) == pytest.approx(diameter(points), rel=0.05)
+    assert diameter(np.vstack([points, [[900.0, 0, 0]]])) == pytest.approx(
+        diameter(points), rel=0.05
+    )
     assert diameter(np.zeros((0, 3))) == 0.0
 
 
@@ -416,7 +469,10 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
 
 
 def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures_folder, tmp_path):
-    """The mirror image is made with trimesh; the run with --model-mirror has the poses of the model turned about x."""
+    """The mirror image is made with trimesh.
+
+    The run with --model-mirror has the poses of the model turned about x.
+    """
     log, mirrored = fixtures_folder / "tumble.mcap", tmp_path / "mirrored.ply"
     with open_source(log) as source:
         own = source.header.surface
@@ -436,12 +492,16 @@ def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures
     half_turn = np.diag([-1.0, -1.0, 1.0])  # the sign of x after that of y
     np.testing.assert_allclose(again.vertices, own.vertices @ half_turn, atol=1e-6)
     volume = trimesh.Trimesh(again.vertices, again.faces, process=False).volume
-    assert volume == pytest.approx(trimesh.Trimesh(own.vertices, own.faces, process=False).volume, rel=1e-5)
+    assert volume == pytest.approx(
+        trimesh.Trimesh(own.vertices, own.faces, process=False).volume, rel=1e-5
+    )
     done = cli("run", log, "--model", mirrored, "--model-mirror", "--init", "auto", "--n-scans", 6)
     assert "6 healthy" in done.out
 
 
-def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(cli, fixtures_folder, tmp_path):
+def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(
+    cli, fixtures_folder, tmp_path
+):
     trimesh.creation.icosphere(subdivisions=2, radius=1.2).export(tmp_path / "ball.stl")
     options = ["--model", tmp_path / "ball.stl", "--init", "auto", "--n-scans", 3, "--json"]
     done = cli("run", fixtures_folder / "tumble.mcap", *options)
@@ -452,7 +512,9 @@ def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(cli, fixt
 
 
 @pytest.mark.parametrize(("offset", "reported"), [(0.0, False), (0.2, False), (5.0, True)])
-def test_an_origin_far_outside_of_the_model_is_reported_as_the_grasp_point(surface, offset, reported):
+def test_an_origin_far_outside_of_the_model_is_reported_as_the_grasp_point(
+    surface, offset, reported
+):
     vertices = surface.vertices + np.array([offset, 0.0, 0.0])
     moved = dataclasses.replace(surface, vertices=vertices, sha256="a")
     advice = [a for a in preflight(Log(_seen(surface)), moved) if a.about == "grasp point"]
@@ -469,15 +531,24 @@ def test_points_far_from_the_origin_of_their_frame_are_named(surface):
 
 
 def test_a_sensor_that_is_not_at_the_origin_is_named(surface):
-    """Ray-cast views by a sensor at the origin, and the same points in a frame whose origin is 60 m away."""
-    caster, rays = RayMeshIntersector(trimesh.Trimesh(surface.vertices, surface.faces)), ray_grid(8.0, 50)
+    """Ray-cast views by a sensor at the origin, and the same points in a frame whose origin is 60 m
+    away.
+    """
+    caster, rays = (
+        RayMeshIntersector(trimesh.Trimesh(surface.vertices, surface.faces)),
+        ray_grid(8.0, 50),
+    )
     clouds = []
     for k in range(3):
         pose = Pose(exp([0.3 * k, 0.2, 0.1]), [0.3 * k, 0.0, 12.0])
         ranges, rows, _ = cast(caster, rays, pose.R, pose.t)
         clouds.append(ranges[:, None] * rays[rows])
-    plain = [a for a in preflight(Log(clouds), surface, search=True) if a.about in ("pose", "sensor")]
+    plain = [
+        a for a in preflight(Log(clouds), surface, search=True) if a.about in ("pose", "sensor")
+    ]
     assert [a.option for a in plain] == [""]
     moved = [cloud + np.array([0.0, 45.0, -40.0]) for cloud in clouds]
-    found = [a for a in preflight(Log(moved), surface, search=True) if a.about in ("pose", "sensor")]
+    found = [
+        a for a in preflight(Log(moved), surface, search=True) if a.about in ("pose", "sensor")
+    ]
     assert [a.option for a in found] == ["--set register.camera=none"]

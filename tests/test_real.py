@@ -1,4 +1,7 @@
-"""Real data: turntable scans, depth views, flights of a cube, a depth scene, bags without clouds (docs/real.md)."""
+"""Real data.
+
+Turntable scans, depth views, flights of a cube, a depth scene, bags without clouds (docs/real.md).
+"""
 
 import json
 
@@ -45,7 +48,9 @@ def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(d
 
 
 def test_72_degree_steps_are_kept(dragon, cli):
-    """The search that follows failed restarts finds the second scan, also where the pipeline does not acquire anew."""
+    """The search that follows failed restarts finds the second scan, also where the pipeline does
+    not acquire anew.
+    """
     for setting in ((), ("--set", "reacquire=false")):
         rows = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3, *setting))
         assert [r["gamma"] for r in rows] == [1] * 5
@@ -55,7 +60,17 @@ def test_72_degree_steps_are_kept(dragon, cli):
 def test_the_folder_itself_runs_without_recording_first(cli, shared_data):
     folder = shared_data / "stanford-dragon"
     rows = rows_of(
-        cli("run", folder, "--init", "truth", "--model", folder / "dragon_vrip_res3.ply", "--n-scans", 2, "--json")
+        cli(
+            "run",
+            folder,
+            "--init",
+            "truth",
+            "--model",
+            folder / "dragon_vrip_res3.ply",
+            "--n-scans",
+            2,
+            "--json",
+        )
     )
     assert [r["gamma"] for r in rows] == [1, 1]
 
@@ -66,14 +81,16 @@ def bunny(shared_data):
 
     folder = shared_data / "stanford-bunny"
     with open_source(folder, SourceOptions(model=folder / "bun_zipper.ply")) as source:
-        return source.header.surface, [(s.points, s.truth) for s in true_scans(source) if s.truth is not None]
+        return source.header.surface, [
+            (s.points, s.truth) for s in true_scans(source) if s.truth is not None
+        ]
 
 
 @pytest.mark.parametrize("off_deg", [5.0, 15.0, 24.0])
 def test_every_bunny_scan_comes_back_from_a_wrong_guess(off_deg, bunny):
     from avsreplay import geometry
     from avsreplay.geometry import Pose
-    from avsreplay.register import Registrar
+    from avsreplay.register.registrar import Registrar
 
     surface, scans = bunny
     registrar = Registrar(surface)
@@ -82,7 +99,9 @@ def test_every_bunny_scan_comes_back_from_a_wrong_guess(off_deg, bunny):
     for points, truth in scans:
         axis = rng.normal(size=3)
         turn = geometry.exp(np.radians(off_deg) * axis / np.linalg.norm(axis))
-        centre = truth.inverse().apply(points.mean(axis=0))  # turned about the middle of what is seen
+        centre = truth.inverse().apply(
+            points.mean(axis=0)
+        )  # turned about the middle of what is seen
         about = Pose(turn, centre - geometry.matrix(turn) @ centre)
         found = registrar.register(points, truth @ about)
         error = geometry.multiply(geometry.conjugate(truth.q), found.T_ac.q)
@@ -92,7 +111,10 @@ def test_every_bunny_scan_comes_back_from_a_wrong_guess(off_deg, bunny):
 
 
 def test_gravity_is_found_and_every_impact_is_a_manoeuvre_at_its_time(shared_data, tmp_path):
-    """Ten real flights of a cube; the campaign determines the instants of the impacts without the estimator."""
+    """Ten real flights of a cube.
+
+    The campaign determines the instants of the impacts without the estimator.
+    """
     import tosses
 
     settings = ("estimator.start_varrho_1s_m=0.002", "estimator.start_log_inertia_1s=0.1")
@@ -103,7 +125,9 @@ def test_gravity_is_found_and_every_impact_is_a_manoeuvre_at_its_time(shared_dat
     assert np.abs(mean - [0.0, 0.0, -9.61]).max() < 0.1
     assert error[2] < 0.03
     chosen = [toss for toss in flights if toss.flight >= 14][:10]
-    results = [tosses.replayed(toss, mean, sigma, tmp_path, (*settings, *disturbed)) for toss in chosen]
+    results = [
+        tosses.replayed(toss, mean, sigma, tmp_path, (*settings, *disturbed)) for toss in chosen
+    ]
     step = float(np.median(np.diff(chosen[0].times)))
     near = [
         found.manoeuvre_s is not None and abs(found.manoeuvre_s - toss.impact_s) < 2.0 * step
@@ -113,20 +137,41 @@ def test_gravity_is_found_and_every_impact_is_a_manoeuvre_at_its_time(shared_dat
     assert sum(found.false_manoeuvres for found in results) == 0
 
 
-def test_the_depth_views_of_a_figure_are_all_registered_and_agree_with_the_markers(shared_data, tmp_path, cli):
+def test_the_depth_views_of_a_figure_are_all_registered_and_agree_with_the_markers(
+    shared_data, tmp_path, cli
+):
     import csv
 
     folder = shared_data / "primesense-bunny"
-    lines = [line for line in (folder / "truth_marker_calibrated.csv").read_text().splitlines() if line[0] != "#"]
+    lines = [
+        line
+        for line in (folder / "truth_marker_calibrated.csv").read_text().splitlines()
+        if line[0] != "#"
+    ]
     truth = tmp_path / "markers.tum"
     names = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
     truth.write_text(
-        "\n".join(" ".join([str(k + 1), *(row[n] for n in names)]) for k, row in enumerate(csv.DictReader(lines)))
+        "\n".join(
+            " ".join([str(k + 1), *(row[n] for n in names)])
+            for k, row in enumerate(csv.DictReader(lines))
+        )
     )
-    rows = rows_of(cli("run", folder / "scans", "--model", folder / "model_bun_zipper.ply", "--truth", truth, "--json"))
+    rows = rows_of(
+        cli(
+            "run",
+            folder / "scans",
+            "--model",
+            folder / "model_bun_zipper.ply",
+            "--truth",
+            truth,
+            "--json",
+        )
+    )
     assert {r["status"] for r in rows} == {"aligned"}
     assert sum(r["gamma"] for r in rows) >= 30
-    assert rms([r["reg_rot_err_deg"] for r in rows]) < 1.2  # the markers are accurate to about 1 deg and 1 mm
+    assert (
+        rms([r["reg_rot_err_deg"] for r in rows]) < 1.2
+    )  # the markers are accurate to about 1 deg and 1 mm
     assert rms([r["reg_pos_err_m"] for r in rows]) < 2.5e-3
     jumps = rows_of(cli("run", truth, "--backend", "poses", "--extent", "0.25", "--json"))
     assert {r["status"] for r in jumps} == {"measured"}
@@ -135,7 +180,10 @@ def test_the_depth_views_of_a_figure_are_all_registered_and_agree_with_the_marke
 @pytest.mark.parametrize("name", ["cdr_test", "rewriter_a", "multiple_files", "test_bag_for_seek"])
 def test_a_recording_without_clouds_is_refused_in_one_line(name, shared_data, cli):
     folder = shared_data / "mcap-rosbag2" / name
-    for more in (("--model", shared_data / "spacecraft-meshes" / "Kepler.obj"), ("--backend", "poses")):
+    for more in (
+        ("--model", shared_data / "spacecraft-meshes" / "Kepler.obj"),
+        ("--backend", "poses"),
+    ):
         done = cli("run", folder, *more)
         assert done.code == 3
         assert len(done.err.strip().splitlines()) == 1
@@ -153,15 +201,22 @@ def test_raw_packets_are_named_and_a_road_scene_fits_no_spacecraft(shared_data, 
     assert [r["gamma"] for r in document["rows"]] == [0] * 5
 
 
-def test_a_carton_in_a_depth_scene_is_found_with_the_crop_that_info_proposes(shared_data, tmp_path, cli):
-    """No ground truth: the reference is the best of 641 starts of a trimmed ICP by others, see the data's README."""
+def test_a_carton_in_a_depth_scene_is_found_with_the_crop_that_info_proposes(
+    shared_data, tmp_path, cli
+):
+    """No ground truth.
+
+    The reference is the best of 641 starts of a trimmed ICP by others, see the data's README.
+    """
     import json
 
     from avsreplay import geometry
     from avsreplay.log import read_surface
 
     source = shared_data / "kinect-milk-scene"
-    (tmp_path / "scene.pcd").write_bytes((source / "milk_cartoon_all_small_clorox.pcd").read_bytes())
+    (tmp_path / "scene.pcd").write_bytes(
+        (source / "milk_cartoon_all_small_clorox.pcd").read_bytes()
+    )
     model = ("--model", source / "milk.pcd", "--cloud-model", "--json")
     checks = json.loads(cli("info", tmp_path, *model).out)["checks"]
     crop = next(check["option"] for check in checks if check["about"] == "background").split()

@@ -1,4 +1,7 @@
-"""Reconstruction of an unknown target: properties of the result against simulated and real shapes."""
+"""Reconstruction of an unknown target.
+
+Properties of the result against simulated and real shapes.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +18,36 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of, true_frame
 from avsreplay.reconstruct.fusion import continues, contradicting, fused, refuted
+from avsreplay.reconstruct.model import at_grasp, deviations, surface_of
+from avsreplay.reconstruct.reconstruction import reconstruct, true_frame
 from avsreplay.reconstruct.registration import Pairing, between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
-from avsreplay.reconstruct.views import SAMPLE, Survey, Twist, extent_of, full_cloud, point_tree, surveyed, thinned_view
+from avsreplay.reconstruct.views import (
+    SAMPLE,
+    Survey,
+    Twist,
+    extent_of,
+    full_cloud,
+    point_tree,
+    surveyed,
+    thinned_view,
+)
 from avsreplay.records import AlignStatus, Scan, Surface
-from avsreplay.register import Registrar
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import builtin_surface
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
 HULL = ConvexHull(CORNERS)
 
 
 def hull_scan(rng, T_ac: Pose, noise_m: float = 0.0) -> np.ndarray:
-    """Points on the faces of an irregular convex body that face the camera at the origin of {A}: exact visibility."""
+    """Points on the faces of an irregular convex body that face the camera at the origin of {A}.
+
+    Exact visibility.
+    """
     parts = []
     for corners, plane in zip(CORNERS[HULL.simplices], HULL.equations, strict=True):
         a, b, c = corners
@@ -47,8 +65,14 @@ def turning(count: int, step_deg: float, noise_m: float = 0.0, seed: int = 1):
     """Scans of the body while it turns about a tilted axis, and their true poses."""
     rng = np.random.default_rng(seed)
     axis = np.array([0.3, 0.9, 0.2]) / np.linalg.norm([0.3, 0.9, 0.2])
-    poses = [Pose(geometry.exp(np.radians(step_deg * k) * axis), np.array([0.02 * k, 0.0, 4.0])) for k in range(count)]
-    scans = [Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, T, noise_m)) for k, T in enumerate(poses)]
+    poses = [
+        Pose(geometry.exp(np.radians(step_deg * k) * axis), np.array([0.02 * k, 0.0, 4.0]))
+        for k in range(count)
+    ]
+    scans = [
+        Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, T, noise_m))
+        for k, T in enumerate(poses)
+    ]
     return scans, poses
 
 
@@ -61,7 +85,9 @@ def errors(made, truth):
         got, want = T @ first.inverse(), by_ns[t_ns] @ by_ns[first_ns].inverse()
         turn = geometry.angle(geometry.multiply(geometry.conjugate(want.q), got.q))
         centre = by_ns[first_ns].t
-        out.append((np.degrees(float(turn)), float(np.linalg.norm(got.apply(centre) - want.apply(centre)))))
+        out.append(
+            (np.degrees(float(turn)), float(np.linalg.norm(got.apply(centre) - want.apply(centre))))
+        )
     return np.array(out)
 
 
@@ -87,7 +113,9 @@ def test_points_lie_on_the_body_and_normals_point_outward(full_turn):
     _, first = made.poses[0]
     T_true_c = truth[0].inverse() @ first  # reconstruction {C} to the body's own frame
     points, normals = T_true_c.apply(made.points), made.normals @ T_true_c.R.T
-    height = points @ HULL.equations[:, :3].T + HULL.equations[:, 3]  # of each point above each plane
+    height = (
+        points @ HULL.equations[:, :3].T + HULL.equations[:, 3]
+    )  # of each point above each plane
     nearest = height.argmax(axis=1)
     distance = np.abs(height.max(axis=1))
     assert np.median(distance) < 0.003
@@ -111,7 +139,9 @@ def test_a_moving_occluder_is_left_out(full_turn):
     rng = np.random.default_rng(3)
     mixed = []
     for scan in scans:
-        plate = np.column_stack([rng.uniform(-0.1, 0.1, (200, 2)) + 0.03 * (scan.seq % 12) - 0.2, np.full(200, 2.9)])
+        plate = np.column_stack(
+            [rng.uniform(-0.1, 0.1, (200, 2)) + 0.03 * (scan.seq % 12) - 0.2, np.full(200, 2.9)]
+        )
         points = np.vstack([scan.points, plate]) if scan.seq % 3 == 1 else scan.points
         mixed.append(Scan(seq=scan.seq, t_ns=scan.t_ns, points=points))
     again = reconstruct(lambda: mixed)
@@ -134,7 +164,11 @@ def test_a_sphere_is_refused(noise_m):
     scans = []
     for k in range(6):
         p = rng.normal(size=(3000, 3))
-        p = (0.5 + noise_m * rng.normal(size=(3000, 1))) * p / np.linalg.norm(p, axis=1, keepdims=True)
+        p = (
+            (0.5 + noise_m * rng.normal(size=(3000, 1)))
+            * p
+            / np.linalg.norm(p, axis=1, keepdims=True)
+        )
         p += [0.01 * k, 0.0, 4.0]
         scans.append(Scan(seq=k, t_ns=k * 500_000_000, points=p[p[:, 2] < 3.9]))
     with pytest.raises(UnreadableInput, match="does not determine its attitude"):
@@ -148,14 +182,20 @@ def test_steps_that_are_too_large_are_refused():
     rng = np.random.default_rng(4)
     turns = [np.zeros(3), 170.0 * axes[0], 85.0 * axes[1]]
     poses = [Pose(geometry.exp(np.radians(t)), np.array([0.0, 0.0, 4.0])) for t in turns]
-    scans = [Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, T, 0.003)) for k, T in enumerate(poses)]
+    scans = [
+        Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, T, 0.003))
+        for k, T in enumerate(poses)
+    ]
     with pytest.raises(UnreadableInput, match=r"only \d of 3 scans could be registered") as refused:
         reconstruct(lambda: scans)
     assert "steps between scans are too large" in str(refused.value.hint)
 
 
 def box_scan(rng, T_ac: Pose, marks) -> np.ndarray:
-    """Points on a box that looks alike after half turns, except for small boxes on its faces; exact visibility."""
+    """Points on a box that looks alike after half turns, except for small boxes on its faces.
+
+    Exact visibility.
+    """
     parts = []
     for size, centre in [(np.array([1.0, 0.7, 0.5]), np.zeros(3)), *marks]:
         p = rng.uniform(-0.5, 0.5, (9000, 3))
@@ -166,7 +206,9 @@ def box_scan(rng, T_ac: Pose, marks) -> np.ndarray:
         p = T_ac.apply((p * size + centre)[: int(9000 * size.max())])
         parts.append(p[np.einsum("ni,ni->n", p, n[: len(p)] @ T_ac.R.T) < 0.0])
     points = np.vstack(parts)
-    return points + 0.002 * rng.normal(size=(len(points), 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
+    return points + 0.002 * rng.normal(size=(len(points), 1)) * points / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
 
 
 @pytest.mark.slow
@@ -181,7 +223,10 @@ def test_large_steps_end_with_the_right_poses_or_with_a_refusal(step_deg, count,
     scans, truth = turning(count, step_deg, noise_m=0.002, seed=77)
     if body == "nearly symmetric":
         rng = np.random.default_rng(78)
-        scans = [replace(scan, points=box_scan(rng, T, marks)) for scan, T in zip(scans, truth, strict=True)]
+        scans = [
+            replace(scan, points=box_scan(rng, T, marks))
+            for scan, T in zip(scans, truth, strict=True)
+        ]
     try:
         made = reconstruct(lambda: scans)
     except UnreadableInput:
@@ -203,7 +248,9 @@ def test_a_scan_with_a_wrong_pose_contradicts_the_others():
 
 
 def test_a_model_is_refuted_by_more_contradicting_views_than_are_expected_of_a_right_one():
-    """At one view in ten, four of eight views have a probability of 0.5 %, and three of eight one of 3.8 %."""
+    """At one view in ten, four of eight views have a probability of 0.5 %, and three of eight one
+    of 3.8 %.
+    """
     assert not refuted(np.array([0.2] * 3 + [0.01] * 5))
     assert refuted(np.array([0.2] * 4 + [0.01] * 4))
     assert not refuted(np.array([0.2] * 10 + [0.01] * 50))
@@ -224,21 +271,29 @@ def test_an_arm_beside_the_target_is_left_out_because_other_scans_have_no_return
     scans, truth = turning(12, 15.0)
     scans = [replace(scan, points=scan.points[::5]) for scan in scans]
     rng = np.random.default_rng(8)
-    arm = np.column_stack([rng.uniform(0.9, 1.1, 300), rng.uniform(-0.5, 0.5, 300), np.full(300, 3.8)])
+    arm = np.column_stack(
+        [rng.uniform(0.9, 1.1, 300), rng.uniform(-0.5, 0.5, 300), np.full(300, 3.8)]
+    )
     mixed = [replace(s, points=np.vstack([s.points, arm])) if s.seq in (4, 5) else s for s in scans]
     survey = Survey(tuple(range(12)), 12, 1.5, np.zeros(3), False)
     twist = {k: Twist(T, np.zeros(3), np.zeros(3)) for k, T in enumerate(truth)}
     with_arm, without_arm = (fused(log, survey, twist, 0.02, 0.001) for log in (mixed, scans))
     height = [
-        (made[0] @ HULL.equations[:, :3].T + HULL.equations[:, 3]).max(axis=1) for made in (with_arm, without_arm)
+        (made[0] @ HULL.equations[:, :3].T + HULL.equations[:, 3]).max(axis=1)
+        for made in (with_arm, without_arm)
     ]
     assert height[0].max() < 0.1
     assert len(height[0]) > 0.98 * len(height[1])
-    assert np.count_nonzero(without_arm[3] == 1) > 0  # points of the body that one scan has seen are kept
+    assert (
+        np.count_nonzero(without_arm[3] == 1) > 0
+    )  # points of the body that one scan has seen are kept
 
 
 def test_the_standard_error_of_points_that_few_scans_have_seen_is_that_of_their_noise():
-    """Against the faces of the body, at the frame of the first scan: of the right size within a factor of two."""
+    """Against the faces of the body, at the frame of the first scan.
+
+    Of the right size within a factor of two.
+    """
     scans, truth = turning(4, 10.0, noise_m=0.004)
     made = reconstruct(lambda: scans)
     _, first = made.poses[0]
@@ -267,7 +322,9 @@ def test_the_command_writes_a_model_that_run_accepts(cli, fixtures_folder, tmp_p
 
 
 def test_the_command_writes_the_poses_of_its_frame(cli, fixtures_folder, tmp_path):
-    """Relative motions of the poses are those of the truth, whatever the frame {C} of the model is."""
+    """Relative motions of the poses are those of the truth, whatever the frame {C} of the
+    model is.
+    """
     log, file = fixtures_folder / "tumble.mcap", tmp_path / "p.tum"
     done = cli("model", log, "-o", tmp_path / "m.ply", "--poses", file, "--json")
     assert done.code == 0, done.err
@@ -300,7 +357,10 @@ def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
 
 @pytest.mark.slow
 def test_scans_of_the_bunny_that_were_placed_wrongly_are_left_out(shared_data):
-    """Ten views in any order: those that are used must agree with the scanner's poses up to one common displacement."""
+    """Ten views in any order.
+
+    Those that are used must agree with the scanner's poses up to one common displacement.
+    """
     folder = shared_data / "stanford-bunny"
     with open_source(folder, SourceOptions(model=folder / "bun_zipper.ply")) as source:
         made = reconstruct(source.scans)
@@ -325,7 +385,9 @@ def test_run_replays_a_log_against_the_model_that_it_builds_itself(cli, fixtures
 
 @pytest.mark.slow
 def test_a_replay_against_the_own_model_is_within_20_mm(cli, fixtures_folder):
-    rows = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--model", "auto", "--json").out)["rows"]
+    rows = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--model", "auto", "--json").out)[
+        "rows"
+    ]
     errors = [r["pos_err_m"] for r in rows if r["gamma"] == 1]
     assert np.sqrt(np.mean(np.square(errors))) < 0.02  # 5 m target
 
@@ -345,8 +407,14 @@ def test_the_frame_is_moved_to_a_grasp_point_with_x_along_the_normal(full_turn):
 
 
 def test_the_true_frame_is_the_mean_over_all_scans_and_not_that_of_the_first(full_turn_small):
-    """A constant transformation is found exactly; an error of the first pose counts as one of ten."""
-    made, offset = full_turn_small, Pose(geometry.exp(np.array([0.4, -1.2, 0.3])), np.array([0.3, 0.1, -0.2]))
+    """A constant transformation is found exactly.
+
+    An error of the first pose counts as one of ten.
+    """
+    made, offset = (
+        full_turn_small,
+        Pose(geometry.exp(np.array([0.4, -1.2, 0.3])), np.array([0.3, 0.1, -0.2])),
+    )
     truth = [(t_ns, T @ offset) for t_ns, T in made.poses]
     np.testing.assert_allclose((offset @ true_frame(made, truth)).t, 0.0, atol=1e-12)
     wrong = Pose(geometry.exp(np.array([0.0, 0.0, 0.01])), np.array([0.05, 0.0, 0.0]))
@@ -372,20 +440,30 @@ def test_scattered_outliers_do_not_change_the_extent():
     scans, _ = turning(3, 15.0, noise_m=0.003)
     clean = [extent_of(scan.points) for scan in scans]
     dirty = [extent_of(scan.points) for scan in with_outliers(scans)]
-    np.testing.assert_allclose(dirty, clean, rtol=0.1)  # a box around all points is ten times as large
+    np.testing.assert_allclose(
+        dirty, clean, rtol=0.1
+    )  # a box around all points is ten times as large
 
 
 def test_the_distance_along_the_mean_normal_is_zero_for_two_points_of_a_circle():
     angles = np.random.default_rng(4).uniform(0.0, 0.8, size=(50, 2))
     a, b = (np.column_stack([np.cos(x), np.sin(x), np.zeros(50)]) for x in angles.T)
-    distance = np.einsum("ni,ni->n", between(a, b), b - a)  # normals of a unit circle are its points
+    distance = np.einsum(
+        "ni,ni->n", between(a, b), b - a
+    )  # normals of a unit circle are its points
     np.testing.assert_allclose(distance, 0.0, atol=1e-14)
     assert np.abs(np.einsum("ni,ni->n", b, b - a)).max() > 0.1  # point-to-plane
 
 
 def tumble(count=24, dt_s=0.5, noise_deg=0.0, noise_m=0.0, seed=1):
-    """Poses of a tumbling body by an independent integrator, its mass centre in {C}, and instants."""
-    inertia, centre_c, rng = np.diag([1.0, 1.4, 2.0]), np.array([0.1, -0.05, 0.08]), np.random.default_rng(seed)
+    """Poses of a tumbling body by an independent integrator, its mass centre in {C}, and
+    instants.
+    """
+    inertia, centre_c, rng = (
+        np.diag([1.0, 1.4, 2.0]),
+        np.array([0.1, -0.05, 0.08]),
+        np.random.default_rng(seed),
+    )
 
     def rates(_, y):
         q, w = y[:4], y[4:]
@@ -397,7 +475,9 @@ def tumble(count=24, dt_s=0.5, noise_deg=0.0, noise_m=0.0, seed=1):
     found = solve_ivp(rates, (0.0, times[-1]), start, t_eval=times, rtol=1e-11, atol=1e-12).y
     poses = []
     for t, q in zip(times, found[:4].T, strict=True):
-        q = geometry.multiply(geometry.normalise(q), geometry.exp(np.radians(noise_deg) * rng.normal(size=3)))
+        q = geometry.multiply(
+            geometry.normalise(q), geometry.exp(np.radians(noise_deg) * rng.normal(size=3))
+        )
         mass = np.array([0.01 * t, 0.0, 4.0])
         poses.append(Pose(q, mass - geometry.matrix(q) @ centre_c + noise_m * rng.normal(size=3)))
     return [round(1e9 * t) for t in times], poses, centre_c
@@ -411,10 +491,14 @@ def test_free_motion_gives_mass_centre_and_smooths_poses():
     centre, spread = motion.mass_centre_c
     assert np.linalg.norm(centre - centre_c) < 4.0 * spread
     assert spread < 0.05
-    off = [float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), motion.at(t).q)))
-           for t, T in zip(t_ns, exact, strict=True)]  # fmt: skip
-    raw = [float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), N.q)))
-           for T, N in zip(exact, noisy, strict=True)]  # fmt: skip
+    off = [
+        float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), motion.at(t).q)))
+        for t, T in zip(t_ns, exact, strict=True)
+    ]
+    raw = [
+        float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), N.q)))
+        for T, N in zip(exact, noisy, strict=True)
+    ]
     assert np.sqrt(np.mean(np.square(off))) < 0.7 * np.sqrt(np.mean(np.square(raw)))
 
 
@@ -438,9 +522,11 @@ outlier_ratio = 0.0
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determined(seed):
-    """A rocket stage hardly shows its turn about its axis: single poses are degrees off, one motion of all is not.
+    """A rocket stage hardly shows its turn about its axis: single poses are degrees off, one motion
+    of all is not.
 
-    Seeds 2 and 3 end 3.6 and 2.7 deg off if the poses are adjusted by twelve iterations without the motion.
+    Seeds 2 and 3 end 3.6 and 2.7 deg off if the poses are adjusted by twelve iterations without the
+    motion.
     """
     scenario = scenario_of(toml_document.parse(WEAK, "s.toml"), seed)
     simulation = simulate(scenario, builtin_surface(scenario.params.target.shape))
@@ -448,17 +534,24 @@ def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determ
     made = reconstruct(lambda: scans)
     true = {scan.t_ns: simulation.truth_of(scan).pose for scan in scans}
     X = true_frame(made, true.items())
-    turns = [float(geometry.angle(geometry.multiply(geometry.conjugate((true[t] @ X).q), T.q))) for t, T in made.poses]
+    turns = [
+        float(geometry.angle(geometry.multiply(geometry.conjugate((true[t] @ X).q), T.q)))
+        for t, T in made.poses
+    ]
     shifts = [float(np.linalg.norm((true[t] @ X).t - T.t)) for t, T in made.poses]
     assert made.used >= 20
-    assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 0.5  # 2.9 deg with equal weights of all directions (seed 4)
+    assert (
+        np.degrees(np.sqrt(np.mean(np.square(turns)))) < 0.5
+    )  # 2.9 deg with equal weights of all directions (seed 4)
     assert np.sqrt(np.mean(np.square(shifts))) < 0.003  # 7.6 mm
 
 
 def test_poses_without_a_common_free_motion_are_not_smoothed():
     t_ns, poses, _ = tumble()
     rng = np.random.default_rng(2)
-    by_hand = [Pose(geometry.multiply(T.q, geometry.exp(0.3 * rng.normal(size=3))), T.t) for T in poses]
+    by_hand = [
+        Pose(geometry.multiply(T.q, geometry.exp(0.3 * rng.normal(size=3))), T.t) for T in poses
+    ]
     assert free_motion(t_ns, by_hand, 1.0) is None
     assert free_motion(t_ns[:5], poses[:5], 1.0) is None  # too few
     assert free_motion([0] * len(poses), poses, 1.0) is None  # no instants
@@ -470,7 +563,8 @@ def test_a_scan_is_deskewed_exactly_for_constant_rate_and_velocity():
     T = Pose(geometry.exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, 4.0]))
     w, v = np.array([0.2, -0.1, 0.3]), np.array([0.1, 0.0, -0.2])
     shown = [
-        Pose(geometry.multiply(T.q, geometry.exp(w * s)), T.t + v * s).apply(x) for s, x in zip(times, p_c, strict=True)
+        Pose(geometry.multiply(T.q, geometry.exp(w * s)), T.t + v * s).apply(x)
+        for s, x in zip(times, p_c, strict=True)
     ]
     scan = Scan(seq=0, t_ns=0, points=np.array(shown), times_s=times)
     found = cKDTree(T.apply(p_c)).query(full_cloud(scan, Twist(T, w, v)))[0]
@@ -478,13 +572,18 @@ def test_a_scan_is_deskewed_exactly_for_constant_rate_and_velocity():
 
 
 def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
-    """A second body beside the CAD model is 'added'; a spike of the CAD model that scans look through is 'missing'."""
+    """A second body beside the CAD model is 'added'.
+
+    A spike of the CAD model that scans look through is 'missing'.
+    """
     made = full_turn_small
     hull = Surface(CORNERS, HULL.simplices.astype(np.int32), "hull.ply", "")
     assert not [r for r in deviations(made, hull).regions if r.size_m > 0.15]
     grown = replace(
         made,
-        points=np.vstack([made.points, made.points[:1] + np.random.default_rng(1).uniform(1.0, 1.2, (200, 3))]),
+        points=np.vstack(
+            [made.points, made.points[:1] + np.random.default_rng(1).uniform(1.0, 1.2, (200, 3))]
+        ),
         normals=np.vstack([made.normals, np.tile([0.0, 0.0, 1.0], (200, 1))]),
         one_sigma_m=np.ones(len(made.points) + 200),
         scans=np.ones(len(made.points) + 200, dtype=np.int64),
@@ -493,7 +592,12 @@ def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
     top = CORNERS[np.argmax(CORNERS[:, 0])]
     spike = top + np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.1]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]) + len(CORNERS)
-    cad = Surface(np.vstack([CORNERS, spike]), np.vstack([HULL.simplices, faces]).astype(np.int32), "spike.ply", "")
+    cad = Surface(
+        np.vstack([CORNERS, spike]),
+        np.vstack([HULL.simplices, faces]).astype(np.int32),
+        "spike.ply",
+        "",
+    )
     missing = [r for r in deviations(made, cad).regions if r.kind == "missing"]
     assert missing
     assert np.linalg.norm(np.array(missing[0].centre_m) - spike.mean(axis=0)) < 0.15
@@ -502,8 +606,12 @@ def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
 def test_a_plate_of_the_cad_model_from_which_no_scan_has_a_return_is_reported(full_turn_small):
     """Nothing lies behind the plate, so that no ray with a return passes through it."""
     plate = np.array([[0.0, 1.2, -0.2], [0.0, 1.6, -0.2], [0.0, 1.6, 0.2], [0.0, 1.2, 0.2]])
-    faces = np.vstack([HULL.simplices, np.array([[0, 1, 2], [0, 2, 3]]) + len(CORNERS)]).astype(np.int32)
-    found = deviations(full_turn_small, Surface(np.vstack([CORNERS, plate]), faces, "plate.ply", ""))
+    faces = np.vstack([HULL.simplices, np.array([[0, 1, 2], [0, 2, 3]]) + len(CORNERS)]).astype(
+        np.int32
+    )
+    found = deviations(
+        full_turn_small, Surface(np.vstack([CORNERS, plate]), faces, "plate.ply", "")
+    )
     assert found.regions[0].kind == "no_return"
     assert np.linalg.norm(np.array(found.regions[0].centre_m) - plate.mean(axis=0)) < 0.05
     assert found.regions[0].size_m == pytest.approx(0.4 * np.sqrt(2.0), abs=0.06)
@@ -511,9 +619,11 @@ def test_a_plate_of_the_cad_model_from_which_no_scan_has_a_return_is_reported(fu
 
 @pytest.mark.parametrize("seed", [0, 2, 8, 13])
 def test_the_origin_of_a_reconstruction_is_not_taken_for_the_sensor(full_turn_small, seed):
-    """Exact points of the sides of the CAD model that face half of all directions, in a frame with any origin.
+    """Exact points of the sides of the CAD model that face half of all directions, in a frame with
+    any origin.
 
-    No single position sees these points. With the origin as the camera these four comparisons ended without a pose.
+    No single position sees these points. With the origin as the camera these four comparisons ended
+    without a pose.
     """
     rng, cad = np.random.default_rng(seed), builtin_surface()
     corners = cad.vertices[cad.faces]
@@ -593,7 +703,10 @@ def test_the_equations_of_pairs_are_the_derivatives_of_the_distances_and_pairs_a
     for k in range(24):
         step = np.zeros(24)
         step[k] = 1e-6
-        moved = [Pose(geometry.exp(s[:3]), s[3:]) @ T for s, T in zip(step.reshape(4, 6), poses, strict=True)]
+        moved = [
+            Pose(geometry.exp(s[:3]), s[3:]) @ T
+            for s, T in zip(step.reshape(4, 6), poses, strict=True)
+        ]
         slopes[k] = (pairing.equations(moved, gate)[3] ** 2 - rms**2) / 1e-6
     weights = np.concatenate([view.weight for view in views])
     assert len(e) > 500
@@ -604,8 +717,13 @@ def test_the_equations_of_pairs_are_the_derivatives_of_the_distances_and_pairs_a
     assert np.array_equal(pairing.equations(far, gate)[2], fresh[2])  # a large step searches again
 
 
-def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of_a_model(fixtures_folder):
-    """A scan that shows one flat side mainly: from guesses 4 cm beside it, every pose that is accepted is right."""
+def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of_a_model(
+    fixtures_folder,
+):
+    """A scan that shows one flat side mainly.
+
+    From guesses 4 cm beside it, every pose that is accepted is right.
+    """
     with open_source(fixtures_folder / "tumble.mcap") as source:
         scans = list(source.scans())
     made = at_grasp(reconstruct(lambda: scans))
@@ -623,14 +741,19 @@ def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of
 
 
 def test_scans_of_a_plate_in_front_of_the_target_are_not_used():
-    """For three scans a plate hides the target entirely; it is flat, as are the faces of the target."""
+    """For three scans a plate hides the target entirely.
+
+    It is flat, as are the faces of the target.
+    """
     scans, truth = turning(12, 10.0, noise_m=0.003)
     rng = np.random.default_rng(8)
     hidden = []
     for scan in scans:
         x, y = rng.uniform(-0.5, 0.5, (2, 300))
         plate = np.column_stack([x, y, 1.6 + 0.3 * x])
-        hidden.append(scan if scan.seq not in (6, 7, 8) else Scan(seq=scan.seq, t_ns=scan.t_ns, points=plate))
+        hidden.append(
+            scan if scan.seq not in (6, 7, 8) else Scan(seq=scan.seq, t_ns=scan.t_ns, points=plate)
+        )
     made = reconstruct(lambda: hidden)
     used = {t_ns // 500_000_000 for t_ns, _ in made.poses}
     assert used == set(range(12)) - {6, 7, 8}
@@ -639,8 +762,12 @@ def test_scans_of_a_plate_in_front_of_the_target_are_not_used():
 
 def test_a_point_at_the_sensor_is_left_out_of_a_view():
     """It has no direction; a damaged log may contain one."""
-    grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 20), np.linspace(-0.2, 0.2, 20)), axis=-1).reshape(-1, 2)
-    points = np.vstack([np.column_stack([grid, np.zeros(len(grid))]), np.zeros((1, 3))]).astype(np.float32)
+    grid = np.stack(
+        np.meshgrid(np.linspace(-0.2, 0.2, 20), np.linspace(-0.2, 0.2, 20)), axis=-1
+    ).reshape(-1, 2)
+    points = np.vstack([np.column_stack([grid, np.zeros(len(grid))]), np.zeros((1, 3))]).astype(
+        np.float32
+    )
     camera = points[7].astype(np.float64)
     view = thinned_view(Scan(0, 0, points), Survey((0,), 1, 0.5, camera, False), 0.01)
     assert len(view.points) > 300

@@ -1,4 +1,7 @@
-"""Recording by the command: the log contains the input, with the same bytes every time, and no partial file remains."""
+"""Recording by the command.
+
+The log contains the input, with the same bytes every time, and no partial file remains.
+"""
 
 import hashlib
 import json
@@ -22,7 +25,8 @@ from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record, surface_for
 from avsreplay.records import ScanStatus
-from avsreplay.simulate import load_scenario, simulate
+from avsreplay.simulate.scenario import load_scenario
+from avsreplay.simulate.simulation import simulate
 
 FIXTURES = Path(__file__).parent.parent / "fixtures"
 DATA = Path(__file__).parent.parent.parent / "shared" / "data"
@@ -65,7 +69,9 @@ def read(path, **options):
 
 def run(*args, **env):
     command = [sys.executable, "-m", "avsreplay", "record", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **env}, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, **env}, check=False
+    )
 
 
 def test_a_recorded_simulation_reads_back_as_it_was(scenario, tmp_path):
@@ -91,7 +97,14 @@ def test_a_recorded_simulation_reads_back_as_it_was(scenario, tmp_path):
 def test_a_stamp_jump_is_in_the_log_and_its_truth_is_not_moved(scenario, tmp_path):
     record(scenario, tmp_path / "a.mcap")
     _, scans = read(tmp_path / "a.mcap")
-    assert [s.status is ScanStatus.CLOCK for s in scans] == [False, False, True, False, False, False]
+    assert [s.status is ScanStatus.CLOCK for s in scans] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
     loaded = load_scenario(scenario)
     truth = simulate(loaded, surface_for(loaded)).truth(scans[2].log_ns)
     assert_allclose(scans[2].truth.matrix, truth.T_ac.matrix, atol=1e-12)
@@ -119,7 +132,9 @@ def test_the_builtin_scenario_needs_no_argument(monkeypatch, tmp_path):
 
 
 def test_json_states_the_same(scenario, tmp_path):
-    done = CliRunner().invoke(record_command, [str(scenario), "-o", str(tmp_path / "a.mcap"), "--seed", "9", "--json"])
+    done = CliRunner().invoke(
+        record_command, [str(scenario), "-o", str(tmp_path / "a.mcap"), "--seed", "9", "--json"]
+    )
     said = json.loads(done.output)
     assert (said["scans"], said["span_s"], said["seed"], said["bytes"]) == (
         6,
@@ -132,12 +147,20 @@ def test_json_states_the_same(scenario, tmp_path):
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_fixture_is_reproducible(case, tmp_path):
-    """To the bit where this processor rounds as the one that made it, to 1e-12 in the truth in any event."""
-    record(FIXTURES / f"{case}.toml", tmp_path / "a.mcap", options=RecordOptions(compression="none"))
+    """To the bit where this processor rounds as the one that made it, to 1e-12 in the truth in any
+    event.
+    """
+    record(
+        FIXTURES / f"{case}.toml", tmp_path / "a.mcap", options=RecordOptions(compression="none")
+    )
     if sha(tmp_path / "a.mcap") == sha(FIXTURES / f"{case}.mcap"):
         return
     (one, first), (two, second) = read(tmp_path / "a.mcap"), read(FIXTURES / f"{case}.mcap")
-    assert (one.scenario, labels(one), one.surface.sha256) == (two.scenario, labels(two), two.surface.sha256)
+    assert (one.scenario, labels(one), one.surface.sha256) == (
+        two.scenario,
+        labels(two),
+        two.surface.sha256,
+    )
     for a, b in zip(first, second, strict=True):
         assert (a.t_ns, a.log_ns, a.status, a.fault) == (b.t_ns, b.log_ns, b.status, b.fault)
         assert_allclose(a.points, b.points, atol=1e-6)
@@ -193,7 +216,7 @@ def test_every_nth_scan_keeps_its_own_time(tmp_path):
 
 
 def test_a_model_may_replace_the_shape(scenario, tmp_path):
-    from avsreplay.simulate import Shape, builtin_surface
+    from avsreplay.simulate.target import Shape, builtin_surface
 
     model = tmp_path / "bracket.ply"
     model.write_bytes(builtin_surface(Shape.BRACKET).data)
@@ -243,7 +266,12 @@ def test_a_failure_during_recording_leaves_no_file(scenario, tmp_path):
     ("source", "more", "error", "words"),
     [
         ("short.toml", {"reading": SourceOptions(topic="/x")}, UsageError, "no topics"),
-        ("short.toml", {"options": RecordOptions(model=Path("none.ply"))}, UnreadableInput, "none.ply"),
+        (
+            "short.toml",
+            {"options": RecordOptions(model=Path("none.ply"))},
+            UnreadableInput,
+            "none.ply",
+        ),
         ("none.mcap", {}, UnreadableInput, "no such file"),
         ("none.toml", {}, UnreadableInput, "no such file"),
         ("empty.mcap", {}, UnreadableInput, "empty"),
@@ -285,7 +313,11 @@ def test_messages_that_cannot_be_decoded_are_left_out_and_counted():
             assert len(truth) == 4
 
     tally = recording._fold(
-        [(scan, scan) for scan in scans], truth_of, Writer(), true_clock=False, camera_of=lambda _: []
+        [(scan, scan) for scan in scans],
+        truth_of,
+        Writer(),
+        true_clock=False,
+        camera_of=lambda _: [],
     )
     assert (tally.damaged, tally.scans, 3 in written) == (1, 34, False)
 
@@ -300,5 +332,8 @@ def test_the_dragon_becomes_a_log(tmp_path):
     assert (done.scans, len(scans)) == (15, 15)
     assert_allclose(np.diff([s.t_ns for s in scans]) * 1e-9, 1.0)
     assert all(s.truth is not None for s in scans)
-    turns = [np.degrees(2 * np.arccos(min(1.0, abs(float(s.truth.q @ scans[0].truth.q))))) for s in scans[1:3]]
+    turns = [
+        np.degrees(2 * np.arccos(min(1.0, abs(float(s.truth.q @ scans[0].truth.q)))))
+        for s in scans[1:3]
+    ]
     assert_allclose(turns, [24, 48], atol=1.0)

@@ -1,4 +1,7 @@
-"""Properties of registration: signs, frames, quality, unobservable directions of a view, visible faces."""
+"""Properties of registration.
+
+Signs, frames, quality, unobservable directions of a view, visible faces.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
-from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import example_pose, plate_scan, view
 from avsreplay.register.covariance import systematic_errors, without_dominant_patches
 from avsreplay.register.degenerate import Directions
-from avsreplay.register.params import Camera
+from avsreplay.register.params import Camera, RegisterParams
 from avsreplay.register.peers import best_motion, horn_matrix
 from avsreplay.register.quality import evidence, grade
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
@@ -53,12 +56,17 @@ def test_horn_agrees_with_the_singular_value_solution() -> None:
     rng = _rng()
     for _ in range(20):
         moving, fixed = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
-        oracle = Rotation.align_vectors(fixed - fixed.mean(0), moving - moving.mean(0))[0].as_matrix()
+        oracle = Rotation.align_vectors(fixed - fixed.mean(0), moving - moving.mean(0))[
+            0
+        ].as_matrix()
         np.testing.assert_allclose(best_motion(moving, fixed).R, oracle, atol=1e-9)
 
 
 def test_horn_matrix_is_scalar_first() -> None:
-    """No motion must give [1 0 0 0] as the largest eigenvector; read scalar last it would be a half turn (errata)."""
+    """No motion must give [1 0 0 0] as the largest eigenvector.
+
+    Read scalar last it would be a half turn (errata).
+    """
     points = _rng().normal(size=(20, 3))
     centred = points - points.mean(axis=0)
     vector = np.linalg.eigh(horn_matrix(centred.T @ centred / 20))[1][:, -1]
@@ -69,10 +77,14 @@ def test_horn_matrix_is_scalar_first() -> None:
 
 
 @pytest.mark.parametrize("backend", ["horn", "reference"])
-def test_an_exact_scan_is_registered_to_rounding(surface: Surface, scan: np.ndarray, backend: str) -> None:
+def test_an_exact_scan_is_registered_to_rounding(
+    surface: Surface, scan: np.ndarray, backend: str
+) -> None:
     T_ac = example_pose()
     guess = T_ac @ Pose(exp(np.radians([2.0, -3.0, 1.5])), np.array([0.04, -0.05, 0.03]))
-    params = RegisterParams(backend=backend, eps_rad=1e-7, eps_m=1e-7, n_max=1000)  # Horn alone settles slowly
+    params = RegisterParams(
+        backend=backend, eps_rad=1e-7, eps_m=1e-7, n_max=1000
+    )  # Horn alone settles slowly
     found = Registrar(surface, params).register(scan, guess)
     assert found.status is AlignStatus.ALIGNED
     step = T_ac.inverse() @ found.T_ac
@@ -125,7 +137,9 @@ class _NotFinite(_Raising):
 
 
 @pytest.mark.parametrize("fake", [_Raising, _NotFinite])
-def test_a_failure_of_a_back_end_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
+def test_a_failure_of_a_back_end_is_a_status(
+    monkeypatch, surface: Surface, scan: np.ndarray, fake
+) -> None:
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: fake)
     found = Registrar(surface).register(scan, example_pose())
     assert found.status is AlignStatus.FAILED
@@ -146,8 +160,13 @@ def _off(degrees: float) -> Pose:
     return example_pose() @ Pose(exp([0.0, np.radians(degrees), 0.0]), np.zeros(3))
 
 
-def test_a_guess_that_is_returned_unchanged_is_no_measurement(monkeypatch, surface: Surface, scan: np.ndarray) -> None:
-    """Even a good guess: it says nothing of this scan, and the filter would take it as a perfect confirmation."""
+def test_a_guess_that_is_returned_unchanged_is_no_measurement(
+    monkeypatch, surface: Surface, scan: np.ndarray
+) -> None:
+    """Even a good guess.
+
+    It says nothing of this scan, and the filter would take it as a perfect confirmation.
+    """
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _Unchanged)
     noisy = scan + np.random.default_rng(3).normal(0.0, 0.005, scan.shape)
     for degrees in (0.02, 0.5, 3.0):
@@ -156,14 +175,18 @@ def test_a_guess_that_is_returned_unchanged_is_no_measurement(monkeypatch, surfa
         assert "unchanged" in found.message
 
 
-def test_a_scan_beside_the_target_is_no_failure_of_the_back_end(registrar: Registrar, scan: np.ndarray) -> None:
+def test_a_scan_beside_the_target_is_no_failure_of_the_back_end(
+    registrar: Registrar, scan: np.ndarray
+) -> None:
     guess = example_pose()
     found = registrar.register(scan + np.array([40.0, 0.0, 0.0]), guess)
     assert (found.status, found.message) == (AlignStatus.NO_OVERLAP, "")
     np.testing.assert_allclose(found.T_ac.t, guess.t, atol=1e-12)
 
 
-def test_a_false_claim_of_convergence_is_found(monkeypatch, surface: Surface, scan: np.ndarray) -> None:
+def test_a_false_claim_of_convergence_is_found(
+    monkeypatch, surface: Surface, scan: np.ndarray
+) -> None:
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _NearGuess)
     found = Registrar(surface).register(scan, _off(0.4))
     assert not found.converged
@@ -173,8 +196,12 @@ def test_a_false_claim_of_convergence_is_found(monkeypatch, surface: Surface, sc
 # --- the ruler
 
 
-def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: Registrar, scan: np.ndarray) -> None:
-    """J of the ruler against finite differences of the residuals, in d of T_ac_true = T_ac @ Exp(d)."""
+def test_information_is_the_curvature_of_the_cost(
+    surface: Surface, registrar: Registrar, scan: np.ndarray
+) -> None:
+    """J of the ruler against finite differences of the residuals, in d of T_ac_true = T_ac @
+    Exp(d).
+    """
     T_ac = example_pose()
     model = SurfaceIndex.build(surface, 0.5)
     base = residuals(model, Visibility(surface), scan, T_ac.inverse(), 0.05)
@@ -188,11 +215,16 @@ def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: R
             pytest.fail("the step changed the inliers")
         slope = (shifted.e - base.e) / h
         inside = np.abs(slope - base.J[:, k]) < 1e-3
-        assert inside.mean() > 0.97  # the rest have their foot on an edge, where the foot slides to another face
+        assert (
+            inside.mean() > 0.97
+        )  # the rest have their foot on an edge, where the foot slides to another face
 
 
 def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np.ndarray) -> None:
-    """The kernel's sums against numpy, point by point; the patches in any order; few patches: a point each."""
+    """The kernel's sums against numpy, point by point; the patches in any order; few patches.
+
+    A point each.
+    """
     T_ca, index = example_pose().inverse(), SurfaceIndex.build(surface, 0.5)
     for points in (scan, scan[:40], scan[:1], scan[:0]):
         plain = residuals(index, Visibility(surface), points, T_ca, 0.05)
@@ -200,21 +232,38 @@ def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np
         assert (found.points, found.inliers) == (len(points), plain.inliers)
         assert len(found.counts) == plain.patch.max(initial=-1) + 1
         assert sorted(found.counts) == sorted(np.bincount(plain.patch))
-        np.testing.assert_allclose(found.normals.sum(axis=0), plain.J.T @ plain.J, rtol=1e-10, atol=1e-9)
-        np.testing.assert_allclose(found.gradients.sum(axis=0), plain.J.T @ plain.e, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            found.normals.sum(axis=0), plain.J.T @ plain.J, rtol=1e-10, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            found.gradients.sum(axis=0), plain.J.T @ plain.e, rtol=1e-9, atol=1e-9
+        )
         if plain.inliers:
             np.testing.assert_allclose(found.centre, plain.p.mean(axis=0), atol=1e-12)
             assert found.rms_m == pytest.approx(np.sqrt(plain.d2.mean()), rel=1e-12)
-            assert found.noise_m == pytest.approx(max(1.4826 * np.median(np.abs(plain.e)), 5e-8), rel=1e-9)
+            assert found.noise_m == pytest.approx(
+                max(1.4826 * np.median(np.abs(plain.e)), 5e-8), rel=1e-9
+            )
             whole = summed(plain.J, plain.e, plain.patch)
-            order = np.argsort(np.unique(plain.patch, return_index=True)[1])  # by the first point of each patch
+            order = np.argsort(
+                np.unique(plain.patch, return_index=True)[1]
+            )  # by the first point of each patch
             np.testing.assert_allclose(found.normals, whole.normals[order], rtol=1e-8, atol=1e-9)
-            np.testing.assert_allclose(found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(
+                found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9
+            )
 
 
 def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_them() -> None:
-    """Patches are parts of the model. Those of the measured points would divide the face by the sign of the noise."""
-    low, high, rng = np.array([-0.6, -0.5, -0.4]), np.array([0.55, 0.45, 0.001]), np.random.default_rng(4)
+    """Patches are parts of the model.
+
+    Those of the measured points would divide the face by the sign of the noise.
+    """
+    low, high, rng = (
+        np.array([-0.6, -0.5, -0.4]),
+        np.array([0.55, 0.45, 0.001]),
+        np.random.default_rng(4),
+    )
     solid = box(low, high)
     surface = Surface(solid.vertices, solid.faces, "box", "")
     index, noise, values = SurfaceIndex.build(surface, 0.5), 0.004, []
@@ -229,17 +278,26 @@ def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_the
 
 
 @pytest.mark.parametrize(
-    ("noise_m", "squeeze", "systematic"), [(0.01, 0.0, True), (0.002, 0.02, True), (0.01, 0.0, False)]
+    ("noise_m", "squeeze", "systematic"),
+    [(0.01, 0.0, True), (0.002, 0.02, True), (0.01, 0.0, False)],
 )
 def test_the_grade_follows_from_the_sums_over_patches(
     surface: Surface, scan: np.ndarray, noise_m: float, squeeze: float, systematic: bool
 ) -> None:
-    """One call of the kernel gives what numpy makes of the sums, the covariance and the test of halves."""
+    """One call of the kernel gives what numpy makes of the sums, the covariance and the test of
+    halves.
+    """
     points = scan * [1.0 + squeeze, 1.0, 1.0] + _rng().normal(0.0, noise_m, scan.shape)
-    index, visibility, params = SurfaceIndex.build(surface, 0.5), Visibility(surface), RegisterParams()
+    index, visibility, params = (
+        SurfaceIndex.build(surface, 0.5),
+        Visibility(surface),
+        RegisterParams(),
+    )
     limits = params.limits(surface.extent)
     T_ca = Registrar(surface).register(points, example_pose()).T_ac.inverse()
-    found = grade(index, visibility, points, Fit(T_ca, 1, True), limits, params, systematic=systematic)
+    found = grade(
+        index, visibility, points, Fit(T_ca, 1, True), limits, params, systematic=systematic
+    )
     sums = evidence(index, visibility, points, T_ca, limits.gate_m)
     assert (found.points, found.inliers, found.rms_m) == (sums.points, sums.inliers, sums.rms_m)
     sums = without_dominant_patches(sums)
@@ -250,10 +308,14 @@ def test_the_grade_follows_from_the_sums_over_patches(
     assert not found.message  # no size is fitted, whose effect on the pose would be added
     np.testing.assert_allclose(found.covariance, P, rtol=1e-7, atol=1e-12 * np.abs(P).max())
     assert found.dof == pytest.approx(dof, rel=1e-6)
-    assert found.split_nis == pytest.approx(oracle_of.split_nis(sums, errors, T_ca.R[:, :2].T), rel=1e-6)
+    assert found.split_nis == pytest.approx(
+        oracle_of.split_nis(sums, errors, T_ca.R[:, :2].T), rel=1e-6
+    )
 
 
-def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, registrar: Registrar) -> None:
+def test_covariance_shrinks_with_points_and_grows_with_noise(
+    surface: Surface, registrar: Registrar
+) -> None:
     T_ac, rng = example_pose(), _rng()
     exact = {n: T_ac.apply(view(surface, n, T_ac.inverse().t)) for n in (3000, 12000)}
 
@@ -269,13 +331,20 @@ def test_no_overlap_whatever_the_flag_says(surface: Surface, scan: np.ndarray) -
     params = RegisterParams()
     far = Fit(Pose(example_pose().inverse().q, np.full(3, 1e3)), 1, True)
     found = grade(
-        SurfaceIndex.build(surface, 0.5), Visibility(surface), scan, far, params.limits(surface.extent), params
+        SurfaceIndex.build(surface, 0.5),
+        Visibility(surface),
+        scan,
+        far,
+        params.limits(surface.extent),
+        params,
     )
     assert found.status is AlignStatus.NO_OVERLAP
     assert (found.inliers, found.covariance) == (0, None)
 
 
-def test_a_registration_that_did_not_converge_is_reported_and_graded(surface: Surface, scan: np.ndarray) -> None:
+def test_a_registration_that_did_not_converge_is_reported_and_graded(
+    surface: Surface, scan: np.ndarray
+) -> None:
     guess = example_pose() @ Pose(exp([0.05, 0.0, 0.0]), np.zeros(3))
     found = Registrar(surface, RegisterParams(n_max=2)).register(scan, guess)
     assert found.status is AlignStatus.NOT_CONVERGED
@@ -287,7 +356,10 @@ def test_a_registration_that_did_not_converge_is_reported_and_graded(surface: Su
 def test_instants_say_which_pose_a_moving_scan_is_registered_at(
     registrar: Registrar, surface: Surface, scan: np.ndarray, late_far: bool
 ) -> None:
-    """The target drifts by t d1 while it is scanned, along one side or at random: the pose found is off by M d1."""
+    """The target drifts by t d1 while it is scanned, along one side or at random.
+
+    The pose found is off by M d1.
+    """
     T_ac, rng = example_pose(), _rng()
     body = T_ac.inverse().apply(scan)
     times = rng.uniform(0.0, 1.0, len(scan))
@@ -295,7 +367,9 @@ def test_instants_say_which_pose_a_moving_scan_is_registered_at(
         times[np.argsort(body[:, 1])] = np.sort(times)
     d1 = np.array([2e-3, -1e-3, 1.5e-3, 1e-3, 2e-3, -1e-3])
     moved = T_ac.apply(body + times[:, None] * (np.cross(d1[:3], body) + d1[3:]))
-    found = Registrar(surface, RegisterParams(eps_rad=1e-7, eps_m=1e-7, n_max=1000)).register(moved, T_ac)
+    found = Registrar(surface, RegisterParams(eps_rad=1e-7, eps_m=1e-7, n_max=1000)).register(
+        moved, T_ac
+    )
     step = T_ac.inverse() @ found.T_ac
     d = np.concatenate([geometry.log(step.q), step.t])
     M = registrar.instants(moved, times, found.T_ac)
@@ -303,7 +377,9 @@ def test_instants_say_which_pose_a_moving_scan_is_registered_at(
     assert (np.abs(M - 0.5 * np.eye(6)).max() > 0.1) == late_far
 
 
-def test_points_of_one_instant_have_it_in_every_direction(registrar: Registrar, scan: np.ndarray) -> None:
+def test_points_of_one_instant_have_it_in_every_direction(
+    registrar: Registrar, scan: np.ndarray
+) -> None:
     M = registrar.instants(scan, np.full(len(scan), 0.3), example_pose())
     np.testing.assert_allclose(M, 0.3 * np.eye(6), atol=1e-12)
 
@@ -345,7 +421,9 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
 def test_a_sphere_turns_about_everything_and_a_full_view_about_nothing(surface: Surface) -> None:
     n = _rng().normal(size=(3000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    assert sorted(_free(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [f"turns about {axis}" for axis in "xyz"]
+    assert sorted(_free(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [
+        f"turns about {axis}" for axis in "xyz"
+    ]
     points, normals = sample(surface, 3000)
     assert _free(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
 
@@ -366,11 +444,15 @@ def test_a_degenerate_view_has_no_covariance(registrar: Registrar) -> None:
 
 @pytest.mark.parametrize("guess_deg", [0.0, 3.0])
 def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg: float) -> None:
-    """The middle of the barrel alone determines neither the position along the axis nor the rotation about it."""
+    """The middle of the barrel alone determines neither the position along the axis nor the
+    rotation about it.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
     rim = np.column_stack([1.8 * np.cos(angle), 1.8 * np.sin(angle), np.zeros(64)])
     k, n = np.arange(64), (np.arange(64) + 1) % 64
-    faces = np.vstack([np.column_stack([k, n, k + 64]), np.column_stack([n, n + 64, k + 64])]).astype(np.int32)
+    faces = np.vstack(
+        [np.column_stack([k, n, k + 64]), np.column_stack([n, n + 64, k + 64])]
+    ).astype(np.int32)
     up = np.array([0.0, 0.0, 4.5])
     barrel = Surface(np.vstack([rim - up, rim + up]), faces, "barrel", "")
     rng, T_ac = _rng(), Pose(exp([np.pi / 2, 0.0, 0.0]), np.array([0.0, 0.0, 20.0]))
@@ -387,8 +469,11 @@ def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg:
     assert np.degrees(np.arccos(step.R[2, 2])) < 0.1  # the axis is found
     assert np.linalg.norm(step.t[:2]) < 0.01
     if guess_deg == 0.0:
-        assert abs(np.degrees(geometry.log(step.q)[2])) < 0.05  # the rotation about it stays that of the guess
-    # The position along it stays that of the guess, where the surface was seen: one radius beside the axis.
+        assert (
+            abs(np.degrees(geometry.log(step.q)[2])) < 0.05
+        )  # the rotation about it stays that of the guess
+    # The position along it stays that of the guess, where the surface was seen: one radius beside
+    # the axis.
     assert abs(step.t[2]) < 1.8 * np.radians(guess_deg) + 0.002
 
 
@@ -422,7 +507,14 @@ def test_thin_keeps_one_point_a_voxel_in_order() -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("reach_m", 0.0), ("gate_m", -1.0), ("n_max", 0), ("threads", 0), ("min_inlier_ratio", 1.5), ("eps_rad", np.nan)],
+    [
+        ("reach_m", 0.0),
+        ("gate_m", -1.0),
+        ("n_max", 0),
+        ("threads", 0),
+        ("min_inlier_ratio", 1.5),
+        ("eps_rad", np.nan),
+    ],
 )
 def test_a_value_that_cannot_be_right_is_named(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=key):
@@ -431,5 +523,10 @@ def test_a_value_that_cannot_be_right_is_named(key: str, value: float) -> None:
 
 def test_lengths_scale_with_the_model() -> None:
     small, large = RegisterParams().limits(0.25), RegisterParams().limits(8.0)
-    assert large.reach_m / small.reach_m == large.gate_m / small.gate_m == large.eps_m / small.eps_m == 32.0
+    assert (
+        large.reach_m / small.reach_m
+        == large.gate_m / small.gate_m
+        == large.eps_m / small.eps_m
+        == 32.0
+    )
     assert RegisterParams(gate_m=0.5).limits(1.0).reach_m >= 0.5

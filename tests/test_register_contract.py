@@ -24,7 +24,11 @@ QUICK = ("horn", "satellite")
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param((name, size), id=f"{name}-{size}", marks=[] if (name, size) == QUICK else pytest.mark.slow)
+        pytest.param(
+            (name, size),
+            id=f"{name}-{size}",
+            marks=[] if (name, size) == QUICK else pytest.mark.slow,
+        )
         for name in BUILT_IN
         for size in SCALES
         if (name, size) != ("reference", "statue")
@@ -101,7 +105,9 @@ class _Optimist(_Guesser):
         (_Drifter, {"runs repeat to the bit"}),
     ],
 )
-def test_the_contract_detects_a_faulty_back_end(monkeypatch: pytest.MonkeyPatch, fake, broken: set[str]) -> None:
+def test_the_contract_detects_a_faulty_back_end(
+    monkeypatch: pytest.MonkeyPatch, fake, broken: set[str]
+) -> None:
     _install(monkeypatch, fake)
     failed = {finding.law for finding in check("fake") if not finding.held}
     assert broken <= failed
@@ -121,7 +127,9 @@ def test_an_unknown_name_lists_the_registered_names() -> None:
 
 
 def test_a_missing_library_gives_an_install_hint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),))
+    monkeypatch.setattr(
+        "avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),)
+    )
     with pytest.raises(MissingBackend, match="pip install kiss-icp"):
         backend.load_backend("kiss")
     assert [state.installed for state in backend.available() if state.name == "kiss"] == [False]
@@ -177,4 +185,6 @@ def test_frames_are_not_mixed() -> None:
     bench = Bench("horn")
     found = bench.registrar.register(bench.scan, bench.guess)
     corner = bench.surface.vertices[0]
-    np.testing.assert_allclose(found.T_ac.apply(corner), bench.T_ac.R @ corner + bench.T_ac.t, atol=1e-6)
+    np.testing.assert_allclose(
+        found.T_ac.apply(corner), bench.T_ac.R @ corner + bench.T_ac.t, atol=1e-6
+    )

@@ -1,4 +1,7 @@
-"""Views that do not determine all directions of a pose: which, their covariance, and a run that begins with one."""
+"""Views that do not determine all directions of a pose.
+
+Which, their covariance, and a run that begins with one.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.track import common_motions
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import block_1s
+from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus, ScanStatus, Surface
-from avsreplay.register import Registrar
 from avsreplay.register.contract import view
 from avsreplay.register.covariance import sandwich_covariance
 from avsreplay.register.degenerate import Directions
+from avsreplay.register.registrar import Registrar
 
 HEIGHT_M, RADIUS_M = 3.0, 0.6
 
@@ -42,11 +45,15 @@ def scan_of(surface: Surface, T_ac: Pose, seed: int) -> Array:
 def twist(d: Array) -> Array:
     """The 4x4 generator of a motion d = [theta; v]."""
     x, y, z = d[:3]
-    return np.block([[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), d[3:, None]], [np.zeros((1, 4))]])
+    return np.block(
+        [[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), d[3:, None]], [np.zeros((1, 4))]]
+    )
 
 
 def cylinder_rows(seed: int) -> tuple[Array, Array]:
-    """J (n, 6) of points on the near half of a cylinder about a random axis, and that axis as a motion d."""
+    """J (n, 6) of points on the near half of a cylinder about a random axis, and that axis as a
+    motion d.
+    """
     rng = np.random.default_rng(seed)
     R, c = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
     a, z = rng.uniform(0, np.pi, 400), rng.uniform(-1, 1, 400)
@@ -57,7 +64,9 @@ def cylinder_rows(seed: int) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("angle", [0.3, 2.0, -3.0])
-def test_a_rotation_by_any_angle_about_the_axis_is_a_motion_along_the_unobservable_directions(seed, angle):
+def test_a_rotation_by_any_angle_about_the_axis_is_a_motion_along_the_unobservable_directions(
+    seed, angle
+):
     J, axis = cylinder_rows(seed)
     centre = J[:, 3:].mean(axis=0)
     view_of = Directions.of(J.T @ J, len(J), centre)
@@ -68,7 +77,9 @@ def test_a_rotation_by_any_angle_about_the_axis_is_a_motion_along_the_unobservab
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_refined_pose_has_no_residuals_left_and_does_not_move_along_the_unobservable_directions(seed):
+def test_a_refined_pose_has_no_residuals_left_and_does_not_move_along_the_unobservable_directions(
+    seed,
+):
     J, _ = cylinder_rows(seed)
     view_of = Directions.of(J.T @ J, len(J), J[:, 3:].mean(axis=0))
     error = 1e-5 * np.random.default_rng(seed).normal(size=6)
@@ -81,7 +92,10 @@ def test_a_refined_pose_has_no_residuals_left_and_does_not_move_along_the_unobse
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_information_is_that_of_the_observable_directions_alone(seed):
-    """Oracle: least squares in the observable directions only, with the covariance of independent noise."""
+    """Oracle.
+
+    Least squares in the observable directions only, with the covariance of independent noise.
+    """
     J, axis = cylinder_rows(seed)
     rng = np.random.default_rng(seed)
     found = summed(J, rng.normal(0.0, 0.01, len(J)), np.arange(len(J)) // 4)
@@ -118,15 +132,23 @@ def test_a_body_of_revolution_is_found_up_to_its_rotation_and_not_called_ambiguo
 
 
 def test_the_estimate_of_a_body_of_revolution_states_that_its_rotation_is_not_determined():
-    """It turns about an axis across its own; the position is tracked, and the attitude never claimed."""
+    """It turns about an axis across its own.
+
+    The position is tracked, and the attitude never claimed.
+    """
     surface, registrar = stage(), Registrar(stage())
     estimator = Estimator(EstimatorParams(), None, surface.extent)
     judge = FaultDetector(FaultParams(), surface.extent)
     poses = [
-        Pose((Rotation.from_rotvec([0.0, 0.05 * k, 0.02 * k]) * Rotation.from_rotvec([1.2, 0.4, 0.0])).as_quat(),
-             np.array([0.002 * k, 0.0, 8.0]))
+        Pose(
+            (
+                Rotation.from_rotvec([0.0, 0.05 * k, 0.02 * k])
+                * Rotation.from_rotvec([1.2, 0.4, 0.0])
+            ).as_quat(),
+            np.array([0.002 * k, 0.0, 8.0]),
+        )
         for k in range(30)
-    ]  # fmt: skip
+    ]
     first = registrar.acquire(scan_of(surface, poses[0], 0))
     track, used = estimator.initial(0, first.T_ac, acquired=True), 0
     for k, T_ac in enumerate(poses):

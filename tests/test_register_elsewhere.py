@@ -1,4 +1,6 @@
-"""A pose far from the true one that explains a part of a scan as well, or better by chance, is not accepted."""
+"""A pose far from the true one that explains a part of a scan as well, or better by chance, is not
+accepted.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ from trimesh.creation import annulus, box, cylinder
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import Registrar
 from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.elsewhere import cube_rotations
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
 from avsreplay.register.symmetry import near_symmetries
 
@@ -44,7 +46,11 @@ def mug(height: float) -> trimesh.Trimesh:
     handle = annulus(0.18, 0.25, 0.1, sections=32).apply_transform(
         trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
     )
-    parts = [cylinder(0.4, 0.9, sections=48), at(handle, 0.5, 0, 0.05), at(box((0.1, 0.1, 0.3)), 0.1, 0.42, height)]
+    parts = [
+        cylinder(0.4, 0.9, sections=48),
+        at(handle, 0.5, 0, 0.05),
+        at(box((0.1, 0.1, 0.3)), 0.1, 0.42, height),
+    ]
     return trimesh.util.concatenate(parts)
 
 
@@ -55,7 +61,9 @@ def surface_of(mesh: trimesh.Trimesh) -> Surface:
 def pose_of(rng: np.random.Generator, mesh: trimesh.Trimesh) -> Pose:
     """Any attitude, three extents in front of the camera."""
     q = rng.standard_normal(4)
-    return Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * float(np.linalg.norm(mesh.extents))]))
+    return Pose(
+        q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * float(np.linalg.norm(mesh.extents))])
+    )
 
 
 def cast(rng: np.random.Generator, count: int, extent: float, *placed: trimesh.Trimesh) -> Array:
@@ -85,7 +93,10 @@ def is_wrong(found: Alignment, T_ac: Pose, extent: float) -> bool:
 
 
 def test_a_part_of_a_repeated_pattern_is_not_accepted_at_another_place() -> None:
-    """The cells of a grid are alike: a part of it fits in several places, of which a search reaches a few."""
+    """The cells of a grid are alike.
+
+    A part of it fits in several places, of which a search reaches a few.
+    """
     mesh = grid()
     registrar, extent = Registrar(surface_of(mesh)), float(np.linalg.norm(mesh.extents))
     found = []
@@ -115,7 +126,9 @@ def test_a_body_beside_another_object_is_not_accepted_turned(name: str, first: i
 
 @pytest.mark.parametrize("name", ["mug:51", "mug:319", "mug:325"])
 def test_the_axis_of_a_body_with_large_marks_is_found(name: str) -> None:
-    """All turns by 5 deg about the axis carry the shell onto itself, although the marks displace the first fit."""
+    """All turns by 5 deg about the axis carry the shell onto itself, although the marks displace
+    the first fit.
+    """
     surface = scenes.meshes([name])[name]
     registrar = Registrar(surface)
     found = near_symmetries(registrar._symmetry.search, registrar.index, *sample(surface, 4000))
@@ -124,9 +137,11 @@ def test_the_axis_of_a_body_with_large_marks_is_found(name: str) -> None:
 
 
 def test_a_body_with_marks_is_not_accepted_turned_by_some_degrees() -> None:
-    """A mark that meets a few points of another object gives a minimum of the distances, 5 to 15 deg from the truth.
+    """A mark that meets a few points of another object gives a minimum of the distances, 5 to 15
+    deg from the truth.
 
-    Where no mark is in sight, the pose is that of the guess up to an edge of the shell, and the row states it.
+    Where no mark is in sight, the pose is that of the guess up to an edge of the shell, and the row
+    states it.
     """
     mesh = mug(0.1)
     registrar, extent = Registrar(surface_of(mesh)), float(np.linalg.norm(mesh.extents))
@@ -140,7 +155,9 @@ def test_a_body_with_marks_is_not_accepted_turned_by_some_degrees() -> None:
         other.apply_translation(T_ac.t + 0.4 * extent * place / np.linalg.norm(place))
         axis = axis / np.linalg.norm(axis)
         guess = T_ac @ Pose(exp(np.radians(4.0) * axis), 0.01 * extent * axis)
-        found.append((registrar.register(cast(rng, 2000, extent, moved(mesh, T_ac), other), guess), T_ac))
+        found.append(
+            (registrar.register(cast(rng, 2000, extent, moved(mesh, T_ac), other), guess), T_ac)
+        )
     assert not [each for each in found if is_wrong(*each, extent) and not each[0].message]
     assert sum(each.status is AlignStatus.ALIGNED for each, _ in found) >= 15
 
@@ -165,7 +182,9 @@ def test_the_rotations_of_a_cube_are_a_group() -> None:
 def test_comparing_poses_stays_within_the_budget(
     name: str, scene: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where displaced starts take several times their usual work, and where the turns of a body are many."""
+    """Also where displaced starts take several times their usual work, and where the turns of a
+    body are many.
+    """
     spent, spend = [0], Budget.spend
 
     def counted(self: Budget, searches: int) -> None:
@@ -175,6 +194,12 @@ def test_comparing_poses_stays_within_the_budget(
     monkeypatch.setattr(Budget, "spend", counted)
     surface = scenes.meshes([name])[name]
     registrar, case = Registrar(surface), scenes.SCENES[scene](surface, 2000, seed)
-    found = registrar.acquire(case.points) if case.guess is None else registrar.register(case.points, case.guess)
-    assert 0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(case.points), registrar._target.near_work)
+    found = (
+        registrar.acquire(case.points)
+        if case.guess is None
+        else registrar.register(case.points, case.guess)
+    )
+    assert (
+        0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(case.points), registrar._target.near_work)
+    )
     assert found.status is not AlignStatus.FAILED

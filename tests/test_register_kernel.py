@@ -1,4 +1,7 @@
-"""The C++ kernel: exact against independent searches, the same bits for any thread count and instruction set."""
+"""The C++ kernel.
+
+Exact against independent searches, the same bits for any thread count and instruction set.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from oracles.closest_point import OracleIndex
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
-from avsreplay.register import RegisterParams
+from avsreplay.register.params import RegisterParams
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex, kernel_module
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
@@ -26,7 +29,12 @@ NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 def surface(vertices: Array, faces: object = NO_FACES) -> Surface:
-    return Surface(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int32).reshape(-1, 3), "test", "")
+    return Surface(
+        np.asarray(vertices, dtype=np.float64),
+        np.asarray(faces, dtype=np.int32).reshape(-1, 3),
+        "test",
+        "",
+    )
 
 
 def rng(seed: int) -> np.random.Generator:
@@ -36,7 +44,9 @@ def rng(seed: int) -> np.random.Generator:
 def soup(n: int, seed: int, size: float = 0.3) -> Surface:
     """n triangles anywhere in a box, of sizes over two decades, some of them slivers."""
     r = rng(seed)
-    corners = r.uniform(-1, 1, (n, 1, 3)) + size * r.standard_normal((n, 3, 3)) * 10 ** r.uniform(-2, 0, (n, 1, 1))
+    corners = r.uniform(-1, 1, (n, 1, 3)) + size * r.standard_normal((n, 3, 3)) * 10 ** r.uniform(
+        -2, 0, (n, 1, 1)
+    )
     thin = r.random(n) < 0.2
     along = corners[thin, 0] + 0.7 * (corners[thin, 1] - corners[thin, 0])
     corners[thin, 2] = along + 1e-7 * r.standard_normal(along.shape)
@@ -44,14 +54,18 @@ def soup(n: int, seed: int, size: float = 0.3) -> Surface:
 
 
 def distances(q: Array, corners: Array) -> Array:
-    """Distance from q (3,) to each triangle (m, 3, 3), by barycentric coordinates and the sides, in long double."""
+    """Distance from q (3,) to each triangle (m, 3, 3), by barycentric coordinates and the sides, in
+    long double.
+    """
     a, b, c, q = (x.astype(np.longdouble) for x in (corners[:, 0], corners[:, 1], corners[:, 2], q))
     sides = np.min([_to_side(q, a, b), _to_side(q, b, c), _to_side(q, c, a)], axis=0)
     ab, ac, aq = b - a, c - a, q - a
     m = np.cross(ab, ac)
     v, w = _dot(np.cross(aq, ac), m) / _dot(m, m), _dot(np.cross(ab, aq), m) / _dot(m, m)
     inside = (v >= 0) & (w >= 0) & (v + w <= 1)
-    return np.where(inside, np.minimum(sides, np.abs(_dot(aq, m)) / np.sqrt(_dot(m, m))), sides).astype(np.float64)
+    return np.where(
+        inside, np.minimum(sides, np.abs(_dot(aq, m)) / np.sqrt(_dot(m, m))), sides
+    ).astype(np.float64)
 
 
 def _dot(u: Array, v: Array) -> Array:
@@ -64,7 +78,10 @@ def _to_side(q: Array, u: Array, v: Array) -> Array:
 
 
 def adversarial(vertices: Array, seed: int, n: int) -> Array:
-    """Queries where a search goes wrong if it can: on vertices, halfway between them, a rounding beside, far off."""
+    """Queries where a search goes wrong if it can.
+
+    On vertices, halfway between them, a rounding beside, far off.
+    """
     r = rng(seed)
     i, j = r.integers(len(vertices), size=(2, n))
     t = r.random((n, 1))
@@ -87,14 +104,17 @@ def clouds() -> dict[str, Array]:
     lattice = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
     angle = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
     return {
-        "sphere, its middle equally far from all": sphere / np.linalg.norm(sphere, axis=1, keepdims=True),
+        "sphere, its middle equally far from all": sphere
+        / np.linalg.norm(sphere, axis=1, keepdims=True),
         "lattice, ties everywhere": lattice,
         "ring, a whole axis of ties": np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]),
         "one point": np.array([[0.1, 0.2, 0.3]]),
         "doubled points": np.repeat(r.standard_normal((300, 3)), 5, axis=0),
         "flat": np.column_stack([r.random((2000, 2)), np.zeros(2000)]),
         "far from the origin": 1e4 + r.standard_normal((2000, 3)),
-        "two scales": np.concatenate([1e-3 * r.standard_normal((2000, 3)), 5 + r.standard_normal((500, 3))]),
+        "two scales": np.concatenate(
+            [1e-3 * r.standard_normal((2000, 3)), 5 + r.standard_normal((500, 3))]
+        ),
     }
 
 
@@ -122,10 +142,14 @@ def test_the_tree_of_points_has_the_distances_of_another_kd_tree(count: int) -> 
     q = np.concatenate([rng(7).standard_normal((300, 3)), points])
     for k in (1, 2, 9):
         distance, number = kernel_module().PointTree(points).query(q, k)
-        assert np.array_equal(distance, scipy_spatial.cKDTree(points).query(q, k=range(1, k + 1))[0])
+        assert np.array_equal(
+            distance, scipy_spatial.cKDTree(points).query(q, k=range(1, k + 1))[0]
+        )
         known = number < count
         assert np.array_equal(known, np.isfinite(distance))
-        between = np.linalg.norm(q[:, None, :] - np.append(points, np.zeros((1, 3)), axis=0)[number], axis=2)
+        between = np.linalg.norm(
+            q[:, None, :] - np.append(points, np.zeros((1, 3)), axis=0)[number], axis=2
+        )
         assert np.allclose(between[known], distance[known], rtol=1e-14, atol=0)
         assert all(len(set(row[row < count])) == np.sum(row < count) for row in number)
 
@@ -200,12 +224,17 @@ def test_kernel_and_oracle_find_the_same_closest_points_on_the_built_in_like_mes
     near = (ours.id >= 0) & (plain.id >= 0)
     unsure = np.abs(np.sqrt(np.minimum(ours.d2, plain.d2)) - 0.5) < 1e-9
     assert np.array_equal((ours.id >= 0) | unsure, (plain.id >= 0) | unsure)
-    assert np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near])).max() < 1e-7  # the slivers' normals
+    assert (
+        np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near])).max() < 1e-7
+    )  # the slivers' normals
     assert np.median(np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near]))) < 1e-15
 
 
 def hard_meshes() -> dict[str, Surface]:
-    """Meshes that are not closed, single and outer: what a display model of a spacecraft is made of."""
+    """Meshes that are not closed, single and outer.
+
+    What a display model of a spacecraft is made of.
+    """
     trimesh = pytest.importorskip("trimesh")
     r = rng(20)
     ball = trimesh.creation.icosphere(3, 1.0)
@@ -232,10 +261,15 @@ def test_nearest_face_that_faces_the_camera_is_that_of_a_full_search(name: str) 
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     model = SurfaceIndex.build(mesh, 0.3 * mesh.extent)
     r = rng(22)
-    on = np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), 120), corners[r.integers(len(corners), size=120)])
+    on = np.einsum(
+        "nk,nki->ni", r.dirichlet(np.ones(3), 120), corners[r.integers(len(corners), size=120)]
+    )
     away = 10 ** r.uniform(-6, -0.5, (120, 1)) * mesh.extent * r.standard_normal((120, 3))
     q = np.concatenate([on + 0.01 * away, on + away, adversarial(mesh.vertices, 23, 12)])
-    for eye in (np.array([0.3, 5.0, 2.0]) * mesh.extent, np.array([-0.02, 0.05, 0.1]) * mesh.extent):
+    for eye in (
+        np.array([0.3, 5.0, 2.0]) * mesh.extent,
+        np.array([-0.02, 0.05, 0.1]) * mesh.extent,
+    ):
         faces = np.sum((eye - corners[:, 0]) * normals, axis=1) > 0.0
         found = model.closest(q, camera_c=eye)
         assert faces[found.id[found.id >= 0]].all()
@@ -249,17 +283,25 @@ def test_nearest_face_that_faces_the_camera_is_that_of_a_full_search(name: str) 
 @pytest.mark.parametrize("name", ["interior faces", "open", "fine"])
 @pytest.mark.parametrize("facing", [True, False])
 def test_neighbours_kept_over_many_passes_are_those_of_a_search(name: str, facing: bool) -> None:
-    """The camera passes over many faces' edges while the pose settles, so faces begin and cease to face it."""
+    """The camera passes over many faces' edges while the pose settles, so faces begin and cease to
+    face it.
+    """
     mesh = hard_meshes()[name]
     model = SurfaceIndex.build(mesh, 0.3 * mesh.extent)
     corners = mesh.vertices[mesh.faces]
     r = rng(24)
     eye = np.array([0.5, 6.0, 2.0])
     seen = corners[
-        np.sum((eye - corners[:, 0]) * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        np.sum(
+            (eye - corners[:, 0])
+            * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+            axis=1,
+        )
         > 0
     ]
-    p = np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), 3000), seen[r.integers(len(seen), size=3000)])
+    p = np.einsum(
+        "nk,nki->ni", r.dirichlet(np.ones(3), 3000), seen[r.integers(len(seen), size=3000)]
+    )
     start = Pose(exp([0.06, -0.04, 0.05]), eye)
     scan = start.inverse().apply(p + 0.002 * r.standard_normal(p.shape))
     for n in (3, 8, 30):
@@ -273,7 +315,10 @@ def test_neighbours_kept_over_many_passes_are_those_of_a_search(name: str, facin
 
 @pytest.mark.parametrize("seed", range(6))
 def test_newton_steps_end_at_the_fixed_point_of_horns_iteration(seed: int) -> None:
-    """Horn's passes alone, continued to 1e-10, stay where Newton's ended; they need many times more passes."""
+    """Horn's passes alone, continued to 1e-10, stay where Newton's ended.
+
+    They need many times more passes.
+    """
     trimesh = pytest.importorskip("trimesh")
     parts = [
         trimesh.creation.box((1.0, 0.7, 0.4)),
@@ -286,18 +331,28 @@ def test_newton_steps_end_at_the_fixed_point_of_horns_iteration(seed: int) -> No
     scan = scan_of(mesh, 3000, seed, noise=0.004)
     model = SurfaceIndex.build(mesh, 0.3)
     found = model.icp(scan, GUESS, IcpParams(n_max=200))
-    horn = IcpParams(n_max=3000, n_plane=0, gate_m=found.gate_m, tighten=0.0, eps_rad=1e-10, eps_m=1e-10, newton=False)
+    horn = IcpParams(
+        n_max=3000,
+        n_plane=0,
+        gate_m=found.gate_m,
+        tighten=0.0,
+        eps_rad=1e-10,
+        eps_m=1e-10,
+        newton=False,
+    )
     on = model.icp(scan, found.T_ca, horn)
     assert found.converged
     assert found.iterations <= 12
     assert np.abs(found.T_ca - on.T_ca).max() < 2e-5
-    slow = model.icp(scan, GUESS, IcpParams(n_max=3000, newton=False, n_plane=0, eps_rad=1e-8, eps_m=1e-8))
+    slow = model.icp(
+        scan, GUESS, IcpParams(n_max=3000, newton=False, n_plane=0, eps_rad=1e-8, eps_m=1e-8)
+    )
     assert slow.iterations > 2 * found.iterations
 
 
 def test_a_view_along_a_plate_ends_although_newton_steps_fail_there() -> None:
-    """A direction that a few points next to edges determine: full Newton steps leave the region in which these points
-    have the same faces, and Horn's steps alone need hundreds of passes."""
+    """A direction that a few points next to edges determine: full Newton steps leave the region in
+    which these points have the same faces, and Horn's steps alone need hundreds of passes."""
     trimesh = pytest.importorskip("trimesh")
     body = trimesh.util.concatenate(
         [
@@ -332,7 +387,9 @@ def test_a_view_along_a_plate_ends_although_newton_steps_fail_there() -> None:
 def test_directions_that_cannot_be_observed_are_left_at_the_guess(seen: str) -> None:
     r = rng(25)
     if seen == "plate":
-        mesh = surface([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]])
+        mesh = surface(
+            [[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]]
+        )
         p = np.column_stack([r.uniform(-1, 1, (2000, 2)), np.zeros(2000)])
     else:
         trimesh = pytest.importorskip("trimesh")
@@ -340,7 +397,9 @@ def test_directions_that_cannot_be_observed_are_left_at_the_guess(seen: str) -> 
         mesh, angle = surface(tube.vertices, tube.faces), r.uniform(-1.2, 1.2, 2000)
         p = np.column_stack([np.cos(angle), np.sin(angle), r.uniform(-1, 1, 2000)])
     off = Pose(exp([0.01, -0.02, 0.0]), [0.01, 0.02, 0.03])
-    found = SurfaceIndex.build(mesh, 1.0).icp(off.apply(p + 1e-3 * r.standard_normal(p.shape)), Pose.identity())
+    found = SurfaceIndex.build(mesh, 1.0).icp(
+        off.apply(p + 1e-3 * r.standard_normal(p.shape)), Pose.identity()
+    )
     assert np.abs(found.T_ca[:3, 3]).max() < 0.2
     assert found.rms_m < 2e-3
 
@@ -348,7 +407,9 @@ def test_directions_that_cannot_be_observed_are_left_at_the_guess(seen: str) -> 
 def scan_of(mesh: Surface, n: int, seed: int, noise: float = 0.003) -> Array:
     r = rng(seed)
     corners = mesh.vertices[mesh.faces][r.integers(len(mesh.faces), size=n)]
-    return np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), size=n), corners) + noise * r.standard_normal((n, 3))
+    return np.einsum(
+        "nk,nki->ni", r.dirichlet(np.ones(3), size=n), corners
+    ) + noise * r.standard_normal((n, 3))
 
 
 RULE = IcpParams(n_max=40)
@@ -361,9 +422,21 @@ def everything(model: SurfaceIndex, scan: Array, rule: IcpParams = RULE) -> byte
     r = model.icp(scan, GUESS, rule)
     n = model.normal_equations(scan, r.T_ca, 0.2, threads=rule.threads, facing=rule.facing)
     c = model.closest(scan, threads=rule.threads)
-    numbers = [r.iterations, r.inliers, r.rms_m, r.gate_m, r.step_rad, r.step_m, n.inliers, n.sum_e2, n.sum_d2]
+    numbers = [
+        r.iterations,
+        r.inliers,
+        r.rms_m,
+        r.gate_m,
+        r.step_rad,
+        r.step_m,
+        n.inliers,
+        n.sum_e2,
+        n.sum_d2,
+    ]
     arrays = [r.T_ca, n.info, n.gradient, c.foot, c.d2, c.normal]
-    return np.concatenate([np.array(numbers, dtype=np.float64), *(a.ravel() for a in arrays)]).tobytes()
+    return np.concatenate(
+        [np.array(numbers, dtype=np.float64), *(a.ravel() for a in arrays)]
+    ).tobytes()
 
 
 @pytest.fixture(params=["mesh", "cloud"])
@@ -390,7 +463,10 @@ def test_a_number_of_threads_that_no_system_has_is_refused(target: Surface) -> N
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the address space of a process")
 def test_threads_that_the_system_refuses_do_not_end_the_process() -> None:
-    """Those that start do the work: here the stacks of 1024 threads do not fit in the address space."""
+    """Those that start do the work.
+
+    Here the stacks of 1024 threads do not fit in the address space.
+    """
     code = (
         "import resource\n"
         "import numpy as np\n"
@@ -403,14 +479,19 @@ def test_threads_that_the_system_refuses_do_not_end_the_process() -> None:
         "resource.setrlimit(resource.RLIMIT_AS, (size + (256 << 20), resource.RLIM_INFINITY))\n"
         "assert index.closest(points, threads=1024).d2.tobytes() == alone.tobytes()\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
 def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 17)
     model = SurfaceIndex.build(target, 0.4)
-    kept, searched = model.icp(scan, GUESS, RULE), model.icp(scan, GUESS, IcpParams(n_max=40, keep=False))
+    kept, searched = (
+        model.icp(scan, GUESS, RULE),
+        model.icp(scan, GUESS, IcpParams(n_max=40, keep=False)),
+    )
     assert everything(model, scan) == everything(model, scan, IcpParams(n_max=40, keep=False))
     assert kept.searched < searched.searched == searched.iterations * len(scan)
     assert everything(model, scan, FACING) == everything(model, scan, replace(FACING, keep=False))
@@ -428,27 +509,46 @@ def sheet(n: int) -> Surface:
 
 @pytest.mark.parametrize("facing", [False, True])
 def test_on_small_triangles_most_searches_are_skipped_with_the_same_bits(facing: bool) -> None:
-    """Neighbouring triangles are nearly as near as the nearest: only its block can be kept, not the triangle."""
+    """Neighbouring triangles are nearly as near as the nearest.
+
+    Only its block can be kept, not the triangle.
+    """
     mesh, r = sheet(80), rng(31)
     model = SurfaceIndex.build(mesh, 0.4)
-    at = mesh.vertices[r.integers(len(mesh.vertices), size=3000)] + 0.01 * r.standard_normal((3000, 3))
+    at = mesh.vertices[r.integers(len(mesh.vertices), size=3000)] + 0.01 * r.standard_normal(
+        (3000, 3)
+    )
     camera = Pose(exp([0.0, np.pi, 0.0]), np.array([0.0, 0.0, 4.0]))
     scan = camera.inverse().apply(at)
     guess = Pose(exp([0.004, -0.003, 0.002]), np.array([0.004, 0.002, -0.003])) @ camera
-    rule = IcpParams(n_max=12, n_plane=2, gate_m=0.1, tighten=0.0, eps_rad=0.0, eps_m=0.0, facing=facing)
+    rule = IcpParams(
+        n_max=12, n_plane=2, gate_m=0.1, tighten=0.0, eps_rad=0.0, eps_m=0.0, facing=facing
+    )
     kept, plain = (model.icp(scan, guess, replace(rule, keep=keep)) for keep in (True, False))
     assert kept.T_ca.tobytes() == plain.T_ca.tobytes()
     assert kept.rms_m == plain.rms_m < 0.02
     assert kept.searched < 0.4 * plain.searched
-    found = [model.evidence(scan, kept.T_ca, 0.1, 0.2, 24, facing=facing, matches=m) for m in (None, kept.matches)]
+    found = [
+        model.evidence(scan, kept.T_ca, 0.1, 0.2, 24, facing=facing, matches=m)
+        for m in (None, kept.matches)
+    ]
     assert found[0].gradients.tobytes() == found[1].gradients.tobytes()
 
 
 @pytest.mark.parametrize("eye", [None, (0.3, -0.2, 4.0)], ids=["both sides", "facing"])
 @pytest.mark.parametrize("shape", ["sheet", "soup", "cloud"])
-def test_each_point_is_found_as_if_it_were_alone(shape: str, eye: tuple[float, float, float] | None) -> None:
-    """The points of a strip are searched together: no point may have the blocks or the distances of another one."""
-    shapes = {"sheet": sheet(40), "soup": soup(800, seed=41), "cloud": surface(rng(42).standard_normal((3000, 3)))}
+def test_each_point_is_found_as_if_it_were_alone(
+    shape: str, eye: tuple[float, float, float] | None
+) -> None:
+    """The points of a strip are searched together.
+
+    No point may have the blocks or the distances of another one.
+    """
+    shapes = {
+        "sheet": sheet(40),
+        "soup": soup(800, seed=41),
+        "cloud": surface(rng(42).standard_normal((3000, 3))),
+    }
     mesh, r = shapes[shape], rng(43)
     model = SurfaceIndex.build(mesh, 0.4)
     at = adversarial(mesh.vertices, 44, 60)
@@ -474,9 +574,15 @@ def test_closest_points_beyond_the_largest_distance_are_none(target: Surface) ->
     np.testing.assert_array_equal(near.foot[inside], all_of_them.foot[inside])
 
 
-@pytest.mark.parametrize("rule", [IcpParams(few=200), IcpParams(few=200, facing=True)], ids=["both sides", "facing"])
-def test_a_part_of_the_scan_leads_to_the_fixed_point_of_the_whole(target: Surface, rule: IcpParams) -> None:
-    """One more pass of Horn's over all points stays, for any number of threads, with and without kept neighbours."""
+@pytest.mark.parametrize(
+    "rule", [IcpParams(few=200), IcpParams(few=200, facing=True)], ids=["both sides", "facing"]
+)
+def test_a_part_of_the_scan_leads_to_the_fixed_point_of_the_whole(
+    target: Surface, rule: IcpParams
+) -> None:
+    """One more pass of Horn's over all points stays, for any number of threads, with and without
+    kept neighbours.
+    """
     scan = scan_of(soup(600, seed=14), 5003, 20)
     model = SurfaceIndex.build(target, 0.4)
     found = model.icp(scan, GUESS, rule)
@@ -503,17 +609,35 @@ def test_a_part_of_the_scan_without_overlap_is_not_used() -> None:
 
 @pytest.mark.parametrize("facing", [False, True])
 @pytest.mark.parametrize("gate", [0.05, 0.2, 0.39])
-def test_matches_of_the_alignment_do_not_change_the_evidence(target: Surface, facing: bool, gate: float) -> None:
-    """Also far from the pose of the alignment, with a wider gate, and for another scan of the same length."""
+def test_matches_of_the_alignment_do_not_change_the_evidence(
+    target: Surface, facing: bool, gate: float
+) -> None:
+    """Also far from the pose of the alignment, with a wider gate, and for another scan of the same
+    length.
+    """
     model = SurfaceIndex.build(target, 0.4)
     scan, other = scan_of(soup(600, seed=14), 3000, 23), scan_of(soup(600, seed=14), 3000, 24)
     found = model.icp(scan, GUESS, IcpParams(facing=facing, gate_m=0.2))
     near, far = Pose.from_matrix(found.T_ca), Pose(exp([0.0, 0.05, 0.0]), [0.1, 0.0, 0.0])
     for points, T in ((scan, near), (scan, far @ near), (other, near)):
         plain = model.evidence(points, T, gate, 0.3, 24, facing=facing)
-        begun = model.evidence(points, T, gate, 0.3, 24, facing=facing, matches=found.matches, threads=2)
-        for name in ("points", "inliers", "sum_d2", "median_m", "centre", "counts", "normals", "gradients"):
-            assert np.asarray(getattr(plain, name)).tobytes() == np.asarray(getattr(begun, name)).tobytes(), name
+        begun = model.evidence(
+            points, T, gate, 0.3, 24, facing=facing, matches=found.matches, threads=2
+        )
+        for name in (
+            "points",
+            "inliers",
+            "sum_d2",
+            "median_m",
+            "centre",
+            "counts",
+            "normals",
+            "gradients",
+        ):
+            assert (
+                np.asarray(getattr(plain, name)).tobytes()
+                == np.asarray(getattr(begun, name)).tobytes()
+            ), name
 
 
 @pytest.mark.parametrize("beyond", [-0.4, -0.01, 0.01, 0.4])
@@ -531,8 +655,13 @@ def test_the_share_of_points_on_faces_towards_the_camera_is_compared_with_the_le
 
 @pytest.mark.parametrize("count", [150, 1000, 1700])
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 4.0), (0.0, 0.0, -4.0)])
-def test_distances_are_those_of_the_closest_points(count: int, eye: tuple[float, float, float]) -> None:
-    """A plate whose upper side alone is there: from below no face faces the camera, and both sides count."""
+def test_distances_are_those_of_the_closest_points(
+    count: int, eye: tuple[float, float, float]
+) -> None:
+    """A plate whose upper side alone is there.
+
+    From below no face faces the camera, and both sides count.
+    """
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
     plate = SurfaceIndex.build(surface(corners, [[0, 1, 2], [0, 2, 3]]), 0.5)
     points = rng(count).uniform(-1, 1, (count, 3)) * [1.2, 1.2, 0.7]
@@ -564,7 +693,8 @@ def test_voxels_are_numbered_by_their_first_points() -> None:
 
 def test_of_equal_poses_the_first_is_different() -> None:
     poses = [
-        Pose(exp(np.radians([0.0, 0.0, d])), np.array([x, 0.0, 0.0])) for d, x in ((0, 0), (4, 0), (30, 0), (0, 1))
+        Pose(exp(np.radians([0.0, 0.0, d])), np.array([x, 0.0, 0.0]))
+        for d, x in ((0, 0), (4, 0), (30, 0), (0, 1))
     ]
     T = np.stack([pose.matrix for pose in poses])
     trace = 1.0 + 2.0 * np.cos(np.radians(10.0))
@@ -590,7 +720,9 @@ def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surf
     scan = scan_of(soup(600, seed=14), 3000, 20).astype(np.float32)
     model = SurfaceIndex.build(target, 0.4)
     want = everything(model, scan)
-    record = np.zeros(3000, dtype=[("pad", "u1", 3), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("i", "u2")])
+    record = np.zeros(
+        3000, dtype=[("pad", "u1", 3), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("i", "u2")]
+    )
     for k, name in enumerate("xyz"):
         record[name] = scan[:, k]
     offsets = [record.dtype.fields[n][1] for n in "xyz"]
@@ -598,7 +730,13 @@ def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surf
     wide = np.zeros((6000, 5), dtype=np.float64)
     wide[::2, 4::-2] = scan
     backwards = np.ascontiguousarray(scan[::-1])[::-1]
-    for view in (odd, wide[::2, 4::-2], np.asfortranarray(scan), backwards, scan.astype(np.float64)):
+    for view in (
+        odd,
+        wide[::2, 4::-2],
+        np.asfortranarray(scan),
+        backwards,
+        scan.astype(np.float64),
+    ):
         assert everything(model, view) == want
 
 
@@ -638,7 +776,9 @@ def test_many_threads_may_share_a_model(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 2000, 23)
     model = SurfaceIndex.build(target, 0.4)
     want, got = everything(model, scan), []
-    workers = [threading.Thread(target=lambda: got.append(everything(model, scan))) for _ in range(4)]
+    workers = [
+        threading.Thread(target=lambda: got.append(everything(model, scan))) for _ in range(4)
+    ]
     for w in workers:
         w.start()
     for w in workers:
@@ -667,7 +807,10 @@ def stub_arguments(function: ast.FunctionDef) -> list[tuple[str, bool]]:
 
 
 def bound_arguments(text: str) -> list[tuple[str, bool]]:
-    """The same from the signature that nanobind writes; a default is ``\\0``, ``\\1``, and types are not in Python."""
+    """The same from the signature that nanobind writes.
+
+    A default is ``\\0``, ``\\1``, and types are not in Python.
+    """
     while "[" in text:
         text = re.sub(r"\[[^\[\]]*\]", "", text)
     return stub_arguments(ast.parse(text.replace("= \\", "= ") + ": ...").body[0])
@@ -677,14 +820,22 @@ def signatures(space: object) -> dict[str, list[list[tuple[str, bool]]]]:
     """The arguments of every bound function of a module or class, of each overload."""
     own = {name: value for name, value in vars(space).items() if hasattr(value, "__nb_signature__")}
     functions = {name: value for name, value in own.items() if not isinstance(value, type)}
-    return {name: [bound_arguments(each[0]) for each in f.__nb_signature__] for name, f in functions.items()}
+    return {
+        name: [bound_arguments(each[0]) for each in f.__nb_signature__]
+        for name, f in functions.items()
+    }
 
 
 def test_the_stub_states_the_functions_and_arguments_of_the_extension() -> None:
     stub = ast.parse(Path(kernel.__file__).with_name("_kernel.pyi").read_text())
     spaces = {"": (stub.body, kernel)}
-    spaces |= {c.name: (c.body, getattr(kernel, c.name)) for c in stub.body if isinstance(c, ast.ClassDef)}
-    assert set(spaces) == {"", *(name for name, value in vars(kernel).items() if isinstance(value, type))}
+    spaces |= {
+        c.name: (c.body, getattr(kernel, c.name)) for c in stub.body if isinstance(c, ast.ClassDef)
+    }
+    assert set(spaces) == {
+        "",
+        *(name for name, value in vars(kernel).items() if isinstance(value, type)),
+    }
     for name, (body, space) in spaces.items():
         stated: dict[str, list[list[tuple[str, bool]]]] = {}
         properties = set()
@@ -694,4 +845,6 @@ def test_the_stub_states_the_functions_and_arguments_of_the_extension() -> None:
             else:
                 stated.setdefault(each.name, []).append(stub_arguments(each))
         assert stated == signatures(space), name
-        assert properties == {key for key, value in vars(space).items() if isinstance(value, property)}, name
+        assert properties == {
+            key for key, value in vars(space).items() if isinstance(value, property)
+        }, name

@@ -8,16 +8,19 @@ import trimesh
 
 from avsreplay.geometry import Pose
 from avsreplay.records import AlignStatus, Scan, Surface
-from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import view
 from avsreplay.register.mirror import MOST_SCANS, from_another_side, reflections
+from avsreplay.register.model_check import ModelCheck
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 
 NOISE = 0.002  # of the extent
 
 
 def body(*marks: tuple[float, float, float]) -> Surface:
-    """A bus with two panels and a dish, symmetric in the plane x = 0, and boxes on its upper side at ``marks``."""
+    """A bus with two panels and a dish, symmetric in the plane x = 0, and boxes on its upper side
+    at ``marks``.
+    """
     parts = [trimesh.creation.box((1.2, 1.0, 1.6))]
     for x in (-1.5, 1.5):
         parts.append(trimesh.creation.box((1.4, 0.05, 0.7)).apply_translation((x, 0.1, 0.2)))
@@ -31,8 +34,12 @@ MARKS = (0.35, 0.6, -0.4), (-0.45, -0.2, 0.95)
 DIFFERENT, SYMMETRIC = body(*MARKS), body((0.0, 0.6, -0.4))
 
 
-def checked(model: Surface, target: Surface, mirrored: bool, count: int = 8, seed: int = 5) -> tuple[ModelCheck, int]:
-    """The check of a run, and the number of its accepted scans, which are searched without a guess."""
+def checked(
+    model: Surface, target: Surface, mirrored: bool, count: int = 8, seed: int = 5
+) -> tuple[ModelCheck, int]:
+    """The check of a run, and the number of its accepted scans, which are searched without a
+    guess.
+    """
     registrar, rng = Registrar(model), np.random.default_rng(seed)
     check, accepted = ModelCheck(registrar, model), 0
     for k in range(count):
@@ -48,7 +55,9 @@ def checked(model: Surface, target: Surface, mirrored: bool, count: int = 8, see
 
 
 @pytest.mark.slow
-def test_a_mirrored_model_of_a_nearly_symmetric_object_is_noticed_although_scans_are_accepted() -> None:
+def test_a_mirrored_model_of_a_nearly_symmetric_object_is_noticed_although_scans_are_accepted() -> (
+    None
+):
     check, accepted = checked(DIFFERENT, DIFFERENT, mirrored=True)
     assert accepted >= 4
     (note,) = check.notes()
@@ -63,8 +72,16 @@ def test_a_mirrored_model_of_a_nearly_symmetric_object_is_noticed_although_scans
         (DIFFERENT, DIFFERENT, False),
         (SYMMETRIC, SYMMETRIC, False),
         (SYMMETRIC, SYMMETRIC, True),
-        (SYMMETRIC, DIFFERENT, False),  # parts that the model lacks, where it and its image are equally wrong
-        (DIFFERENT, body(MARKS[0], (0.2, -0.3, 0.95)), False),  # one of two parts is at another place
+        (
+            SYMMETRIC,
+            DIFFERENT,
+            False,
+        ),  # parts that the model lacks, where it and its image are equally wrong
+        (
+            DIFFERENT,
+            body(MARKS[0], (0.2, -0.3, 0.95)),
+            False,
+        ),  # one of two parts is at another place
     ],
 )
 def test_the_right_model_and_a_symmetric_one_are_not_called_mirrored(
@@ -91,7 +108,10 @@ def test_the_plane_of_a_symmetric_body_is_found(turned: float) -> None:
 def test_a_body_without_a_plane_of_symmetry_has_no_reflection() -> None:
     sizes = (2.0, 0.2, 0.2), (0.2, 1.7, 0.2), (0.2, 0.2, 1.5), (0.2, 1.2, 0.2)
     middles = (0.0, 0.0, 0.0), (0.9, 0.8, 0.0), (-0.9, 0.0, 0.7), (-0.9, -0.5, 1.4)
-    parts = [trimesh.creation.box(size).apply_translation(at) for size, at in zip(sizes, middles, strict=True)]
+    parts = [
+        trimesh.creation.box(size).apply_translation(at)
+        for size, at in zip(sizes, middles, strict=True)
+    ]
     shape = trimesh.util.concatenate(parts)
     surface = Surface(np.array(shape.vertices), np.array(shape.faces, dtype=np.int32), "body", "")
     assert len(reflections(surface, SurfaceIndex.build(surface, 0.15 * surface.extent))) == 0
@@ -102,7 +122,9 @@ def test_scans_of_different_sides_are_kept() -> None:
     seen = check._seen
     assert len(seen) == MOST_SCANS
     middle = 0.5 * (SYMMETRIC.vertices.min(axis=0) + SYMMETRIC.vertices.max(axis=0))
-    sights = np.array([(middle - scan.T_cs.t) / np.linalg.norm(middle - scan.T_cs.t) for scan in seen])
+    sights = np.array(
+        [(middle - scan.T_cs.t) / np.linalg.norm(middle - scan.T_cs.t) for scan in seen]
+    )
     cosines = (sights @ sights.T)[np.triu_indices(len(seen), 1)]
     assert cosines.max() < np.cos(np.radians(30.0))
     assert not from_another_side(seen[0].T_cs, seen, middle)

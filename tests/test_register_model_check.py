@@ -11,9 +11,10 @@ import trimesh
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Scan, Surface
-from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, view
+from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams
+from avsreplay.register.registrar import Registrar
 
 SEED = 3
 
@@ -25,7 +26,13 @@ def scans(surface: Surface, count: int, sigma: float = 0.01) -> list[tuple[Array
         q = rng.standard_normal(4)
         T_ac = Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * surface.extent]))
         points = T_ac.apply(view(surface, 3000, T_ac.inverse().t))
-        found.append((points * (1.0 + sigma * rng.standard_normal((len(points), 1)) / (3.0 * surface.extent)), T_ac))
+        found.append(
+            (
+                points
+                * (1.0 + sigma * rng.standard_normal((len(points), 1)) / (3.0 * surface.extent)),
+                T_ac,
+            )
+        )
     return found
 
 
@@ -38,7 +45,8 @@ def checked(model: Surface, measured: Surface, count: int = 30) -> ModelCheck:
 
 
 @pytest.mark.parametrize(
-    "factor", [pytest.param(0.98, marks=pytest.mark.slow), 1.01, pytest.param(1.03, marks=pytest.mark.slow)]
+    "factor",
+    [pytest.param(0.98, marks=pytest.mark.slow), 1.01, pytest.param(1.03, marks=pytest.mark.slow)],
 )
 def test_an_error_of_size_is_measured(factor: float) -> None:
     model = boxes()
@@ -106,18 +114,29 @@ def test_the_motion_of_a_box_of_the_right_size_says_nothing_of_it(acceleration: 
     assert tumbling_box(1.0, acceleration).notes() == ()
 
 
-def moving_scans(surface: Surface, duration_s: float, count: int, sigma: float = 0.001) -> list[tuple[Scan, Pose]]:
-    """Scans of a moving target every 0.5 s, point after point from left to right; the poses are those in the middle."""
+def moving_scans(
+    surface: Surface, duration_s: float, count: int, sigma: float = 0.001
+) -> list[tuple[Scan, Pose]]:
+    """Scans of a moving target every 0.5 s, point after point from left to right.
+
+    The poses are those in the middle.
+    """
     rng, found = np.random.default_rng(SEED), []
     rate, velocity = np.array([0.05, 0.08, -0.04]), np.array([0.004, -0.003, 0.002])
     for k in range(count):
         t = 0.5 * k
-        T_ac = Pose(geometry.exp(rate * t), np.array([0.0, 0.0, 3.0 * surface.extent]) + velocity * t)
+        T_ac = Pose(
+            geometry.exp(rate * t), np.array([0.0, 0.0, 3.0 * surface.extent]) + velocity * t
+        )
         points = T_ac.apply(view(surface, 2000, T_ac.inverse().t))
         points = points[np.argsort(points[:, 0])]
         places = np.arange(len(points)) / len(points)
         moved = np.cross(rate, points - T_ac.t) + velocity
-        points = points + duration_s * (places - 0.5)[:, None] * moved + sigma * rng.standard_normal(points.shape)
+        points = (
+            points
+            + duration_s * (places - 0.5)[:, None] * moved
+            + sigma * rng.standard_normal(points.shape)
+        )
         found.append((Scan(k, round(t * 1e9), points, places=places.astype(np.float32)), T_ac))
     return found
 
@@ -143,7 +162,9 @@ def test_points_with_times_give_the_size_at_the_instant_of_their_scan() -> None:
     model, duration_s = boxes(), 0.4
     registrar = Registrar(model)
     timed, skewed = ModelCheck(registrar, model), ModelCheck(registrar, model)
-    for (scan, T_ac), (apart, _) in zip(moving_scans(model, 0.0, 30), moving_scans(model, duration_s, 30), strict=True):
+    for (scan, T_ac), (apart, _) in zip(
+        moving_scans(model, 0.0, 30), moving_scans(model, duration_s, 30), strict=True
+    ):
         found = registrar.register(scan.points, T_ac)
         times = (duration_s * (apart.places - 0.5)).astype(np.float32)
         timed.add(replace(apart, places=None, times_s=times), found)
@@ -156,7 +177,13 @@ def test_points_with_times_give_the_size_at_the_instant_of_their_scan() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("factor", "duration_s", "sigma"),
-    [(1.02, 0.0, 0.001), (0.98, 0.0, 0.001), (1.0, 0.0, 0.02), (1.02, 0.3, 0.001), (0.98, -0.3, 0.001)],
+    [
+        (1.02, 0.0, 0.001),
+        (0.98, 0.0, 0.001),
+        (1.0, 0.0, 0.02),
+        (1.02, 0.3, 0.001),
+        (0.98, -0.3, 0.001),
+    ],
 )
 def test_an_error_of_size_and_noise_are_not_taken_for_a_duration(
     factor: float, duration_s: float, sigma: float
@@ -208,7 +235,9 @@ def test_poses_that_did_not_converge_on_the_model_say_nothing_of_its_shape() -> 
 @pytest.mark.slow
 def test_a_mirrored_model_and_another_object_are_told_apart() -> None:
     model = boxes()
-    mirrored = replace(model, vertices=model.vertices * [-1.0, 1.0, 1.0], faces=model.faces[:, ::-1])
+    mirrored = replace(
+        model, vertices=model.vertices * [-1.0, 1.0, 1.0], faces=model.faces[:, ::-1]
+    )
     sphere = np.random.default_rng(SEED).standard_normal((3000, 3)) + np.array([0.0, 0.0, 20.0])
     for points, word in ((scans(mirrored, 1)[0][0], "mirror image"), (sphere, "right model")):
         registrar = Registrar(model)

@@ -10,9 +10,10 @@ pytest.importorskip("kiss_icp")
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.params import RegisterParams
 from avsreplay.register.peers import KissBackend, KissOdometry, thinned
+from avsreplay.register.registrar import Registrar
 
 TURN = np.array([0.008, 0.02, -0.012])  # rad a scan
 
@@ -21,7 +22,9 @@ def tumble(scale: float, scans: int = 15) -> list[tuple[Array, Pose]]:
     """Views of a turning target that drifts by two extents, with the true T_ac."""
     surface, found = boxes(scale), []
     for k in range(scans):
-        T_ac = Pose(np.array([0.0, 0.0, 0.0, 1.0]), scale * np.array([0.5 * k, 0.0, 0.0])) @ example_pose(scale)
+        T_ac = Pose(
+            np.array([0.0, 0.0, 0.0, 1.0]), scale * np.array([0.5 * k, 0.0, 0.0])
+        ) @ example_pose(scale)
         T_ac = T_ac @ Pose(exp(k * TURN), np.zeros(3))
         found.append((T_ac.apply(view(surface, 12_000, T_ac.inverse().t)), T_ac))
     return found
@@ -58,7 +61,8 @@ def test_the_threshold_follows_the_error_of_the_guess() -> None:
     registrar = Registrar(surface, RegisterParams(backend="kiss"))
     backend = KissBackend(registrar._target)
     errors = [
-        Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([k * registrar.limits.gate_m, 0.0, 0.0])) for k in (0, 3, 9)
+        Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([k * registrar.limits.gate_m, 0.0, 0.0]))
+        for k in (0, 3, 9)
     ]
     sigma = [backend.threshold(T_ca, error @ T_ca) / registrar.limits.gate_m for error in errors]
     assert sigma[0] == pytest.approx(2.0)

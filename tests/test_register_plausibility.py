@@ -1,4 +1,7 @@
-"""Wrong poses are rejected, correct ones are not: noise, contradictions, and the work that a scan may cost."""
+"""Wrong poses are rejected, correct ones are not.
+
+Noise, contradictions, and the work that a scan may cost.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,10 @@ import trimesh
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Effort, Registrar, effort_after
-from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
+from avsreplay.register.budget import HEALTHY_SCANS, Budget, Effort, effort_after, healthy_work
 from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 from avsreplay.register.visibility import Visibility
@@ -27,14 +30,19 @@ def registrar(surface: Surface) -> Registrar:
     return Registrar(surface)
 
 
-def hidden_view(surface: Surface, T_ac: Pose, count: int, rng: np.random.Generator, sigma: float = 0.01) -> Array:
+def hidden_view(
+    surface: Surface, T_ac: Pose, count: int, rng: np.random.Generator, sigma: float = 0.01
+) -> Array:
     """Points of the visible surface only: of all facing points in a direction, the nearest."""
     points = T_ac.apply(view(surface, 12 * count, T_ac.inverse().t))
     cell = np.floor(points[:, :2] / points[:, 2:] / 0.012).astype(int)
     order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
     _, first = np.unique(cell[order], axis=0, return_index=True)
     seen = points[order[first]]
-    return seen * (1.0 + sigma * rng.standard_normal((len(seen), 1)) / np.linalg.norm(seen, axis=1, keepdims=True))
+    return seen * (
+        1.0
+        + sigma * rng.standard_normal((len(seen), 1)) / np.linalg.norm(seen, axis=1, keepdims=True)
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
@@ -48,7 +56,11 @@ def test_the_noise_is_found_among_outliers(share: float) -> None:
 
 def test_the_true_pose_is_plausible_and_others_are_not(surface: Surface) -> None:
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    test, T_ac, rng = (
+        PlausibilityTest(surface, index, visibility, 0.065),
+        example_pose(),
+        np.random.default_rng(SEED),
+    )
     scan = hidden_view(surface, T_ac, 3000, rng)
     assert test.check(scan, T_ac.inverse()).reason == ""
     for _ in range(10):
@@ -58,10 +70,14 @@ def test_the_true_pose_is_plausible_and_others_are_not(surface: Surface) -> None
 
 
 def test_the_surface_that_the_camera_sees_is_not_hidden(surface: Surface) -> None:
-    """Of the sampled points those whose line of sight no triangle crosses, but for points near an outline."""
+    """Of the sampled points those whose line of sight no triangle crosses, but for points near an
+    outline.
+    """
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
     test, T_ac = PlausibilityTest(surface, index, visibility, 0.065), example_pose()
-    found = test._expected(hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED)), T_ac.inverse())
+    found = test._expected(
+        hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED)), T_ac.inverse()
+    )
     eye = T_ac.inverse().t
     towards = test._points - eye
     far = np.linalg.norm(towards, axis=1)
@@ -70,13 +86,22 @@ def test_the_surface_that_the_camera_sees_is_not_hidden(surface: Surface) -> Non
     free = (first > far - 0.05 * surface.extent) & (cosine > 0.25)
     assert np.all(cosine[found] > 0.25)
     assert np.mean(free[found]) > 0.97
-    assert np.mean(np.isin(np.flatnonzero(free), found)) > 0.6  # points near an outline share a cell with nearer ones
+    assert (
+        np.mean(np.isin(np.flatnonzero(free), found)) > 0.6
+    )  # points near an outline share a cell with nearer ones
 
 
 def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surface) -> None:
-    """The camera looks through the model at a wall: the distances of the part on the model alone do not show it."""
+    """The camera looks through the model at a wall.
+
+    The distances of the part on the model alone do not show it.
+    """
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    test, T_ac, rng = (
+        PlausibilityTest(surface, index, visibility, 0.065),
+        example_pose(),
+        np.random.default_rng(SEED),
+    )
     scan = hidden_view(surface, T_ac, 3000, rng)
     part = scan[scan[:, 0] < np.quantile(scan[:, 0], 0.4)]
     others = scan[scan[:, 0] >= np.quantile(scan[:, 0], 0.4)]
@@ -86,8 +111,13 @@ def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surf
     assert "pass through it" in test.check(part, T_ac.inverse(), behind).reason
 
 
-def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(surface: Surface) -> None:
-    """Nearly all points stay on a long box that is shifted along its axis: its small end alone shows the shift."""
+def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(
+    surface: Surface,
+) -> None:
+    """Nearly all points stay on a long box that is shifted along its axis.
+
+    Its small end alone shows the shift.
+    """
     made = trimesh.creation.box((4.0, 1.0, 0.3))
     box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "box", "")
     index, visibility = SurfaceIndex.build(box, 0.6), Visibility(box)
@@ -107,13 +137,24 @@ def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(sur
 
 
 def test_a_surface_that_continues_beyond_an_edge_is_another_object() -> None:
-    """A longer box fits three faces of the model, a box behind an edge of the model does not continue them."""
-    made = [trimesh.creation.box(size) for size in ((2.0, 1.2, 0.8), (2.5, 1.2, 0.8), (0.8, 0.6, 0.7))]
+    """A longer box fits three faces of the model, a box behind an edge of the model does not
+    continue them.
+    """
+    made = [
+        trimesh.creation.box(size) for size in ((2.0, 1.2, 0.8), (2.5, 1.2, 0.8), (0.8, 0.6, 0.7))
+    ]
     made[1].apply_translation((0.25, 0.0, 0.0))
-    made[2].apply_transform(trimesh.transformations.euler_matrix(0.5, 0.4, 0.6)).apply_translation((1.3, 0.1, -0.2))
-    box, longer, other = (Surface(np.array(m.vertices), np.array(m.faces, dtype=np.int32), "", "") for m in made)
+    made[2].apply_transform(trimesh.transformations.euler_matrix(0.5, 0.4, 0.6)).apply_translation(
+        (1.3, 0.1, -0.2)
+    )
+    box, longer, other = (
+        Surface(np.array(m.vertices), np.array(m.faces, dtype=np.int32), "", "") for m in made
+    )
     test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
-    T_ac, rng = Pose(exp(np.array([0.6, 0.5, 0.1])), np.array([0.0, 0.0, 8.0])), np.random.default_rng(SEED)
+    T_ac, rng = (
+        Pose(exp(np.array([0.6, 0.5, 0.1])), np.array([0.0, 0.0, 8.0])),
+        np.random.default_rng(SEED),
+    )
     for measured, continued in (([box], False), ([longer], True), ([box, other], False)):
         points = np.vstack([T_ac.apply(view(each, 1000, T_ac.inverse().t)) for each in measured])
         scan = points + rng.normal(0.0, 0.003, points.shape)
@@ -122,7 +163,9 @@ def test_a_surface_that_continues_beyond_an_edge_is_another_object() -> None:
 
 
 @pytest.mark.parametrize("count", [700, 5000])
-def test_points_well_off_the_model_are_counted_as_their_distances_say(registrar: Registrar, count: int) -> None:
+def test_points_well_off_the_model_are_counted_as_their_distances_say(
+    registrar: Registrar, count: int
+) -> None:
     """Among 1,000 points of the scan: two gates off or more, but within the reach of the index."""
     T_ac, rng = example_pose(), np.random.default_rng(SEED)
     scan = hidden_view(registrar._target.surface, T_ac, count, rng)
@@ -137,7 +180,9 @@ def test_points_well_off_the_model_are_counted_as_their_distances_say(registrar:
 
 
 def test_points_on_faces_that_face_away_from_the_camera_are_not_of_this_model() -> None:
-    """The near side of a plate is matched to the far side of a box, and its surroundings to nothing."""
+    """The near side of a plate is matched to the far side of a box, and its surroundings to
+    nothing.
+    """
     made = trimesh.creation.box((2.0, 1.2, 0.8))
     box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "", "")
     test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
@@ -146,7 +191,9 @@ def test_points_on_faces_that_face_away_from_the_camera_are_not_of_this_model() 
     far = np.insert(rng.uniform([-0.9, -0.5], [0.9, 0.5], (800, 2)), 2, 0.4, axis=1)
     beside = np.insert(rng.uniform([1.5, -0.5], [1.8, 0.5], (200, 2)), 2, 0.0, axis=1)
     assert "face away" in test.check(T_ac.apply(np.vstack([far, beside])), T_ac.inverse()).reason
-    assert test.check(T_ac.apply(far), T_ac.inverse()).reason == ""  # perhaps the camera is not at the origin
+    assert (
+        test.check(T_ac.apply(far), T_ac.inverse()).reason == ""
+    )  # perhaps the camera is not at the origin
 
 
 @pytest.mark.parametrize("guess_deg", [0.1, 3.0])
@@ -155,14 +202,18 @@ def test_most_points_outliers(registrar: Registrar, surface: Surface, guess_deg:
     scan = hidden_view(surface, T_ac, 3000, rng)
     wrong = rng.random(len(scan)) < 0.6
     scan[wrong] = rng.uniform(scan.min(0) - 0.5, scan.max(0) + 0.5, (wrong.sum(), 3))
-    found = registrar.register(scan, T_ac @ Pose(exp(np.radians(guess_deg) * np.array([0.6, 0.0, 0.8])), np.zeros(3)))
+    found = registrar.register(
+        scan, T_ac @ Pose(exp(np.radians(guess_deg) * np.array([0.6, 0.0, 0.8])), np.zeros(3))
+    )
     step = T_ac.inverse() @ found.T_ac
     assert found.status is AlignStatus.ALIGNED
     assert np.degrees(geometry.angle(step.q)) < 0.5
 
 
 @pytest.mark.parametrize("guess_deg", [20.0, 60.0, 120.0, 180.0])
-def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface, guess_deg: float) -> None:
+def test_what_is_called_aligned_is_right(
+    registrar: Registrar, surface: Surface, guess_deg: float
+) -> None:
     rng, T_ac = np.random.default_rng(SEED), example_pose()
     scan = hidden_view(surface, T_ac, 3000, rng)
     for axis in np.vstack([np.eye(3), rng.standard_normal((3, 3))]):
@@ -185,9 +236,16 @@ def test_the_budget_counts_work() -> None:
 @pytest.mark.parametrize("guessed", [True, False])
 @pytest.mark.parametrize("scene", ["clutter", "outliers", "another body", "plane"])
 def test_no_scan_costs_more_than_twenty_ordinary_registrations(
-    registrar: Registrar, surface: Surface, monkeypatch: pytest.MonkeyPatch, scene: str, guessed: bool
+    registrar: Registrar,
+    surface: Surface,
+    monkeypatch: pytest.MonkeyPatch,
+    scene: str,
+    guessed: bool,
 ) -> None:
-    """Of the last step, too: it is counted how much each scan takes in all, whatever its result is."""
+    """Of the last step, too.
+
+    It is counted how much each scan takes in all, whatever its result is.
+    """
     spent, spend, rng, T_ac = [0], Budget.spend, np.random.default_rng(SEED), example_pose()
 
     def counted(self: Budget, searches: int) -> None:
@@ -219,7 +277,9 @@ def test_an_ordinary_registration_costs_about_what_is_assumed(
 
     monkeypatch.setattr(Budget, "spend", counted)
     scan = hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED))
-    found = registrar.register(scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0])))
+    found = registrar.register(
+        scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0]))
+    )
     assert found.status is AlignStatus.ALIGNED
     assert 0.8 < spent[0] / healthy_work(len(scan), registrar._target.near_work) < 2.0
 
@@ -231,7 +291,10 @@ def test_searches_become_rare_where_none_finds_a_pose() -> None:
 
 
 def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
-    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most; on few of 2000."""
+    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most.
+
+    On few of 2000.
+    """
     tried = [failed for failed in range(2000) if effort_after(failed) is not Effort.NONE]
     assert tried[:50] == list(range(50))
     assert all(after - before <= 2 + before / 25 for before, after in itertools.pairwise(tried))
@@ -242,7 +305,10 @@ def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
 def test_a_guess_that_few_points_confirm_gets_the_full_effort(
     registrar: Registrar, surface: Surface, noise: float
 ) -> None:
-    """As at the end of an occlusion at the start of a run; another body costs no registration of the whole scan."""
+    """As at the end of an occlusion at the start of a run.
+
+    Another body costs no registration of the whole scan.
+    """
     rng, T_ac = np.random.default_rng(SEED), example_pose()
     scan = hidden_view(surface, T_ac, 3000, rng, noise * surface.extent)
     guess = T_ac @ Pose(exp([0.04, -0.03, 0.05]), np.array([0.05, 0.05, -0.05]))
@@ -296,11 +362,16 @@ def test_a_body_is_separated_from_the_wall_behind_it(surface: Surface) -> None:
 
 
 def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
-    """Two tetrahedra with a common edge: four faces meet there, and both are closed with outward faces."""
+    """Two tetrahedra with a common edge.
+
+    Four faces meet there, and both are closed with outward faces.
+    """
     apex = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
     opposite = apex * [1.0, -1.0, -1.0]  # a half turn about the common edge
-    both = Surface(np.vstack([apex, opposite]), np.vstack([faces, faces + 4]).astype(np.int32), "two", "")
+    both = Surface(
+        np.vstack([apex, opposite]), np.vstack([faces, faces + 4]).astype(np.int32), "two", ""
+    )
     assert Visibility(both).sided
     assert not Visibility(Surface(apex, faces[:3], "open", "")).sided
     inwards = np.vstack([faces, faces[:, ::-1] + 4]).astype(np.int32)
@@ -311,7 +382,11 @@ def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
 
 def test_a_complete_visible_side_is_told_from_one_with_gaps(surface: Surface) -> None:
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    test, T_ac, rng = (
+        PlausibilityTest(surface, index, visibility, 0.065),
+        example_pose(),
+        np.random.default_rng(SEED),
+    )
     scan = hidden_view(surface, T_ac, 3000, rng)
     assert test.check(scan, T_ac.inverse()).covered
     assert not test.check(scan[scan[:, 0] < np.median(scan[:, 0])], T_ac.inverse()).covered

@@ -1,4 +1,7 @@
-"""Measured poses in place of clouds: every format gives the same run, and wrong input gives one clear line."""
+"""Measured poses in place of clouds.
+
+Every format gives the same run, and wrong input gives one clear line.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,10 @@ def motion() -> tuple[list[int], list[Pose], list[Pose]]:
 
 
 def tum(path: Path, times: list[int], poses: list[Pose]) -> Path:
-    lines = [" ".join(map(repr, [t * 1e-9, *p.t.tolist(), *p.q.tolist()])) for t, p in zip(times, poses, strict=True)]
+    lines = [
+        " ".join(map(repr, [t * 1e-9, *p.t.tolist(), *p.q.tolist()]))
+        for t, p in zip(times, poses, strict=True)
+    ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -51,11 +57,15 @@ def csv(path: Path, times: list[int], poses: list[Pose]) -> Path:
     return path
 
 
-def mcap(path: Path, times: list[int], payloads: list[bytes], kind: str = STAMPED, topic: str = "/pose") -> Path:
+def mcap(
+    path: Path, times: list[int], payloads: list[bytes], kind: str = STAMPED, topic: str = "/pose"
+) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
-        channel = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+        channel = writer.register_channel(
+            topic, "cdr", writer.register_schema(kind, "ros2msg", b"")
+        )
         for t, payload in zip(times, payloads, strict=True):
             writer.add_message(channel, t, payload, t)
         writer.finish()
@@ -68,7 +78,10 @@ def stamped(times: list[int], poses: list[Pose]) -> list[bytes]:
 
 def rows(path: Path, *assignments: str, **options):
     job = Job(
-        source=path, options=SourceOptions(**options), assignments=("register.backend=poses", *assignments), prefetch=0
+        source=path,
+        options=SourceOptions(**options),
+        assignments=("register.backend=poses", *assignments),
+        prefetch=0,
     )
     with Run(job) as run:
         found = list(run.rows())
@@ -86,7 +99,10 @@ def test_a_pose_file_runs_through_the_whole_chain(tmp_path, motion) -> None:
     assert all(getattr(row, name) is None for row in found for name in empty)
     late = found[len(found) // 2 :]
     for estimate, measured in (("pos_err_m", "reg_pos_err_m"), ("rot_err_deg", "reg_rot_err_deg")):
-        mean = [np.mean([getattr(row, name) ** 2 for row in late]) ** 0.5 for name in (estimate, measured)]
+        mean = [
+            np.mean([getattr(row, name) ** 2 for row in late]) ** 0.5
+            for name in (estimate, measured)
+        ]
         assert mean[0] < mean[1]
     assert summary.manoeuvres == 0
     assert summary.violations == 0
@@ -106,13 +122,19 @@ def test_all_formats_give_the_same_rows(tmp_path, motion) -> None:
 @pytest.mark.parametrize("mark", [",", ";", "\t", "; with decimal commas"])
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001)])
 @pytest.mark.parametrize(("time", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)])
-def test_separators_and_units_that_the_heading_names(tmp_path, motion, mark, unit, metres, time, ns) -> None:
+def test_separators_and_units_that_the_heading_names(
+    tmp_path, motion, mark, unit, metres, time, ns
+) -> None:
     times, _, noisy = motion
     names = [f"t_{time}", *(f"{axis} [{unit}]" for axis in "xyz"), "qx", "qy", "qz", "qw"]
     lines = [mark[0].join(names)]
     for t, pose in zip(times[:4], noisy[:4], strict=True):
         text = mark[0].join(
-            [f"{Decimal(t) / ns:f}", *map(repr, (pose.t / metres).tolist()), *map(repr, pose.q.tolist())]
+            [
+                f"{Decimal(t) / ns:f}",
+                *map(repr, (pose.t / metres).tolist()),
+                *map(repr, pose.q.tolist()),
+            ]
         )
         lines.append(text.replace(".", ",") if "decimal" in mark else text)
     path = tmp_path / "a.csv"
@@ -126,7 +148,9 @@ def test_separators_and_units_that_the_heading_names(tmp_path, motion, mark, uni
 
 def checks(path: Path, **options) -> dict[str, tuple[str, str, str]]:
     with open_source(path, SourceOptions(poses=True, **options)) as source:
-        return {a.about: (a.grade, a.text, a.option) for a in preflight(source, source.header.surface)}
+        return {
+            a.about: (a.grade, a.text, a.option) for a in preflight(source, source.header.surface)
+        }
 
 
 def test_poses_in_millimetres_are_found_by_the_step_from_one_to_the_next(tmp_path, motion) -> None:
@@ -142,8 +166,10 @@ def test_stamps_of_a_file_that_step_back_are_no_reason_for_another_clock(tmp_pat
     times, _, noisy = motion
     log = tum(tmp_path / "a.tum", [*times[:9], *times[:9]], [*noisy[:9], *noisy[:9]])
     assert checks(log)["time stamps"] == (
-        "check", "time stamps of scans: 9 back; several recordings in one source must be split", ""
-    )  # fmt: skip
+        "check",
+        "time stamps of scans: 9 back; several recordings in one source must be split",
+        "",
+    )
 
 
 def test_only_complete_options_are_printed_to_be_copied(cli, tmp_path, motion) -> None:
@@ -170,8 +196,12 @@ def test_the_covariance_of_a_message_is_the_noise_of_the_measurement(tmp_path, m
     found, _ = rows(log)
     assert found[0].r_pos_m == pytest.approx(np.sqrt(np.mean(sigma[:3] ** 2)))
     unknown = [data + struct.pack("<36d", *([0.0] * 36)) for data in stamped(times[:5], noisy[:5])]
-    with open_source(mcap(tmp_path / "b.mcap", times[:5], unknown, COVARIANT), SourceOptions(poses=True)) as source:
-        assert all(scan.pose is not None and scan.pose.covariance is None for scan in source.scans())
+    with open_source(
+        mcap(tmp_path / "b.mcap", times[:5], unknown, COVARIANT), SourceOptions(poses=True)
+    ) as source:
+        assert all(
+            scan.pose is not None and scan.pose.covariance is None for scan in source.scans()
+        )
 
 
 def test_pose_sigma_replaces_the_default(tmp_path, motion) -> None:
@@ -181,14 +211,18 @@ def test_pose_sigma_replaces_the_default(tmp_path, motion) -> None:
     assert found[0].r_rot_deg == pytest.approx(0.2)
 
 
-def test_the_grasp_point_is_the_origin_of_the_measured_poses_moved_with_the_body(tmp_path, motion) -> None:
+def test_the_grasp_point_is_the_origin_of_the_measured_poses_moved_with_the_body(
+    tmp_path, motion
+) -> None:
     times, _, noisy = motion
     grasp = (0.3, -0.1, 0.2)
     log = tum(tmp_path / "a.tum", times, noisy)
     with open_source(log, SourceOptions(poses=True, grasp=grasp)) as source:
         for scan, pose in zip(source.scans(), noisy, strict=True):
             assert scan.pose is not None
-            np.testing.assert_allclose(scan.pose.T_ac.t, pose.t + geometry.matrix(pose.q) @ grasp, atol=1e-9)
+            np.testing.assert_allclose(
+                scan.pose.T_ac.t, pose.t + geometry.matrix(pose.q) @ grasp, atol=1e-9
+            )
 
 
 def test_true_poses_are_those_of_the_grasp_point(tmp_path, motion) -> None:
@@ -238,7 +272,9 @@ def test_a_file_that_holds_no_poses_is_refused_with_file_and_line(tmp_path, text
     assert "x.csv" in str(error.value)
 
 
-def test_wrong_topics_are_refused_with_the_topics_that_exist(tmp_path, motion, fixtures_folder) -> None:
+def test_wrong_topics_are_refused_with_the_topics_that_exist(
+    tmp_path, motion, fixtures_folder
+) -> None:
     times, _, noisy = motion
     log = mcap(tmp_path / "a.mcap", times[:3], stamped(times[:3], noisy[:3]))
     with pytest.raises(UsageError, match=r"no pose topic '/other'.*/pose \(geometry_msgs"):
@@ -248,7 +284,9 @@ def test_wrong_topics_are_refused_with_the_topics_that_exist(tmp_path, motion, f
     with pytest.raises(UsageError, match=r"2 pose topics.*--topic"):
         open_source(fixtures_folder / "tumble.mcap", SourceOptions(poses=True))
     with pytest.raises(UsageError, match="a pose file has no topics"):
-        open_source(tum(tmp_path / "a.tum", times[:3], noisy[:3]), SourceOptions(poses=True, topic="/pose"))
+        open_source(
+            tum(tmp_path / "a.tum", times[:3], noisy[:3]), SourceOptions(poses=True, topic="/pose")
+        )
 
 
 def test_a_model_cannot_be_built_from_poses(tmp_path, motion) -> None:
@@ -271,7 +309,9 @@ def test_the_command_names_the_missing_size_and_writes_results(tmp_path, motion,
     reasons = [reason["text"] for reason in json.loads(done.out)["verdict"]["reasons"]]
     assert any("no model" in text and "--extent METRES" in text for text in reasons)
     sized = cli("run", log, "--backend", "poses", "--extent", "2", "--json")
-    assert not any("no model" in reason["text"] for reason in json.loads(sized.out)["verdict"]["reasons"])
+    assert not any(
+        "no model" in reason["text"] for reason in json.loads(sized.out)["verdict"]["reasons"]
+    )
     assert (tmp_path / "out" / "report.html").is_file()
     info = cli("info", log, "--poses")
     assert info.code == 0
@@ -279,7 +319,9 @@ def test_the_command_names_the_missing_size_and_writes_results(tmp_path, motion,
 
 
 @pytest.mark.parametrize("lasts_s", [0.0, 0.8])
-def test_a_push_is_one_manoeuvre_with_its_time_and_size_also_if_it_lasts_for_scans(tmp_path, motion, lasts_s) -> None:
+def test_a_push_is_one_manoeuvre_with_its_time_and_size_also_if_it_lasts_for_scans(
+    tmp_path, motion, lasts_s
+) -> None:
     times, _, noisy = motion
     push, begin = np.array([0.0, 0.06, -0.03]), 12.1
     moved = []

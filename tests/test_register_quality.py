@@ -24,7 +24,10 @@ from avsreplay.register.degenerate import unbounded_directions
 
 @pytest.mark.parametrize("patches", [5, 8, 9, 30, 122])
 def test_the_sandwich_of_any_number_of_patches_is_that_of_their_eigenvalues(patches: int) -> None:
-    """Patches with little and with much leverage in any order: four of them are computed together."""
+    """Patches with little and with much leverage in any order.
+
+    Four of them are computed together.
+    """
     rng = np.random.default_rng(patches)
     for _ in range(20):
         J = rng.normal(size=(patches, 5, 6)) * 10.0 ** rng.uniform(-1.0, 0.5, (patches, 1, 1))
@@ -59,7 +62,10 @@ def _rows(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("count", [600, 30, 12])
 def test_covariance_is_right_in_the_mean_for_independent_noise(count: int) -> None:
-    """Of patches of unequal size, the largest with a third of the points; the delete-one jackknife claims too much."""
+    """Of patches of unequal size, the largest with a third of the points.
+
+    The delete-one jackknife claims too much.
+    """
     rng, total = np.random.default_rng(3), np.zeros((6, 6))
     J = rng.normal(size=(600, 6))
     patch = np.sort(np.minimum(rng.integers(0, int(1.5 * count), 600), count - 1))
@@ -72,26 +78,42 @@ def test_covariance_is_right_in_the_mean_for_independent_noise(count: int) -> No
 
 
 def _normalised_errors(per_patch: float) -> np.ndarray:
-    """Squared errors of 400 fits over their covariance; noise of unit variance, ``per_patch`` of it in common."""
+    """Squared errors of 400 fits over their covariance.
+
+    Noise of unit variance, ``per_patch`` of it in common.
+    """
     rng, values = np.random.default_rng(12), []
     for _ in range(400):
         J = rng.normal(size=(600, 6)) + 0.7 * rng.normal(size=(30, 6))[PATCH]
-        noise = np.sqrt(1.0 - per_patch) * rng.normal(size=600) + np.sqrt(per_patch) * rng.normal(size=30)[PATCH]
+        noise = (
+            np.sqrt(1.0 - per_patch) * rng.normal(size=600)
+            + np.sqrt(per_patch) * rng.normal(size=30)[PATCH]
+        )
         d = np.linalg.lstsq(J, noise, rcond=None)[0]
         values.append(d @ np.linalg.solve(_sandwich(summed(J, noise - J @ d, PATCH)), d))
     return np.array(values)
 
 
 @pytest.mark.parametrize("per_patch", [0.0, 0.3])
-def test_few_patches_do_not_make_the_covariance_too_small_in_some_direction(per_patch: float) -> None:
-    """Thirty patches do not determine 21 variances: without shrinkage the 99 % point is that of Hotelling's T^2, 28."""
+def test_few_patches_do_not_make_the_covariance_too_small_in_some_direction(
+    per_patch: float,
+) -> None:
+    """Thirty patches do not determine 21 variances.
+
+    Without shrinkage the 99 % point is that of Hotelling's T^2, 28.
+    """
     values = _normalised_errors(per_patch)
     assert 0.85 < values.mean() / 6.0 < 1.15
-    assert np.quantile(values, 0.99) < 1.3 * 16.8  # 99 % point of chi-square with 6 degrees of freedom
+    assert (
+        np.quantile(values, 0.99) < 1.3 * 16.8
+    )  # 99 % point of chi-square with 6 degrees of freedom
 
 
 def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:
-    """Nothing but patch 7 sees the last motion: it is left out, and the motion is free; without it nothing is lone."""
+    """Nothing but patch 7 sees the last motion: it is left out, and the motion is free.
+
+    Without it nothing is lone.
+    """
     J, e = _rows(4)
     found = summed(J, e, PATCH)
     assert without_dominant_patches(found) is found
@@ -103,7 +125,10 @@ def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:
 
 
 def test_patches_are_left_out_until_none_determines_a_motion_alone() -> None:
-    """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest: all three go, one after the other."""
+    """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest.
+
+    All three go, one after the other.
+    """
     J, e = _rows(4)
     for patch in range(30):
         J[patch == PATCH, 5] *= {7: 1.0, 8: 1e-2, 9: 1e-4}.get(patch, 0.0)
@@ -145,12 +170,16 @@ def _scan(rng: np.random.Generator, strain: float, noise: float = 0.003) -> Evid
 
 
 def _nis(strain: float) -> tuple[float, float, float]:
-    """Mean over scans of the squared difference of halves over 6, and shares of it with the sandwich alone."""
+    """Mean over scans of the squared difference of halves over 6, and shares of it with the
+    sandwich alone.
+    """
     rng, values, bare, sigma = np.random.default_rng(5), [], [], []
     for _ in range(25):
         found = _scan(rng, strain)
         errors = systematic_errors(found, 2.0, 0.1)
-        none = replace(errors, block_m2=0.0, smooth_m2=np.zeros(7), amplitudes=np.zeros(7), fit=np.zeros(6))
+        none = replace(
+            errors, block_m2=0.0, smooth_m2=np.zeros(7), amplitudes=np.zeros(7), fit=np.zeros(6)
+        )
         values.append(split_nis(found, errors, np.eye(3)[:1]))
         bare.append(split_nis(found, none, np.eye(3)[:1]))
         sandwich, _ = sandwich_covariance(found.normals, found.gradients)
@@ -159,7 +188,9 @@ def _nis(strain: float) -> tuple[float, float, float]:
 
 
 def test_halves_of_a_strained_target_differ_as_the_covariance_says() -> None:
-    """The sandwich over patches takes the strain for independent errors of patches and claims too little."""
+    """The sandwich over patches takes the strain for independent errors of patches and claims too
+    little.
+    """
     nis, bare, sigma = _nis(0.004)
     assert 0.6 < nis < 1.6
     assert bare > 2.5
@@ -174,7 +205,9 @@ def test_white_noise_adds_little_to_the_sandwich() -> None:
 
 
 def test_halves_that_disagree_beyond_all_errors_have_a_large_nis() -> None:
-    """One half of the scan is displaced as a whole, as a body with a joint is, and the covariance does not cover it."""
+    """One half of the scan is displaced as a whole, as a body with a joint is, and the covariance
+    does not cover it.
+    """
     found = _scan(np.random.default_rng(8), 0.0)
     moved = np.where(found.places[:, 0] < 0.0, 0.02, -0.02)
     gradients = found.gradients + moved[:, None] * found.normals[:, :, 5]
@@ -191,14 +224,24 @@ def test_covariance_and_test_of_halves_are_those_of_the_oracle(strain: float, se
     found = _scan(np.random.default_rng(seed), strain)
     if seed == 3:  # a view of a narrow part, where not every amplitude is observable
         found = found.only(found.places[:, 2] > 0.35)
-    errors, oracle = systematic_errors(found, 2.0, 0.1), oracle_of.systematic_errors(found, 2.0, 0.1)
+    errors, oracle = (
+        systematic_errors(found, 2.0, 0.1),
+        oracle_of.systematic_errors(found, 2.0, 0.1),
+    )
     for name in ("block_m2", "smooth_m2", "amplitudes", "fit"):
-        np.testing.assert_allclose(getattr(errors, name), getattr(oracle, name), rtol=1e-7, atol=1e-12)
-    (P, dof), (Q, expected) = registration_covariance(found, errors), oracle_of.registration_covariance(found, oracle)
+        np.testing.assert_allclose(
+            getattr(errors, name), getattr(oracle, name), rtol=1e-7, atol=1e-12
+        )
+    (P, dof), (Q, expected) = (
+        registration_covariance(found, errors),
+        oracle_of.registration_covariance(found, oracle),
+    )
     np.testing.assert_allclose(P, Q, rtol=1e-7, atol=1e-9 * np.abs(Q).max())
     assert dof == pytest.approx(expected, rel=1e-6)
     across = np.eye(3)[:2]
-    np.testing.assert_allclose(split_nis(found, errors, across), oracle_of.split_nis(found, oracle, across), rtol=1e-7)
+    np.testing.assert_allclose(
+        split_nis(found, errors, across), oracle_of.split_nis(found, oracle, across), rtol=1e-7
+    )
 
 
 def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
@@ -214,7 +257,8 @@ def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
         errors = systematic_errors(summed(J, e, patch, p=p), 2.0, 0.1)
         half = rng.random(len(p)) < 0.5
         parts = [
-            summed(J[k], e[k], np.unique(patch[k], return_inverse=True)[1].reshape(-1), p=p[k]) for k in (half, ~half)
+            summed(J[k], e[k], np.unique(patch[k], return_inverse=True)[1].reshape(-1), p=p[k])
+            for k in (half, ~half)
         ]
         d = [np.linalg.lstsq(J[k], e[k], rcond=None)[0] for k in (half, ~half)]
         step = d[1] - d[0]
@@ -223,7 +267,8 @@ def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
 
 
 def test_degrees_of_freedom_give_the_gate_its_false_alarm_rate() -> None:
-    """Hotelling's T^2 of 3,000 fits with errors common to a patch, whose size differs from patch to patch by half.
+    """Hotelling's T^2 of 3,000 fits with errors common to a patch, whose size differs from patch to
+    patch by half.
 
     Taken for chi-square, the squared error exceeds the 95 % and 99 % points too often.
     """
@@ -231,7 +276,9 @@ def test_degrees_of_freedom_give_the_gate_its_false_alarm_rate() -> None:
     for _ in range(3000):
         size = np.exp(0.5 * rng.normal(size=60))[:, None]
         J = rng.normal(size=(60, 6, 6)) + 5.0 * rng.normal(size=(60, 1, 6))
-        e = size * (np.sqrt(0.1) * rng.normal(size=(60, 6)) + np.sqrt(0.9) * rng.normal(size=(60, 1)))
+        e = size * (
+            np.sqrt(0.1) * rng.normal(size=(60, 6)) + np.sqrt(0.9) * rng.normal(size=(60, 1))
+        )
         d = np.linalg.lstsq(J.reshape(-1, 6), e.reshape(-1), rcond=None)[0]
         normals, gradients = np.einsum("pki,pkj->pij", J, J), np.einsum("pk,pki->pi", e - J @ d, J)
         P, dof = sandwich_covariance(normals, gradients)
@@ -240,5 +287,7 @@ def test_degrees_of_freedom_give_the_gate_its_false_alarm_rate() -> None:
     taken = [f.sf(square * (dof - 5.0) / (6.0 * dof), 6, dof - 5.0) for square, dof in values]
     for probability in (0.05, 0.01):
         spread = np.sqrt(probability / 3000)
-        assert np.mean(np.array(taken) < probability) == pytest.approx(probability, abs=3.0 * spread)
+        assert np.mean(np.array(taken) < probability) == pytest.approx(
+            probability, abs=3.0 * spread
+        )
         assert np.mean(np.array(squares) > chi2.isf(probability, 6)) > probability + 3.0 * spread

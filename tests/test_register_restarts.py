@@ -14,13 +14,17 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Effort, RegisterParams, Registrar, neighbourhood, quality
-from avsreplay.register.budget import Budget
+from avsreplay.register import neighbourhood, quality
+from avsreplay.register.budget import Budget, Effort
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.neighbourhood import Neighbourhood
+from avsreplay.register.params import RegisterParams
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import Restarter
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import builtin_surface
 
 SCENARIO = """
 seed = 5
@@ -35,7 +39,9 @@ position_m = [0.1, -0.1, 4.5]
 
 @pytest.fixture(scope="module")
 def scans():
-    simulated = simulate(scenario_of(toml_document.parse(SCENARIO, "second look")), builtin_surface())
+    simulated = simulate(
+        scenario_of(toml_document.parse(SCENARIO, "second look")), builtin_surface()
+    )
     return list(true_scans(simulated))
 
 
@@ -59,14 +65,21 @@ def test_no_far_guess_ends_beside_the_truth(scans):
 def test_a_close_guess_is_registered_once(scans, monkeypatch):
     registrar, calls = Registrar(builtin_surface()), []
     graded = registrar._grader.graded
-    monkeypatch.setattr(registrar._grader, "graded", lambda *args, **named: calls.append(1) or graded(*args, **named))
+    monkeypatch.setattr(
+        registrar._grader,
+        "graded",
+        lambda *args, **named: calls.append(1) or graded(*args, **named),
+    )
     for scan in scans:
         registrar.register(scan.points, scan.truth)
     assert len(calls) == len(scans)
 
 
 def test_a_scan_of_scattered_points_costs_few_restarts():
-    """A few stray returns are worth at most eight restarts: a result equal to the guess is not a second start."""
+    """A few stray returns are worth at most eight restarts.
+
+    A result equal to the guess is not a second start.
+    """
     registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
     restarter = registrar._restarter
     calls, graduated = [], restarter.graduated
@@ -80,39 +93,60 @@ def test_a_scan_of_scattered_points_costs_few_restarts():
 
 
 def seen(surface: Surface, T_ac: Pose, noise: float, rng: np.random.Generator) -> Array:
-    """Points on the sides of the surface that face the camera, with noise along the ray in units of the extent."""
+    """Points on the sides of the surface that face the camera, with noise along the ray in units of
+    the extent.
+    """
     points = T_ac.apply(view(surface, 4000, T_ac.inverse().t))
-    return points * (1.0 + noise * surface.extent * rng.standard_normal((len(points), 1)) / T_ac.t[2])
+    return points * (
+        1.0 + noise * surface.extent * rng.standard_normal((len(points), 1)) / T_ac.t[2]
+    )
 
 
 def near(T_ac: Pose, degrees: float, shift_m: float) -> Pose:
-    return T_ac @ Pose(geometry.exp(np.radians(degrees) * np.array([0.6, 0.0, 0.8])), np.array([0.0, shift_m, 0.0]))
+    return T_ac @ Pose(
+        geometry.exp(np.radians(degrees) * np.array([0.6, 0.0, 0.8])), np.array([0.0, shift_m, 0.0])
+    )
 
 
 @pytest.mark.parametrize("noise", [0.008, 0.015])
 def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
-    """A poor fit whose misfit neighbouring points do not share is registered once more, with a wider rejection."""
+    """A poor fit whose misfit neighbouring points do not share is registered once more, with a
+    wider rejection.
+    """
     surface, T_ac = boxes(), example_pose()
     registrar, calls, restarts = Registrar(surface), [], []
     scan = seen(surface, T_ac, noise, np.random.default_rng(3))
     graded, best = registrar._grader.graded, registrar._restarter.best
-    monkeypatch.setattr(registrar._grader, "graded", lambda *args, **named: calls.append(1) or graded(*args, **named))
-    monkeypatch.setattr(registrar._restarter, "best", lambda *args: restarts.append(1) or best(*args))
+    monkeypatch.setattr(
+        registrar._grader,
+        "graded",
+        lambda *args, **named: calls.append(1) or graded(*args, **named),
+    )
+    monkeypatch.setattr(
+        registrar._restarter, "best", lambda *args: restarts.append(1) or best(*args)
+    )
     found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
     assert found.status is AlignStatus.ALIGNED
     assert found.inlier_ratio > 0.93
     assert (len(calls), len(restarts)) == (2, 0)
 
 
-@pytest.mark.parametrize(("noise", "wrong", "rough"), [(0.002, 0.0, False), (0.015, 0.0, True), (0.002, 0.6, False)])
+@pytest.mark.parametrize(
+    ("noise", "wrong", "rough"), [(0.002, 0.0, False), (0.015, 0.0, True), (0.002, 0.6, False)]
+)
 def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise, wrong, rough):
     """All points are needed for a close fit, and to tell outliers from the surface."""
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(6)
     registrar, scan = Registrar(surface), seen(surface, T_ac, noise, rng)
     spread = rng.random(len(scan)) < wrong
-    scan[spread] = scan.mean(axis=0) + 0.6 * surface.extent * rng.uniform(-1.0, 1.0, (int(spread.sum()), 3))
+    scan[spread] = scan.mean(axis=0) + 0.6 * surface.extent * rng.uniform(
+        -1.0, 1.0, (int(spread.sum()), 3)
+    )
     guess = near(T_ac, 1.0, 0.003 * surface.extent).inverse()
-    found, whole = registrar._backend.align_roughly(scan, guess), registrar._backend.align(scan, guess)
+    found, whole = (
+        registrar._backend.align_roughly(scan, guess),
+        registrar._backend.align(scan, guess),
+    )
     assert whole.converged
     assert found.converged is not rough
     assert (found.T_ca.matrix.tobytes() == whole.T_ca.matrix.tobytes()) is not rough
@@ -121,13 +155,20 @@ def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise
 
 
 def test_the_size_is_fitted_for_the_pose_that_is_returned(monkeypatch):
-    """Half of the points are far away: two alignments are graded, and the size is fitted to the second only."""
+    """Half of the points are far away.
+
+    Two alignments are graded, and the size is fitted to the second only.
+    """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(5)
     registrar, graded, sized = Registrar(surface), [], []
     scan = seen(surface, T_ac, 0.002, rng)
     scan = np.vstack([scan, scan + np.array([0.0, 0.0, 0.8 * surface.extent])])
     grade, fitted = registrar._grader.graded, neighbourhood.size_error
-    monkeypatch.setattr(registrar._grader, "graded", lambda *args, **named: graded.append(1) or grade(*args, **named))
+    monkeypatch.setattr(
+        registrar._grader,
+        "graded",
+        lambda *args, **named: graded.append(1) or grade(*args, **named),
+    )
     monkeypatch.setattr(neighbourhood, "size_error", lambda *args: sized.append(1) or fitted(*args))
     found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
     assert found.status is AlignStatus.ALIGNED
@@ -151,7 +192,9 @@ def test_noise_as_large_as_a_patch_is_not_a_common_misfit_of_neighbours():
     restarter, share = Registrar(surface)._restarter, 0.015
     for seed in range(4):
         noisy = seen(surface, T_ac, share, np.random.default_rng(seed))
-        assert restarter.structure(noisy, T_ac.inverse(), side=share) < 0.18 * share * surface.extent
+        assert (
+            restarter.structure(noisy, T_ac.inverse(), side=share) < 0.18 * share * surface.extent
+        )
 
 
 def test_points_of_a_wrong_pose_share_their_distances_and_those_of_the_true_pose_do_not() -> None:
@@ -163,21 +206,31 @@ def test_points_of_a_wrong_pose_share_their_distances_and_those_of_the_true_pose
 
 
 def behind_a_plate(points: Array, visible: float, extent: float, rng: np.random.Generator) -> Array:
-    """The points of one side, and as many points of a plate half an extent in front of the rest as it hides."""
+    """The points of one side, and as many points of a plate half an extent in front of the rest as
+    it hides.
+    """
     across = points[:, 0] / points[:, 2]
     left = across <= np.quantile(across, visible)
     ranges = np.linalg.norm(points[~left], axis=1, keepdims=True)
     middle = np.median(np.linalg.norm(points, axis=1)) - 0.5 * extent
     return np.vstack(
-        [points[left], points[~left] / ranges * (middle + 0.002 * extent * rng.standard_normal(ranges.shape))]
+        [
+            points[left],
+            points[~left] / ranges * (middle + 0.002 * extent * rng.standard_normal(ranges.shape)),
+        ]
     )
 
 
 @pytest.mark.parametrize("visible", [0.25, 0.35])
-def test_a_scan_of_a_target_that_is_mostly_hidden_is_used_at_the_predicted_pose(visible: float) -> None:
+def test_a_scan_of_a_target_that_is_mostly_hidden_is_used_at_the_predicted_pose(
+    visible: float,
+) -> None:
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(8)
     registrar, whole = Registrar(surface), seen(surface, T_ac, 0.002, rng)
-    scan, guess = behind_a_plate(whole, visible, surface.extent, rng), near(T_ac, 0.3, 0.002 * surface.extent)
+    scan, guess = (
+        behind_a_plate(whole, visible, surface.extent, rng),
+        near(T_ac, 0.3, 0.002 * surface.extent),
+    )
     found, complete = registrar.register(scan, guess), registrar.register(whole, guess)
     error = found.T_ac.inverse() @ T_ac
     d = np.concatenate([geometry.log(error.q), error.t])
@@ -188,7 +241,9 @@ def test_a_scan_of_a_target_that_is_mostly_hidden_is_used_at_the_predicted_pose(
 
 
 @pytest.mark.parametrize("degrees", [4.0, 30.0])
-def test_a_mostly_hidden_target_away_from_the_prediction_is_not_called_aligned(degrees: float) -> None:
+def test_a_mostly_hidden_target_away_from_the_prediction_is_not_called_aligned(
+    degrees: float,
+) -> None:
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(8)
     scan = behind_a_plate(seen(surface, T_ac, 0.002, rng), 0.2, surface.extent, rng)
     found = Registrar(surface).register(scan, near(T_ac, degrees, 0.02 * surface.extent))
@@ -200,7 +255,12 @@ def test_a_wall_in_place_of_the_target_is_not_called_aligned() -> None:
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(9)
     whole = seen(surface, T_ac, 0.002, rng)
     ranges = np.linalg.norm(whole, axis=1, keepdims=True)
-    wall = whole / ranges * (T_ac.t[2] / (whole[:, 2:] / ranges)) * (1.0 + 1e-3 * rng.standard_normal(ranges.shape))
+    wall = (
+        whole
+        / ranges
+        * (T_ac.t[2] / (whole[:, 2:] / ranges))
+        * (1.0 + 1e-3 * rng.standard_normal(ranges.shape))
+    )
     found = Registrar(surface).register(wall, T_ac)
     assert found.status is not AlignStatus.ALIGNED
 
@@ -221,20 +281,29 @@ def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() 
 
 
 def test_a_pose_beside_the_truth_is_left_along_the_valley():
-    """A stage with one fin, turned about its axis: the cost is nearly flat there and has its minimum at the truth."""
+    """A stage with one fin, turned about its axis.
+
+    The cost is nearly flat there and has its minimum at the truth.
+    """
     angle = 2.0 * np.pi * np.arange(48) / 48.0
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(48)])
     up = np.array([0.0, 0.0, 2.0])
     ends = [rim - up, rim + up, -up[None], up[None]]
     k, after = np.arange(48), (np.arange(48) + 1) % 48
     sides = [np.column_stack(f) for f in ((k, after, after + 48), (k, after + 48, k + 48))]
-    caps = [np.column_stack(f) for f in ((after, k, np.full(48, 96)), (k + 48, after + 48, np.full(48, 97)))]
+    caps = [
+        np.column_stack(f)
+        for f in ((after, k, np.full(48, 96)), (k + 48, after + 48, np.full(48, 97)))
+    ]
     fin = boxes()
     low, high = fin.vertices[:8].min(axis=0), fin.vertices[:8].max(axis=0)
     corners = (fin.vertices[:8] - low) / (high - low) * [0.4, 0.1, 0.6] + [-1.2, -0.05, -0.3]
     faces = fin.faces[(fin.faces < 8).all(axis=1)]
     surface = Surface(
-        np.vstack([*ends, corners]), np.vstack([*sides, *caps, faces + 98]).astype(np.int32), "stage with a fin", ""
+        np.vstack([*ends, corners]),
+        np.vstack([*sides, *caps, faces + 98]).astype(np.int32),
+        "stage with a fin",
+        "",
     )
     T_ac = Pose(geometry.exp([0.0, -np.pi / 3, 0.0]), np.array([0.0, 0.0, 12.0]))
     neighbourhood = Registrar(surface)._neighbourhood
@@ -245,10 +314,19 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
 
 
 @pytest.mark.parametrize(
-    ("seed", "error"), [(13, "a minimum 2.7 deg off"), (15, "the other side of a panel, 0.2 deg and 0.01 extents off")]
+    ("seed", "error"),
+    [
+        (13, "a minimum 2.7 deg off"),
+        (15, "the other side of a panel, 0.2 deg and 0.01 extents off"),
+    ],
 )
-def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(scans, monkeypatch, seed, error):
-    """Three tenths of a scan, from a guess 3 deg off: nearly all of its points are near the model at a wrong pose."""
+def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(
+    scans, monkeypatch, seed, error
+):
+    """Three tenths of a scan, from a guess 3 deg off.
+
+    Nearly all of its points are near the model at a wrong pose.
+    """
     registrar, rng, scan = Registrar(builtin_surface()), np.random.default_rng(seed), scans[0]
     angle = rng.uniform(0.0, 2.0 * np.pi)
     across = (scan.points[:, :2] / scan.points[:, 2:]) @ np.array([np.cos(angle), np.sin(angle)])
@@ -264,7 +342,9 @@ def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(scans,
     found = registrar.register(part, guess)
     assert found.status is AlignStatus.ALIGNED
     assert off(found.T_ac) < 0.003
-    monkeypatch.setattr(registrar._neighbourhood, "best", lambda points, guess, at, budget: (None, at.status, ""))
+    monkeypatch.setattr(
+        registrar._neighbourhood, "best", lambda points, guess, at, budget: (None, at.status, "")
+    )
     alone = registrar.register(part, guess)
     assert alone.inlier_ratio > 0.95, error
     assert off(alone.T_ac) > 0.009, error
@@ -293,7 +373,10 @@ def test_a_target_of_another_size_is_said_and_covered():
 
 
 def test_points_beyond_three_standard_deviations_do_not_pull_the_pose():
-    """Some points a little in front of one side, nearer than the gate: mixed pixels at the edges of what is hidden."""
+    """Some points a little in front of one side, nearer than the gate.
+
+    Mixed pixels at the edges of what is hidden.
+    """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(7)
     scan = seen(surface, T_ac, 0.001, rng)
     mixed = (rng.random(len(scan)) < 0.2) & (scan[:, 0] > np.median(scan[:, 0]))
@@ -306,7 +389,10 @@ def test_points_beyond_three_standard_deviations_do_not_pull_the_pose():
 
 
 def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
-    """The second alignment of a noisy scan: passes over few points, or to the planes, would lead away first."""
+    """The second alignment of a noisy scan.
+
+    Passes over few points, or to the planes, would lead away first.
+    """
     model, rng = boxes(), np.random.default_rng(4)
     T_ac = example_pose()
     points = T_ac.apply(view(model, 12000, T_ac.inverse().t))
@@ -321,16 +407,27 @@ def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
     assert backend.align_within(points, first.T_ca, width).iterations > again.iterations
 
 
-def test_where_the_guess_is_only_tested_nothing_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the due scans of a run without an accepted pose: no restart, no search, no steps along the valley."""
+def test_where_the_guess_is_only_tested_nothing_is_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Between the due scans of a run without an accepted pose.
+
+    No restart, no search, no steps along the valley.
+    """
     rng = np.random.default_rng(8)
     sphere = rng.standard_normal((600, 3))
     scan = 2.0 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
     made: list[str] = []
-    for kind, name in ((Neighbourhood, "along_valley"), (Restarter, "graduated"), (GlobalSearch, "search")):
+    for kind, name in (
+        (Neighbourhood, "along_valley"),
+        (Restarter, "graduated"),
+        (GlobalSearch, "search"),
+    ):
         original = getattr(kind, name)
 
-        def counted(self: object, *given: object, _name: str = name, _original: object = original) -> object:
+        def counted(
+            self: object, *given: object, _name: str = name, _original: object = original
+        ) -> object:
             made.append(_name)
             return _original(self, *given)
 
@@ -346,7 +443,9 @@ def test_where_the_guess_is_only_tested_nothing_is_searched(monkeypatch: pytest.
 
 @pytest.mark.slow
 def test_the_bias_of_the_noise_is_corrected_and_the_covariance_contains_the_rest(monkeypatch):
-    """Noise as large as a panel is thick displaces the minimum of the distances in the same way in every scan."""
+    """Noise as large as a panel is thick displaces the minimum of the distances in the same way in
+    every scan.
+    """
     box, panel = trimesh.creation.box((1.5, 1.2, 1.0)), trimesh.creation.box((3.0, 0.8, 0.05))
     panel.apply_translation((2.4, 0.0, 0.1))
     body = trimesh.util.concatenate([box, panel])
@@ -363,7 +462,11 @@ def test_the_bias_of_the_noise_is_corrected_and_the_covariance_contains_the_rest
             found = registrar.register(clean + 0.01 * surface.extent * numbers * rays, T_ac)
             step = found.T_ac.inverse() @ T_ac
             d = np.concatenate([geometry.log(step.q), step.t])
-            yield found.status, d @ np.linalg.solve(found.covariance, d), np.degrees(geometry.angle(step.q))
+            yield (
+                found.status,
+                d @ np.linalg.solve(found.covariance, d),
+                np.degrees(geometry.angle(step.q)),
+            )
 
     statuses, squared, angles = zip(*squared_errors(), strict=True)
     assert set(statuses) == {AlignStatus.ALIGNED}
@@ -377,7 +480,10 @@ def test_the_bias_of_the_noise_is_corrected_and_the_covariance_contains_the_rest
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["guitar", "truss"])
 def test_small_noise_does_not_bias_the_pose_of_thin_parts(kind, monkeypatch):
-    """Noise of 0.2 % of the extent moves points of small parts to other faces; trimesh casts the rays of the views."""
+    """Noise of 0.2 % of the extent moves points of small parts to other faces.
+
+    Trimesh casts the rays of the views.
+    """
     surface = bodies.surface_of(bodies.body(kind, 4), "")
     views = [scenes.view(surface, 10_000, seed, noise=0.002) for seed in range(20)]
 
@@ -392,14 +498,26 @@ def test_small_noise_does_not_bias_the_pose_of_thin_parts(kind, monkeypatch):
     monkeypatch.setattr(quality, "normal_numbers", lambda _count: np.empty(0))
     before, wider = zip(*results(), strict=True)
     size = np.diag([1.0] * 3 + [surface.extent] * 3)
-    squared = [size @ e @ np.linalg.solve(P, size @ e) / 6.0 for e, P in zip(errors, claims, strict=True)]
+    squared = [
+        size @ e @ np.linalg.solve(P, size @ e) / 6.0 for e, P in zip(errors, claims, strict=True)
+    ]
     assert 0.4 < np.mean(squared) < 1.5
     assert np.sum(np.square(before)) > 1.5 * np.sum(np.square(errors))
-    assert np.mean([np.linalg.slogdet(np.linalg.solve(Q, P))[1] for P, Q in zip(claims, wider, strict=True)]) < -4.0
+    assert (
+        np.mean(
+            [
+                np.linalg.slogdet(np.linalg.solve(Q, P))[1]
+                for P, Q in zip(claims, wider, strict=True)
+            ]
+        )
+        < -4.0
+    )
 
 
 def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
-    """Noise of both signs cancels there, so that pose and covariance are those without the simulation."""
+    """Noise of both signs cancels there, so that pose and covariance are those without the
+    simulation.
+    """
     parts = [trimesh.creation.box((4.0, 3.0, 2.0))]
     body = trimesh.util.concatenate(parts)
     surface = Surface(np.array(body.vertices), np.array(body.faces, dtype=np.int32), "", "")
@@ -410,7 +528,10 @@ def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
     eye = np.array([9.0, 8.0, 7.0])
     rays = p - eye
     p += 0.004 * rng.standard_normal((3000, 1)) * rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    registrar, T_ac = Registrar(surface, RegisterParams(split_every=1)), Pose(Pose.identity().q, -eye)
+    registrar, T_ac = (
+        Registrar(surface, RegisterParams(split_every=1)),
+        Pose(Pose.identity().q, -eye),
+    )
     fit = registrar._backend.align(T_ac.apply(p), T_ac.inverse())
     target = registrar._target
     options = (registrar.limits, registrar.params, False, quality.ACCURACY, True, T_ac.inverse())
@@ -423,7 +544,10 @@ def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
 
 
 def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
-    """The distances at this minimum change their sign within a twentieth of the extent; nearly all are inliers."""
+    """The distances at this minimum change their sign within a twentieth of the extent.
+
+    Nearly all are inliers.
+    """
     surface = shared("spacecraft-meshes", "Kepler.obj")
     if surface is None:
         pytest.skip("../shared/data/spacecraft-meshes is not here")
@@ -435,7 +559,10 @@ def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
 
 
 def test_a_fit_whose_points_share_their_distances_is_not_close() -> None:
-    """A pose shifted by a third of the gate, with points off the model; noise of single points is a close fit."""
+    """A pose shifted by a third of the gate, with points off the model.
+
+    Noise of single points is a close fit.
+    """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
     registrar = Registrar(surface)
     gate, T_ca = registrar.limits.gate_m, T_ac.inverse()
@@ -443,6 +570,9 @@ def test_a_fit_whose_points_share_their_distances_is_not_close() -> None:
     first = registrar._grader.graded(scan, T_ac, Budget(10**7), None, False, False)
     off = replace(first, inliers=int(0.95 * first.points), rms_m=0.28 * gate, well_off=20)
     shift = Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.35 * gate]))
-    noisy = scan * (1.0 + 0.25 * gate * rng.standard_normal((len(scan), 1)) / np.linalg.norm(scan, axis=1)[:, None])
+    noisy = scan * (
+        1.0
+        + 0.25 * gate * rng.standard_normal((len(scan), 1)) / np.linalg.norm(scan, axis=1)[:, None]
+    )
     assert registrar._restarter.sound(noisy, replace(off, T_ac=T_ac), Budget(10**7))
     assert not registrar._restarter.sound(scan, replace(off, T_ac=shift @ T_ac), Budget(10**7))

@@ -1,4 +1,7 @@
-"""Nearly symmetric bodies: rays decide between poses that differ by a near-symmetry, or the result is ambiguous."""
+"""Nearly symmetric bodies.
+
+Rays decide between poses that differ by a near-symmetry, or the result is ambiguous.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ import trimesh
 from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import Registrar
 from avsreplay.register.budget import Budget, healthy_work
 from avsreplay.register.quality import left_undetermined
+from avsreplay.register.registrar import Registrar
 
 
 def stage(edge_m: float, sides: int, nozzle: bool, tilt: float) -> trimesh.Trimesh:
@@ -65,7 +68,9 @@ def test_a_small_mark_decides(edge_m, nozzle, seed):
     T_ac = seen_from(0.0, rng.uniform(0.4, 0.7))
     towards = T_ac.inverse().t
     facing = (
-        np.arctan2(towards[1], towards[0]) - np.arctan2(mark[1], mark[0]) + rng.choice([-1, 1]) * rng.uniform(0.5, 0.9)
+        np.arctan2(towards[1], towards[0])
+        - np.arctan2(mark[1], mark[0])
+        + rng.choice([-1, 1]) * rng.uniform(0.5, 0.9)
     )
     T_ac = T_ac @ Pose(exp([0.0, 0.0, facing]), np.zeros(3))
     registrar, scan = Registrar(surface_of(mesh)), scan_of(mesh, T_ac, seed)
@@ -86,7 +91,9 @@ def test_a_mark_out_of_sight_leaves_the_turn_open(sides, nozzle):
     registrar, axis = Registrar(surface_of(mesh)), np.array([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]).T
     away = seen_from(0.0, 0.2)
     towards = away.inverse().t
-    T_ac = away @ Pose(exp([0.0, 0.0, np.arctan2(towards[1], towards[0]) + np.pi - np.pi / sides]), np.zeros(3))
+    T_ac = away @ Pose(
+        exp([0.0, 0.0, np.arctan2(towards[1], towards[0]) + np.pi - np.pi / sides]), np.zeros(3)
+    )
     scan = scan_of(mesh, T_ac, 3)
     assert registrar.acquire(scan).status in (AlignStatus.AMBIGUOUS, AlignStatus.DEGENERATE)
     guess = T_ac @ Pose(exp([0.0, 0.0, 0.25 * np.pi]), np.zeros(3))
@@ -112,19 +119,28 @@ def test_the_information_left_without_motions_is_that_of_free_motions():
 
 
 @pytest.mark.parametrize("points", [600, 2000, 2600, 6000])
-def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most_turns(points: int) -> None:
-    """A round of the search that is never allowed would leave every scan of the body without a pose."""
+def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most_turns(
+    points: int,
+) -> None:
+    """A round of the search that is never allowed would leave every scan of the body without a
+    pose.
+    """
     handle = trimesh.creation.box((0.3, 0.1, 0.4)).apply_translation((0.5, 0.0, 0.1))
     mug = trimesh.util.concatenate([trimesh.creation.cylinder(0.4, 0.9, sections=64), handle])
     symmetry = Registrar(surface_of(mug))._symmetry
     assert symmetry.marked
     assert len(symmetry._marks) > 400
     assert sum(len(motions) for motions in symmetry._kinds) > 100
-    assert symmetry.search_work(points, 0) < 0.9 * Budget(healthy_work(points, symmetry._target.near_work)).left
+    assert (
+        symmetry.search_work(points, 0)
+        < 0.9 * Budget(healthy_work(points, symmetry._target.near_work)).left
+    )
 
 
 def pot() -> trimesh.Trimesh:
-    """A vessel of revolution with a spout and a handle, which every turn moves to a place where the scan shows none."""
+    """A vessel of revolution with a spout and a handle, which every turn moves to a place where the
+    scan shows none.
+    """
     body = trimesh.creation.cylinder(0.6, 1.0, sections=96)
     spout = trimesh.creation.cylinder(0.08, 0.5, sections=12)
     spout.apply_transform(trimesh.transformations.rotation_matrix(1.0, (0, 1, 0)))

@@ -1,4 +1,6 @@
-"""Scans in a fixed frame are registered as in the frame of their sensor, wherever the fixed frame has its origin."""
+"""Scans in a fixed frame are registered as in the frame of their sensor, wherever the fixed frame
+has its origin.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, SourceOptions, open_source
 from avsreplay.record import RecordOptions, record_source
 from avsreplay.records import LogHeader, Scan
-from avsreplay.register import RegisterParams, Registrar, SensorFrame
+from avsreplay.register.params import RegisterParams
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.run import Job, Run
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
@@ -26,7 +30,11 @@ SENSOR = Pose(geometry.exp([0.4, -1.1, 2.0]), np.array([80.0, -45.0, 10.0]))
 def scene():
     with open_source(FIXTURE) as source:
         scan = source.scan_at(3)
-        return Registrar(source.header.surface, RegisterParams()), scan.points.copy(), source.truth_of(scan).pose
+        return (
+            Registrar(source.header.surface, RegisterParams()),
+            scan.points.copy(),
+            source.truth_of(scan).pose,
+        )
 
 
 def test_pose_and_quality_are_those_in_the_frame_of_the_sensor(scene):
@@ -38,7 +46,9 @@ def test_pose_and_quality_are_those_in_the_frame_of_the_sensor(scene):
     assert (found.status, found.inliers) == (plain.status, plain.inliers)
     np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-3, atol=1e-12)
     acquired = SensorFrame(registrar, SENSOR).acquire(moved)
-    np.testing.assert_allclose(acquired.T_ac.matrix, (SENSOR @ registrar.acquire(points).T_ac).matrix, atol=1e-5)
+    np.testing.assert_allclose(
+        acquired.T_ac.matrix, (SENSOR @ registrar.acquire(points).T_ac).matrix, atol=1e-5
+    )
     times = np.linspace(0.0, 0.1, len(points))
     expected = registrar.instants(points, times, plain.T_ac)
     instants = SensorFrame(registrar, SENSOR).instants(moved, times, SENSOR @ plain.T_ac)
@@ -47,12 +57,17 @@ def test_pose_and_quality_are_those_in_the_frame_of_the_sensor(scene):
 
 def test_without_a_sensor_pose_the_registrar_is_used_as_it_is(scene):
     registrar, points, truth = scene
-    plain, found = registrar.register(points, truth), SensorFrame(registrar, None).register(points, truth)
+    plain, found = (
+        registrar.register(points, truth),
+        SensorFrame(registrar, None).register(points, truth),
+    )
     assert found.T_ac.t.tobytes() == plain.T_ac.t.tobytes()
 
 
 def _far_log(log: Path, fixed_frame: str = "map", raw: Path = FIXTURE) -> Path:
-    """The fixture, seen by a camera 90 m from the origin of the fixed frame that the header names."""
+    """The fixture, seen by a camera 90 m from the origin of the fixed frame that the header
+    names.
+    """
     with open_source(raw) as source:
         header = replace(source.header, start=None, truth=None, scenario="", labels=())
         with LogWriter(log, replace(header, fixed_frame=fixed_frame)) as writer:
@@ -88,7 +103,10 @@ def test_without_transforms_no_scan_of_a_log_that_names_a_fixed_frame_can_be_use
 
 
 def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
-    """The camera stands 90 m from the origin of the fixed frame; the target is behind it as seen from there."""
+    """The camera stands 90 m from the origin of the fixed frame.
+
+    The target is behind it as seen from there.
+    """
     log = _far_log(tmp_path / "far.mcap")
     with Run(Job(source=log)) as run:
         rows = list(run.rows())
@@ -103,26 +121,40 @@ def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path)
 
 
 def _turning(after_s: float) -> Pose:
-    """Pose of a sensor that turns and moves; between two instants the position is interpolated by the reader."""
+    """Pose of a sensor that turns and moves.
+
+    Between two instants the position is interpolated by the reader.
+    """
     return Pose(
-        geometry.multiply(SENSOR.q, geometry.exp(after_s * np.array([0.1, -0.2, 0.15]))), SENSOR.t + 0.3 * after_s
+        geometry.multiply(SENSOR.q, geometry.exp(after_s * np.array([0.1, -0.2, 0.15]))),
+        SENSOR.t + 0.3 * after_s,
     )
 
 
 def _turning_log(log: Path, raw: Path = RASTER) -> float:
-    """A log with points at their own times, measured by that sensor; returns the duration of a scan [s]."""
+    """A log with points at their own times, measured by that sensor.
+
+    Returns the duration of a scan [s].
+    """
     with open_source(raw) as source:
-        header = replace(source.header, start=None, truth=None, scenario="", labels=(), fixed_frame="map")
+        header = replace(
+            source.header, start=None, truth=None, scenario="", labels=(), fixed_frame="map"
+        )
         first = source.scan_at(0).t_ns
         with LogWriter(log, header) as writer:
             for scan in source.scans():
                 t_s, times = (scan.t_ns - first) * 1e-9, scan.times_s.astype(np.float64)
                 poses = [_turning(t_s + after) for after in times]
-                seen = [T.inverse().apply(p) for T, p in zip(poses, SENSOR.apply(scan.points), strict=True)]
+                seen = [
+                    T.inverse().apply(p)
+                    for T, p in zip(poses, SENSOR.apply(scan.points), strict=True)
+                ]
                 last = float(times.max())
                 for after in np.linspace(0.0, last, 9):
                     ns = round(after * 1e9)
-                    writer.write_camera(scan.log_ns + ns, scan.t_ns + ns, _turning(t_s + float(after)))
+                    writer.write_camera(
+                        scan.log_ns + ns, scan.t_ns + ns, _turning(t_s + float(after))
+                    )
                 writer.write(replace(scan, points=np.array(seen)))
                 writer.write_truth(scan.log_ns, scan.t_ns, SENSOR @ source.truth_of(scan).pose)
     return last

@@ -1,4 +1,7 @@
-"""Size of the target from one scan: reported if it is wrong, not if noise or another error has a similar effect."""
+"""Size of the target from one scan.
+
+Reported if it is wrong, not if noise or another error has a similar effect.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +14,28 @@ from oracles.residuals import summed
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
 from avsreplay.register import size as size_module
 from avsreplay.register.contract import boxes, view
 from avsreplay.register.covariance import patch_size
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.size import SizeError, fitted_size, noise_bias, normal_jacobian
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.simulate import builtin_surface
+from avsreplay.simulate.target import builtin_surface
 
 
 def scan_of(surface: Surface, seed: int, noise: float, count: int = 3000) -> tuple[Array, Pose]:
-    """A view from a random side at three extents, noise in units of the extent along the ray; and T_ac."""
+    """A view from a random side at three extents, noise in units of the extent along the ray.
+
+    And T_ac.
+    """
     rng = np.random.default_rng(seed)
     q = rng.standard_normal(4)
     T_ac = Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * surface.extent]))
     points = T_ac.apply(view(surface, count, T_ac.inverse().t))
     ranges = np.linalg.norm(points, axis=1, keepdims=True)
-    return points * (1.0 + noise * surface.extent * rng.standard_normal(ranges.shape) / ranges), T_ac
+    return points * (
+        1.0 + noise * surface.extent * rng.standard_normal(ranges.shape) / ranges
+    ), T_ac
 
 
 def remarks(model: Surface, measured: Surface, noise: float, seeds: range) -> list[str]:
@@ -63,7 +71,11 @@ def test_the_step_of_the_extension_is_that_of_the_rows(monkeypatch, known: bool)
     np.testing.assert_allclose(step.matrix, moved.matrix, atol=1e-11)
     assert abs(delta) > 0.01
     far = p + 10.0 * model.extent
-    assert size_module._rounds(index, far, camera_c, 1) is size_module.least_squares(index, far, camera_c) is None
+    assert (
+        size_module._rounds(index, far, camera_c, 1)
+        is size_module.least_squares(index, far, camera_c)
+        is None
+    )
 
 
 def test_faces_in_coordinate_planes_do_not_enlarge_the_standard_error() -> None:
@@ -128,7 +140,10 @@ def test_the_bias_of_noise_is_that_of_repeated_scans() -> None:
 
 
 def test_an_error_of_aspect_is_not_called_an_error_of_size() -> None:
-    """Along one axis alone: the sign of the isotropic fit depends on the view, and its standard error includes that."""
+    """Along one axis alone.
+
+    The sign of the isotropic fit depends on the view, and its standard error includes that.
+    """
     model = boxes()
     stretched = replace(model, vertices=model.vertices * [1.0, 1.0, 1.012])
     assert not any(remarks(model, stretched, 0.002, range(8)))
@@ -139,7 +154,9 @@ def test_three_faces_of_a_box_tell_no_size() -> None:
     """Points on three planes fit a box of any size; only a face behind the others would tell."""
     planes = [np.random.default_rng(k).uniform(0.1, 0.9, (200, 2)) for k in range(3)]
     corner = np.vstack([np.insert(plane, k, 1.0, axis=1) for k, plane in enumerate(planes)])
-    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+    vertices = np.array(
+        [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64
+    )
     index = SurfaceIndex.build(Surface(vertices, cube_faces(), "cube", ""), 0.3)
     assert fitted_size(index, 1.03 * corner - 0.03, np.array([5.0, 5.0, 5.0])) is None
 

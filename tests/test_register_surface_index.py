@@ -1,4 +1,7 @@
-"""The surface index and its numpy reference: recovery, invariance, meaning of the sums, invalid input."""
+"""The surface index and its numpy reference.
+
+Recovery, invariance, meaning of the sums, invalid input.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,14 @@ NO_FACES = np.zeros((0, 3), dtype=np.int32)
 MOVE = Pose(exp([0.05, -0.08, 0.06]), [0.03, -0.02, 0.04])
 
 
-Build = Callable[[Surface, float], Any]  # of a SurfaceIndex or an OracleIndex, which have the same methods
+Build = Callable[
+    [Surface, float], Any
+]  # of a SurfaceIndex or an OracleIndex, which have the same methods
 
 
 @pytest.fixture(
-    params=[SurfaceIndex.build, pytest.param(OracleIndex, marks=pytest.mark.slow)], ids=["kernel", "oracle"]
+    params=[SurfaceIndex.build, pytest.param(OracleIndex, marks=pytest.mark.slow)],
+    ids=["kernel", "oracle"],
 )
 def build(request: pytest.FixtureRequest) -> Build:
     return request.param
@@ -42,9 +48,15 @@ def shape() -> Surface:
         ((0.6, 0.2, 0.3), (0.5, 0.2, 0.3)),
         ((-0.3, 0.5, 0.1), (0.2, 0.6, 0.5)),
     ):
-        corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.array(size) / 2
+        corner = (
+            np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            * np.array(size)
+            / 2
+        )
         quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-        faces += [[len(vertices) * 8 + q[k] for k in t] for q in quads for t in ((0, 1, 2), (0, 2, 3))]
+        faces += [
+            [len(vertices) * 8 + q[k] for k in t] for q in quads for t in ((0, 1, 2), (0, 2, 3))
+        ]
         vertices.append(corner + np.array(centre))
     return Surface(np.concatenate(vertices), np.array(faces, dtype=np.int32), "boxes", "")
 
@@ -52,7 +64,9 @@ def shape() -> Surface:
 def on(mesh: Surface, n: int, seed: int) -> Array:
     r = rng(seed)
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     pick = corners[r.choice(len(corners), n, p=area / area.sum())]
     return np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), size=n), pick)
 
@@ -90,7 +104,10 @@ def test_the_order_of_the_points_does_not_matter(build: Build) -> None:
     mesh = shape()
     model = build(mesh, 0.5)
     scan = MOVE.apply(on(mesh, 1200, 5) + 0.004 * rng(6).standard_normal((1200, 3)))
-    a, b = model.icp(scan, Pose.identity()), model.icp(scan[rng(7).permutation(1200)], Pose.identity())
+    a, b = (
+        model.icp(scan, Pose.identity()),
+        model.icp(scan[rng(7).permutation(1200)], Pose.identity()),
+    )
     assert np.abs(a.T_ca - b.T_ca).max() < 1e-9
 
 
@@ -100,7 +117,10 @@ def test_outliers_are_rejected_by_the_shrinking_gate(build: Build) -> None:
     r = rng(8)
     scan = on(mesh, 1500, 9) + 0.003 * r.standard_normal((1500, 3))
     scan = np.concatenate([scan, r.uniform(-1.2, 1.2, (300, 3))])
-    free, tight = (model.icp(MOVE.apply(scan), Pose.identity(), IcpParams(n_max=200, tighten=t)) for t in (0.0, 3.0))
+    free, tight = (
+        model.icp(MOVE.apply(scan), Pose.identity(), IcpParams(n_max=200, tighten=t))
+        for t in (0.0, 3.0)
+    )
     wrong = [np.abs(x.T_ca - MOVE.inverse().matrix).max() for x in (free, tight)]
     assert wrong[1] < 2e-3 < wrong[0]
     assert tight.gate_m < 0.02
@@ -129,7 +149,10 @@ def test_kernel_and_oracle_make_the_same_steps() -> None:
         IcpParams(newton=False, n_plane=0),
         IcpParams(**plain, n_max=9, tighten=0.0, gate_m=0.1),
     ):
-        a, b = (index(mesh, 0.5).icp(scan, Pose.identity(), rule) for index in (SurfaceIndex.build, OracleIndex))
+        a, b = (
+            index(mesh, 0.5).icp(scan, Pose.identity(), rule)
+            for index in (SurfaceIndex.build, OracleIndex)
+        )
         assert np.abs(a.T_ca - b.T_ca).max() < 1e-9
         assert (a.iterations, a.converged, a.inliers) == (b.iterations, b.converged, b.inliers)
         assert a.rms_m == pytest.approx(b.rms_m, rel=1e-9)
@@ -137,19 +160,26 @@ def test_kernel_and_oracle_make_the_same_steps() -> None:
 
 
 def test_horn_passes_lower_the_rms_every_time(build: Build) -> None:
-    """With the gate held wide enough to take every point, a pass of ICP never raises the mean square."""
+    """With the gate held wide enough to take every point, a pass of ICP never raises the mean
+    square.
+    """
     mesh = shape()
     model = build(mesh, 2.0)
     scan = MOVE.apply(on(mesh, 600, 14) + 0.004 * rng(15).standard_normal((600, 3)))
     rms = [
-        model.icp(scan, Pose.identity(), IcpParams(n_max=n, n_plane=0, tighten=0.0, newton=False)).rms_m
+        model.icp(
+            scan, Pose.identity(), IcpParams(n_max=n, n_plane=0, tighten=0.0, newton=False)
+        ).rms_m
         for n in range(1, 25)
     ]
     assert all(b <= a * (1 + 1e-12) for a, b in pairwise(rms))
 
 
 def test_information_is_the_residuals_curvature(build: Build) -> None:
-    """J = de/dd for T_ac_true = T_ac Exp(d): the residual at the moved pose, feet and normals held, against J d."""
+    """J = de/dd for T_ac_true = T_ac Exp(d).
+
+    The residual at the moved pose, feet and normals held, against J d.
+    """
     mesh = shape()
     model = build(mesh, 0.5)
     T_ca = MOVE.inverse()
@@ -180,7 +210,9 @@ def test_the_gate_counts_inliers(build: Build) -> None:
     scan = on(mesh, 400, 18) + 0.05 * rng(19).standard_normal((400, 3))
     d2 = model.closest(scan).d2
     for gate in (0.0, 0.01, 0.03, 10.0):
-        assert model.normal_equations(scan, np.eye(4), gate).inliers == np.sum(d2 < min(gate, 0.5) ** 2)
+        assert model.normal_equations(scan, np.eye(4), gate).inliers == np.sum(
+            d2 < min(gate, 0.5) ** 2
+        )
 
 
 def test_normals_look_out_of_the_face(build: Build) -> None:
@@ -193,7 +225,9 @@ def test_normals_look_out_of_the_face(build: Build) -> None:
 
 def test_ids_are_those_of_the_given_faces_where_some_have_no_area(build: Build) -> None:
     mesh = shape()
-    faces = np.insert(mesh.faces, [0, 5, 20], [[0, 0, 1], [2, 2, 2], [3, 4, 3]], axis=0).astype(np.int32)
+    faces = np.insert(mesh.faces, [0, 5, 20], [[0, 0, 1], [2, 2, 2], [3, 4, 3]], axis=0).astype(
+        np.int32
+    )
     plain = build(mesh, 0.5)
     model = build(dataclasses.replace(mesh, faces=faces), 0.5)
     q = rng(20).uniform(-1, 1, (300, 3))
@@ -263,7 +297,10 @@ def test_only_faces_that_look_at_the_camera_count(build: Build) -> None:
 
 
 def test_a_thin_plate_is_not_pulled_to_its_far_side(build: Build) -> None:
-    """Half the noise of the near side lies nearer to the far one: all faces bias the pose, those seen do not."""
+    """Half the noise of the near side lies nearer to the far one.
+
+    All faces bias the pose, those seen do not.
+    """
     mesh = shape()
     thin = dataclasses.replace(mesh, vertices=mesh.vertices * [1, 1, 0.02])
     r = rng(31)
@@ -273,7 +310,10 @@ def test_a_thin_plate_is_not_pulled_to_its_far_side(build: Build) -> None:
     scan = camera.inverse().apply(on(dataclasses.replace(thin, faces=thin.faces[up]), 3000, 32))
     scan += [0, 0, 1] * (0.006 * r.standard_normal((3000, 1)))
     model = build(thin, 0.3)
-    z = [model.icp(scan, camera, IcpParams(facing=f, tighten=0.0)).T_ca[2, 3] - 5.0 for f in (True, False)]
+    z = [
+        model.icp(scan, camera, IcpParams(facing=f, tighten=0.0)).T_ca[2, 3] - 5.0
+        for f in (True, False)
+    ]
     sums = model.normal_equations(scan, camera, facing=True)
     assert abs(z[0]) < 2e-4
     assert abs(z[1]) > 5 * abs(z[0])
@@ -301,13 +341,17 @@ def test_a_stray_vertex_within_the_limit_is_indexed(size: float) -> None:
 
 
 def test_closest_point_on_a_dense_mesh() -> None:
-    """A point beyond a face of a convex surface, along the normal at the centroid, has that centroid as its foot.
+    """A point beyond a face of a convex surface, along the normal at the centroid, has that
+    centroid as its foot.
 
-    The mesh is so fine that the first grid of the index has too many entries and a narrower one is built.
+    The mesh is so fine that the first grid of the index has too many entries and a narrower one is
+    built.
     """
     trimesh = pytest.importorskip("trimesh")
     ball = trimesh.creation.icosphere(subdivisions=7)
-    surface = Surface(np.asarray(ball.vertices, float), np.asarray(ball.faces, np.int32), "ball", "")
+    surface = Surface(
+        np.asarray(ball.vertices, float), np.asarray(ball.faces, np.int32), "ball", ""
+    )
     index = SurfaceIndex.build(surface, 0.3)
     chosen = np.arange(0, len(surface.faces), 97)
     middle = surface.vertices[surface.faces[chosen]].mean(axis=1)
@@ -321,7 +365,9 @@ def test_closest_point_on_a_dense_mesh() -> None:
 
 
 def test_a_ray_ends_at_the_first_face_that_it_meets() -> None:
-    """A point p of a face has (p - eye) . n = range * ray . n there, and no other face is met before it."""
+    """A point p of a face has (p - eye) . n = range * ray . n there, and no other face is met
+    before it.
+    """
     surface, eye = shape(), np.array([3.0, 2.0, 2.5])
     index = SurfaceIndex.build(surface, 1.0)
     rays = 0.5 * rng(8).standard_normal((400, 3)) - eye

@@ -1,4 +1,7 @@
-"""Motions that carry most of a model onto itself: turns of gears, of bodies of revolution, and finite groups."""
+"""Motions that carry most of a model onto itself.
+
+Turns of gears, of bodies of revolution, and finite groups.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +13,28 @@ from scipy.spatial.transform import Rotation
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
 from avsreplay.register.symmetry import TURNS, near_symmetries
 
 
 def prism(outline: Array, height: float) -> trimesh.Trimesh:
-    """A prism over an outline (n, 2) that is star-shaped about the origin; its parts end at z = 0 and the height."""
+    """A prism over an outline (n, 2) that is star-shaped about the origin.
+
+    Its parts end at z = 0 and the height.
+    """
     n = len(outline)
     low, high = (np.column_stack([outline, np.full(n, z)]) for z in (0.0, height))
     vertices = np.vstack([low, high, [[0.0, 0.0, 0.0], [0.0, 0.0, height]]])
     k, after = np.arange(n), (np.arange(n) + 1) % n
-    sides = np.vstack([np.column_stack([k, after, after + n]), np.column_stack([k, after + n, k + n])])
+    sides = np.vstack(
+        [np.column_stack([k, after, after + n]), np.column_stack([k, after + n, k + n])]
+    )
     ends = np.vstack(
-        [np.column_stack([after, k, np.full(n, 2 * n)]), np.column_stack([k + n, after + n, np.full(n, 2 * n + 1)])]
+        [
+            np.column_stack([after, k, np.full(n, 2 * n)]),
+            np.column_stack([k + n, after + n, np.full(n, 2 * n + 1)]),
+        ]
     )
     return trimesh.Trimesh(vertices, np.vstack([sides, ends]), process=False)
 
@@ -32,7 +43,9 @@ def gear(teeth: int, depth: float, key: bool = True) -> Surface:
     """A gear of radius 1 with trapezoidal teeth, a hub on one side, and a key on the hub."""
     at = 2.0 * np.pi * (np.arange(teeth)[:, None] + [0.0, 0.25, 0.35, 0.6, 0.75]) / teeth
     radius = np.where(np.isin(np.arange(5), [2, 3]), 1.0, 1.0 - depth) * np.ones((teeth, 1))
-    parts = [prism(np.column_stack([(radius * np.cos(at)).ravel(), (radius * np.sin(at)).ravel()]), 0.3)]
+    parts = [
+        prism(np.column_stack([(radius * np.cos(at)).ravel(), (radius * np.sin(at)).ravel()]), 0.3)
+    ]
     hub = trimesh.creation.cylinder(0.4, 0.3, sections=10 * teeth)
     hub.apply_translation((0.0, 0.0, 0.45))
     parts.append(hub)
@@ -41,7 +54,9 @@ def gear(teeth: int, depth: float, key: bool = True) -> Surface:
         box.apply_translation((0.4, 0.0, 0.45))
         parts.append(box)
     mesh = trimesh.util.concatenate(parts)
-    moved = trimesh.transformations.rotation_matrix(0.9, (0.3, -0.5, 0.7), (0.2, -0.4, 0.1))  # the axis is none of {C}
+    moved = trimesh.transformations.rotation_matrix(
+        0.9, (0.3, -0.5, 0.7), (0.2, -0.4, 0.1)
+    )  # the axis is none of {C}
     mesh.apply_transform(moved)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32), "gear", "")
 
@@ -70,21 +85,28 @@ def test_any_turn_carries_a_body_of_revolution_onto_itself(sides: int) -> None:
     cone = trimesh.creation.cone(0.4, 0.8, sections=sides)
     cone.apply_translation((0.0, 0.0, -1.75))
     mesh = trimesh.util.concatenate([tank, cone])
-    found = found_in(Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32), "stage", ""))
+    found = found_in(
+        Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32), "stage", "")
+    )
     assert len(found.kinds[0]) == TURNS - 1
     assert np.isinf(found.least_rad)
 
 
 def test_products_complete_the_group_of_a_cube() -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
-    found = found_in(Surface(np.array(cube.vertices), np.array(cube.faces, dtype=np.int32), "cube", ""))
+    found = found_in(
+        Surface(np.array(cube.vertices), np.array(cube.faces, dtype=np.int32), "cube", "")
+    )
     angles = turns_deg(np.concatenate(found.kinds))
     np.testing.assert_allclose(angles, [90.0] * 6 + [120.0] * 8 + [180.0] * 9, atol=1.0)
 
 
 @pytest.mark.parametrize("teeth", [17, 38])
 def test_no_pose_of_a_gear_is_accepted_that_is_turned_by_teeth(teeth: int) -> None:
-    """With the key in sight one tooth is right; with the key on the other side none is told from the others."""
+    """With the key in sight one tooth is right.
+
+    With the key on the other side none is told from the others.
+    """
     surface, rng, accepted = gear(teeth, 0.15), np.random.default_rng(teeth), 0
     registrar = Registrar(surface)
     middle = 0.5 * (surface.vertices.max(axis=0) + surface.vertices.min(axis=0))

@@ -16,9 +16,14 @@ SQUARE = np.array([[0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 1.0, 1.0]], np.flo
 
 
 def rows(action: str = "approach") -> list[Row]:
-    """A target at (0, 0, 5) m whose {C} is {A} turned by 90 degrees about z; a plan of 10 s is made at the scan 2."""
+    """A target at (0, 0, 5) m whose {C} is {A} turned by 90 degrees about z.
+
+    A plan of 10 s is made at the scan 2.
+    """
     place = {"x_m": 0.0, "y_m": 0.0, "z_m": 5.0, "qx": 0.0, "qy": 0.0, "qz": HALF, "qw": HALF}
-    made = [Row(t_ns=k * 10**9, action="stand_still" if k < 2 else action, **place) for k in range(15)]
+    made = [
+        Row(t_ns=k * 10**9, action="stand_still" if k < 2 else action, **place) for k in range(15)
+    ]
     made[2] = replace(made[2], t_go_s=10.0)
     return made
 
@@ -53,7 +58,10 @@ def test_the_next_path_replaces_the_former() -> None:
 
 
 def test_the_picture_shows_path_begin_cone_and_body_to_scale() -> None:
-    header = {"approach": {"final_deg": 15.0, "final_range_m": 0.5}, "config": {"fixture_axis_c": [0.0, -1.0, 0.0]}}
+    header = {
+        "approach": {"final_deg": 15.0, "final_range_m": 0.5},
+        "config": {"fixture_axis_c": [0.0, -1.0, 0.0]},
+    }
     shown = approach_picture(rows(), view(), header)
     assert shown is not None
     metre = shown["bar"] / float(shown["bar_text"].split()[0])

@@ -18,13 +18,21 @@ from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import ClockChoice, Unit
 from avsreplay.records import Label
-from avsreplay.report import Summary
 from avsreplay.report.compare import METRICS, changed_settings, metrics
-from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
+from avsreplay.report.gate import (
+    GateRule,
+    RuleOutcome,
+    check_gate,
+    github_lines,
+    judge,
+    junit,
+    load_rules,
+)
 from avsreplay.report.golden import compare_rows
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
 from avsreplay.report.result import load_result, write_manifest
+from avsreplay.report.summary import Summary
 from avsreplay.report.table import print_sparks, spark
 
 
@@ -96,15 +104,23 @@ def test_a_ratio_to_zero_allows_no_increase():
 
 def test_a_missing_figure_breaks_the_rule_unless_optional():
     runs = [("a", BASE), ("b", BASE)]
-    assert [o.ok for o in judge([GateRule("t1_s", max=10), GateRule("t1_s", max=10, optional=True)], runs)] == [
+    assert [
+        o.ok
+        for o in judge([GateRule("t1_s", max=10), GateRule("t1_s", max=10, optional=True)], runs)
+    ] == [
         False,
         True,
     ]
-    assert not judge([GateRule("t1_s", max_ratio=2)], [("a", BASE), ("b", BASE | {"t1_s": 3.0})])[0].ok
+    assert not judge([GateRule("t1_s", max_ratio=2)], [("a", BASE), ("b", BASE | {"t1_s": 3.0})])[
+        0
+    ].ok
 
 
 def test_an_optional_rule_does_not_skip_a_lost_value():
-    rules = [GateRule("t1_s", max_increase=2.0, optional=True), GateRule("capture_s", max=40.0, optional=True)]
+    rules = [
+        GateRule("t1_s", max_increase=2.0, optional=True),
+        GateRule("capture_s", max=40.0, optional=True),
+    ]
     base = BASE | {"t1_s": 8.0, "capture_s": 29.0}
     outcomes = judge(rules, [("base", base), ("new", base | {"t1_s": None, "capture_s": None})])
     assert [o.ok for o in outcomes] == [False, False]
@@ -114,7 +130,9 @@ def test_an_optional_rule_does_not_skip_a_lost_value():
 def test_a_run_that_used_no_scan_cannot_pass(make_rows):
     rows = make_rows(30, gamma=0, reason="not_aligned", nis=None)
     figures = metrics(Summary.fold(rows))
-    outcomes = judge([GateRule("false_alarms", max=1000.0, optional=True)], [("run", figures)], baseline=False)
+    outcomes = judge(
+        [GateRule("false_alarms", max=1000.0, optional=True)], [("run", figures)], baseline=False
+    )
     assert outcomes[-1].why == "the run used no scan"
     with pytest.raises(CheckFailed):
         check_gate(outcomes)
@@ -132,7 +150,10 @@ def test_one_run_is_judged_by_absolute_rules_only():
         ("", r"no \[\[rule\]\]"),
         ('[[rule]]\nmetric = "nope"\nmax = 1', "unknown metric 'nope'"),
         ('[[rule]]\nmetric = "t1_s"', "has no limit"),
-        ('[[rule]]\nmetric = "t1_s"\nmx = 1', r"rules\.toml:3: unknown key 'rule\.0\.mx'; did you mean 'rule\.0\.max'"),
+        (
+            '[[rule]]\nmetric = "t1_s"\nmx = 1',
+            r"rules\.toml:3: unknown key 'rule\.0\.mx'; did you mean 'rule\.0\.max'",
+        ),
         ('[[rule]]\nmetric = "t1_s"\nmax = "1"', r":3: 'rule\.0\.max' must be a number"),
         ("[[rule", "not valid TOML"),
     ],
@@ -152,7 +173,9 @@ EVIL = 'a<b> & "c":,%\n::error::d'
 def _outcomes():
     return [
         RuleOutcome("run", GateRule("t1_s", max=10), 5.0, True),
-        RuleOutcome(EVIL, GateRule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"),
+        RuleOutcome(
+            EVIL, GateRule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"
+        ),
     ]
 
 
@@ -177,18 +200,34 @@ def test_github_annotations_are_escaped():
 
 def test_the_gate_names_the_first_broken_rule():
     check_gate(_outcomes()[:1])
-    with pytest.raises(CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s: 11 > 10.*later is useless"):
+    with pytest.raises(
+        CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s: 11 > 10.*later is useless"
+    ):
         check_gate(_outcomes())
 
 
 def test_every_reading_option_that_is_given_is_stated():
     assert changed_settings(SourceOptions(), RunConfig()) == []
     examples = {bool: True, int: 7, float: 7.5, tuple: (1.0, 2.0), type(None): "x", Unit: Unit.MM}
-    special = {"crop_box": (0.0, 0.0, 0.0, 1.0, 2.0, 3.0), "clock": ClockChoice.LOG, "grasp": (1.0, 2.0, 3.0)}
+    special = {
+        "crop_box": (0.0, 0.0, 0.0, 1.0, 2.0, 3.0),
+        "clock": ClockChoice.LOG,
+        "grasp": (1.0, 2.0, 3.0),
+    }
     for field in dataclasses.fields(SourceOptions):
         value = special.get(field.name, examples.get(type(field.default)))
-        if field.name in ("start_s", "end_s", "duration_s", "rate_hz", "n_scans", "pose_sigma", "crop_range"):
-            value = {"n_scans": 3, "pose_sigma": (1.0, 2.0), "crop_range": (1.0, 2.0)}.get(field.name, 2.5)
+        if field.name in (
+            "start_s",
+            "end_s",
+            "duration_s",
+            "rate_hz",
+            "n_scans",
+            "pose_sigma",
+            "crop_range",
+        ):
+            value = {"n_scans": 3, "pose_sigma": (1.0, 2.0), "crop_range": (1.0, 2.0)}.get(
+                field.name, 2.5
+            )
         (line,) = changed_settings(SourceOptions(**{field.name: value}), RunConfig())
         assert line.startswith(f"{field.name} = "), line
         assert " (default " in line
@@ -205,7 +244,9 @@ def runs(tmp_path, make_rows):
         (tmp_path / name).mkdir()
         write_rows(tmp_path / name / "rows.jsonl", rows)
         write_manifest(tmp_path / name, {}, len(rows))
-    (tmp_path / "rules.toml").write_text('[[rule]]\nmetric = "pose_pos_rmse_m"\nmax_ratio = 1.5\nnote = "no regress"\n')
+    (tmp_path / "rules.toml").write_text(
+        '[[rule]]\nmetric = "pose_pos_rmse_m"\nmax_ratio = 1.5\nnote = "no regress"\n'
+    )
     return tmp_path
 
 
@@ -220,14 +261,29 @@ def test_the_table_shows_changes_and_the_compare_rows(runs):
     assert "worse: worse in rms position error of all scans (" in done.output
     assert "same: no difference; all 40 rows agree" in done.output
     assert "worse: 40 cells differ from base, first at scan 0, column pos_err_m" in done.output
-    assert max(len(line) for line in done.output.splitlines() if "cells" not in line and "agree" not in line) <= 80
+    assert (
+        max(
+            len(line)
+            for line in done.output.splitlines()
+            if "cells" not in line and "agree" not in line
+        )
+        <= 80
+    )
 
 
 def test_the_gate_fails_with_its_own_code_and_writes_for_ci(runs):
     good = _run(runs / "base", runs / "same", "--gate", runs / "rules.toml", "--github")
     assert good.exit_code == 0
     assert "::notice" in good.output
-    bad = _run(runs / "base", runs / "worse", "--gate", runs / "rules.toml", "--junit", runs / "g.xml", "--github")
+    bad = _run(
+        runs / "base",
+        runs / "worse",
+        "--gate",
+        runs / "rules.toml",
+        "--junit",
+        runs / "g.xml",
+        "--github",
+    )
     assert isinstance(bad.exception, CheckFailed)
     assert bad.exception.exit_code == 1
     assert "::error title=avsreplay gate%3A worse::pose_pos_rmse_m: " in bad.output

@@ -20,7 +20,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
-from avsreplay.report import Summary, jsonl
+from avsreplay.report import jsonl
 from avsreplay.report.export import (
     columns_page,
     descriptions,
@@ -37,6 +37,7 @@ from avsreplay.report.export import (
     write_tum,
 )
 from avsreplay.report.jsonl import dump_row, field_types, parse_row, read_rows, write_rows
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row, columns
 
 ROOT = Path(__file__).parent.parent
@@ -74,7 +75,9 @@ def test_every_float_reads_back_to_itself(value):
 
 def _bare() -> Row:
     blank = {str: "", int: 0, float: 0.0, bool: False}
-    return Row(**{name: blank[kind] for name, (kind, nullable) in field_types().items() if not nullable})
+    return Row(
+        **{name: blank[kind] for name, (kind, nullable) in field_types().items() if not nullable}
+    )
 
 
 def test_an_older_result_lacks_words_and_nulls_only(make_rows):
@@ -129,9 +132,13 @@ TOKENS = (
 )
 
 
-@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 200), st.sampled_from(TOKENS)), max_size=3))
+@given(
+    st.lists(st.tuples(st.integers(0, 4), st.integers(0, 200), st.sampled_from(TOKENS)), max_size=3)
+)
 def test_blocks_are_read_as_cell_by_cell(changes):
-    """Rows checked at once are those that the reader of single cells gives, and so are the errors."""
+    """Rows checked at once are those that the reader of single cells gives, and so are the
+    errors.
+    """
     lines = (ROOT / "fixtures" / "tumble.rows.jsonl").read_text(encoding="utf-8").splitlines()[:5]
     for number, place, token in changes:
         cells = lines[number].split(", ")
@@ -205,7 +212,11 @@ def test_csv_has_every_column_and_empty_cells_for_null(tmp_path, make_rows):
     with (tmp_path / "a.csv").open(newline="") as stream:
         table = list(csv.DictReader(stream))
     assert list(table[0]) == [c.name for c in columns()]
-    assert (table[22]["rms_m"], table[22]["converged"], table[22]["fault"]) == ("", "true", "full_occlusion")
+    assert (table[22]["rms_m"], table[22]["converged"], table[22]["fault"]) == (
+        "",
+        "true",
+        "full_occlusion",
+    )
     assert [float(line["x_m"]) for line in table] == [row.x_m for row in rows]
 
 
@@ -231,7 +242,9 @@ def test_the_document_is_strict_json(make_rows):
     whole = json.loads(text, parse_constant=pytest.fail)
     assert whole == run_document(rows, summary, {"seed": 7, "empty": {}})
     assert list(whole) == ["format", "verdict", "header", "summary", "rows"]
-    assert [parse_row(r, "x") for r in whole["rows"]] == [dataclasses.replace(r, rms_m=None) for r in rows]
+    assert [parse_row(r, "x") for r in whole["rows"]] == [
+        dataclasses.replace(r, rms_m=None) for r in rows
+    ]
 
 
 def test_the_document_of_no_rows_is_json_too():
@@ -257,10 +270,18 @@ def test_the_schema_knows_every_column_and_its_type(make_rows):
     schema = row_schema()
     record = json.loads(dump_row(make_rows(1)[0]))
     assert set(schema["required"]) == set(record)
-    kinds = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "null": type(None)}
+    kinds = {
+        "string": str,
+        "integer": int,
+        "number": (int, float),
+        "boolean": bool,
+        "null": type(None),
+    }
     for name, value in record.items():
         types = schema["properties"][name]["type"]
-        assert any(isinstance(value, kinds[t]) for t in ([types] if isinstance(types, str) else types))
+        assert any(
+            isinstance(value, kinds[t]) for t in ([types] if isinstance(types, str) else types)
+        )
 
 
 def test_field_types_are_the_four_that_files_can_hold():

@@ -1,4 +1,7 @@
-"""Golden comparison: in both directions, each column by its declared tolerance, missing values included."""
+"""Golden comparison.
+
+In both directions, each column by its declared tolerance, missing values included.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ def test_the_same_rows_agree(golden, make_rows):
 
 def _nudged(rows, name, amount):
     return [
-        dataclasses.replace(r, **{name: getattr(r, name) + amount}) if getattr(r, name) is not None else r for r in rows
+        dataclasses.replace(r, **{name: getattr(r, name) + amount})
+        if getattr(r, name) is not None
+        else r
+        for r in rows
     ]
 
 
@@ -53,7 +59,18 @@ def test_each_tolerance_is_the_declared_one(tmp_path, make_rows, column):
         assert result.differences[0].tolerance == pytest.approx(limit)
 
 
-EXACT = ("t_ns", "status", "gamma", "reason", "guess", "fault", "iterations", "ogm_rank", "converged", "sigma_hits")
+EXACT = (
+    "t_ns",
+    "status",
+    "gamma",
+    "reason",
+    "guess",
+    "fault",
+    "iterations",
+    "ogm_rank",
+    "converged",
+    "sigma_hits",
+)
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -90,7 +107,10 @@ def test_null_against_a_value_is_a_difference_both_ways(golden, make_rows):
 
 def test_missing_rows_fail_on_either_side(golden, make_rows):
     fewer = compare_golden(golden, make_rows(28))
-    assert [(d.seq, d.column, d.got) for d in fewer.differences] == [(28, "row", ABSENT), (29, "row", ABSENT)]
+    assert [(d.seq, d.column, d.got) for d in fewer.differences] == [
+        (28, "row", ABSENT),
+        (29, "row", ABSENT),
+    ]
     more = compare_golden(golden, make_rows(31))
     assert [(d.seq, d.column, d.expected) for d in more.differences] == [(30, "row", ABSENT)]
 
@@ -101,7 +121,9 @@ def test_a_missing_column_fails_on_the_file_side(golden, make_rows):
         del record["nis"]
     golden.write_text("".join(json.dumps(r) + "\n" for r in records))
     result = compare_golden(golden, make_rows(30))
-    assert [(d.seq, d.column, d.expected, d.got) for d in result.differences] == [(None, "nis", ABSENT, "present")]
+    assert [(d.seq, d.column, d.expected, d.got) for d in result.differences] == [
+        (None, "nis", ABSENT, "present")
+    ]
 
 
 def test_an_undeclared_column_fails(golden, make_rows):
@@ -151,6 +173,16 @@ def test_the_table_names_scan_column_values_and_tolerance(golden, make_rows):
     result = compare_golden(golden, _nudged(make_rows(30), "x_m", 0.5))
     print_table(make_console(stream), golden_table(result))
     text = stream.getvalue()
-    for word in ("scan", "column", "expected", "got", "tolerance", "x_m", "1.1e-05", "by column: x_m 30", "20 of 30"):
+    for word in (
+        "scan",
+        "column",
+        "expected",
+        "got",
+        "tolerance",
+        "x_m",
+        "1.1e-05",
+        "by column: x_m 30",
+        "20 of 30",
+    ):
         assert word in text
     assert max(len(line) for line in text.splitlines()) <= 80

@@ -55,8 +55,12 @@ def _topics(tmp_path):
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     schemas = summary.schemas.values()
-    fields = next(schema.data.decode().split() for schema in schemas if schema.name == "avsreplay/msg/Row")
-    return {channel.topic for channel in summary.channels.values()} | {f"/rows.{name}" for name in fields[1::2]}
+    fields = next(
+        schema.data.decode().split() for schema in schemas if schema.name == "avsreplay/msg/Row"
+    )
+    return {channel.topic for channel in summary.channels.values()} | {
+        f"/rows.{name}" for name in fields[1::2]
+    }
 
 
 def test_every_topic_it_names_is_written(layout, tmp_path):

@@ -20,17 +20,22 @@ from avsreplay.cli.record import report_command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
-from avsreplay.report import Summary
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import Flight, build_flight_page, build_page, render
 from avsreplay.report.result import load_result
+from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, cone_lines, scene, thin_cloud
 
 ROOT = Path(__file__).resolve().parents[1]
-TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
+TRUTH = State(
+    [0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1])
+)
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 2)], dtype=np.float32)
-FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]], np.int32)
+FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]],
+    np.int32,
+)
 
 
 def _view(rows):
@@ -40,12 +45,20 @@ def _view(rows):
         for r in rows
         if r.gamma
     ]
-    path = PathView(rows[min(12, len(rows) - 1)].t_ns, np.linspace([0, 0, 0], [1, 0, 5], 20).astype(np.float32), 0.02)
+    path = PathView(
+        rows[min(12, len(rows) - 1)].t_ns,
+        np.linspace([0, 0, 0], [1, 0, 5], 20).astype(np.float32),
+        0.02,
+    )
     return View(BOX, FACES, tuple(clouds), (path,))
 
 
 def _labels(rows):
-    return [Label("full_occlusion", rows[min(20, len(rows) - 1)].t_ns, rows[min(25, len(rows) - 1)].t_ns)]
+    return [
+        Label(
+            "full_occlusion", rows[min(20, len(rows) - 1)].t_ns, rows[min(25, len(rows) - 1)].t_ns
+        )
+    ]
 
 
 def _page(rows, **more):
@@ -56,7 +69,9 @@ def _page(rows, **more):
 
 
 def _data(page):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+    return json.loads(
+        re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1]
+    )
 
 
 def _floats(packed, kind):
@@ -67,7 +82,8 @@ def test_the_page_makes_no_network_request(make_rows):
     page = _page(make_rows(30))
     assert "default-src 'none'" in page
     outside = re.findall(
-        r"""(?:src|href)\s*=\s*["']([^"'#]+)["']|url\(|@import|fetch\(|XMLHttpRequest|WebSocket""", page
+        r"""(?:src|href)\s*=\s*["']([^"'#]+)["']|url\(|@import|fetch\(|XMLHttpRequest|WebSocket""",
+        page,
     )
     assert set(outside) <= {"data:,"}
 
@@ -120,7 +136,9 @@ def test_columns_are_packed_as_they_are(make_rows):
     run = _data(_page(rows))["runs"][0]
     np.testing.assert_array_equal(_floats(run["t"], "<f8"), [r.t_s for r in rows])
     nis = _floats(run["columns"]["nis"], "<f4")
-    np.testing.assert_array_equal(nis, np.array([np.nan if r.nis is None else r.nis for r in rows], np.float32))
+    np.testing.assert_array_equal(
+        nis, np.array([np.nan if r.nis is None else r.nis for r in rows], np.float32)
+    )
 
 
 def test_points_survive_packing_to_half_a_step(make_rows):
@@ -144,9 +162,15 @@ def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
 
 
 def test_intensities_are_levels_up_to_the_brightest_points(make_rows):
-    """A level for each point in the order of the points; grey (255) where the sensor gives no value."""
+    """A level for each point in the order of the points.
+
+    Grey (255) where the sensor gives no value.
+    """
     rows, points = make_rows(2), np.zeros((4, 3)) + np.arange(4.0)[:, None]
-    clouds = (thin_cloud(0, points, np.zeros(4), [0.0, 50.0, 100.0, np.nan]), thin_cloud(1, points, np.zeros(4)))
+    clouds = (
+        thin_cloud(0, points, np.zeros(4), [0.0, 50.0, 100.0, np.nan]),
+        thin_cloud(1, points, np.zeros(4)),
+    )
     packed = scene(rows, {}, View(BOX, FACES, clouds))["clouds"]
     assert packed["brightest"] == pytest.approx(np.quantile([0.0, 50.0, 100.0], 0.99))
     assert _floats(packed["intensity"], "u1").tolist() == [0, 128, 254, 255, 255, 255, 255, 255]
@@ -156,7 +180,11 @@ def test_intensities_are_levels_up_to_the_brightest_points(make_rows):
 
 def test_spans_are_intervals_of_equal_values(make_rows):
     found = [(s["lane"], s["word"], s["first"], s["last"]) for s in spans(make_rows(40))]
-    expected = [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25), ("action", "approach", 0, 39)]
+    expected = [
+        ("flagged", "no_scan", 20, 25),
+        ("injected", "full_occlusion", 20, 25),
+        ("action", "approach", 0, 39),
+    ]
     assert found == expected
 
 
@@ -183,8 +211,14 @@ def test_without_truth_the_charts_of_errors_are_charts_of_the_uncertainty(make_r
         "pos_1s_m": 0.01,
         "rot_1s_deg": 0.1,
     }
-    titles = [[c["title"] for c in charts(derived(rows))[:2]] for rows in (make_rows(10), make_rows(10, **known))]
-    assert titles == [["Position error", "Attitude error"], ["Position uncertainty", "Attitude uncertainty"]]
+    titles = [
+        [c["title"] for c in charts(derived(rows))[:2]]
+        for rows in (make_rows(10), make_rows(10, **known))
+    ]
+    assert titles == [
+        ["Position error", "Attitude error"],
+        ["Position uncertainty", "Attitude uncertainty"],
+    ]
 
 
 def test_bands_are_the_value_and_its_sigma(make_rows):
@@ -220,11 +254,18 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     again = CliRunner().invoke(report_command, [str(tmp_path)])
     assert isinstance(again.exception, AvsError)
     assert "already exists" in str(again.exception)
-    assert CliRunner().invoke(report_command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
+    assert (
+        CliRunner().invoke(report_command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code
+        == 0
+    )
     (tmp_path / "none.jsonl").write_text("")
-    empty = CliRunner().invoke(report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
+    empty = CliRunner().invoke(
+        report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")]
+    )
     assert "holds no row" in str(empty.exception)
-    missing = CliRunner().invoke(report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
+    missing = CliRunner().invoke(
+        report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")]
+    )
     assert isinstance(missing.exception, AvsError)
     assert not (tmp_path / "x.html").exists()
 
@@ -256,7 +297,10 @@ def test_values_are_in_millimetres_where_the_tables_say_so(make_rows):
 
 def test_one_large_value_does_not_hide_the_others(make_rows):
     """It decides neither the unit nor, on a linear axis, the height of all others."""
-    rows = [dataclasses.replace(r, rms_m=4.0, reg_pos_err_m=9.0) if r.seq == 30 else r for r in make_rows(40)]
+    rows = [
+        dataclasses.replace(r, rms_m=4.0, reg_pos_err_m=9.0) if r.seq == 30 else r
+        for r in make_rows(40)
+    ]
     found = {c["key"]: c for c in charts(derived(rows))}
     assert (found["fit"]["unit"], found["fit"]["log"]) == ("mm", True)
     assert found["position"]["unit"] == "mm"
@@ -269,13 +313,28 @@ def test_a_kind_has_the_same_colour_and_pattern_on_every_page(make_rows):
 
     one = styles(make_rows(40))
     two = styles(
-        [dataclasses.replace(r, gamma=0, reason="fit_error", fault=None) if r.seq < 5 else r for r in make_rows(40)]
+        [
+            dataclasses.replace(r, gamma=0, reason="fit_error", fault=None) if r.seq < 5 else r
+            for r in make_rows(40)
+        ]
     )
     shared = one.keys() & two.keys()
     assert ("injected", "full_occlusion") in shared
     assert all(one[kind] == two[kind] for kind in shared)
-    words = ["not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged", "doubtful", "clock"]
-    rows = [dataclasses.replace(r, gamma=0, reason=word) for r, word in zip(make_rows(8), words, strict=True)]
+    words = [
+        "not_aligned",
+        "fit_error",
+        "no_scan",
+        "pose_jump",
+        "few_inliers",
+        "not_converged",
+        "doubtful",
+        "clock",
+    ]
+    rows = [
+        dataclasses.replace(r, gamma=0, reason=word)
+        for r, word in zip(make_rows(8), words, strict=True)
+    ]
     flagged = [style for (lane, _), style in styles(rows).items() if lane == "flagged"]
     assert len(set(flagged)) == len(words)
 
@@ -285,22 +344,42 @@ def test_a_kind_has_the_same_colour_and_pattern_on_every_page(make_rows):
     [
         ({"pos_err_m": None, "rot_err_deg": None}, "no truth to compare with"),
         ({"gamma": 0, "reason": "not_aligned", "converged": False}, "rms in coasting scans"),
-        ({"gamma": 0, "reason": "not_aligned", "converged": False}, "none of the 40 scans was used"),
+        (
+            {"gamma": 0, "reason": "not_aligned", "converged": False},
+            "none of the 40 scans was used",
+        ),
     ],
 )
 def test_statements_are_right_in_every_state(make_rows, changes, says):
     assert says in _page(make_rows(40, **changes))
 
 
-# Machado, Oliveira, Fernandes 2009, severity 1: what linear RGB becomes to an eye that lacks one kind of cone.
+# Machado, Oliveira, Fernandes 2009, severity 1: what linear RGB becomes to an eye that lacks one
+# kind of cone.
 EYES = {
     "all cones": np.eye(3),
-    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
-    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritanopia": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
 }
 TO_XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.119192, 0.9503041]]
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.119192, 0.9503041],
+    ]
 )
 
 
@@ -317,9 +396,14 @@ def _lab(linear):
 
 @pytest.mark.parametrize("eye", EYES)
 def test_line_colours_differ_to_every_eye(eye):
-    """Five times a just noticeable difference of about 2 in CIELAB, in both themes, and where a page has no script."""
+    """Five times a just noticeable difference of about 2 in CIELAB, in both themes, and where a
+    page has no script.
+    """
     style = render("page.css")
-    themes = [re.findall(r"--c\d: (#\w{6})", block) for block in re.findall(r":root[^{]*\{(.*?)\}", style, re.S)]
+    themes = [
+        re.findall(r"--c\d: (#\w{6})", block)
+        for block in re.findall(r":root[^{]*\{(.*?)\}", style, re.S)
+    ]
     assert [len(theme) for theme in themes] == [6, 6, 6]
     for theme in themes:
         seen = [_lab(np.array(EYES[eye]) @ _linear(colour)) for colour in theme]
@@ -332,7 +416,9 @@ def test_line_colours_differ_to_every_eye(eye):
 @pytest.fixture(scope="module")
 def browser():
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    program = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    program = next(
+        (p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None
+    )
     driver = shutil.which("chromedriver")
     if not program or not driver:
         pytest.skip("no Chromium with its driver here")
@@ -370,7 +456,9 @@ def opened(browser, tmp_path, make_rows):
 
 
 def _text(browser, selector):
-    return browser.execute_script("return document.querySelector(arguments[0]).textContent", selector)
+    return browser.execute_script(
+        "return document.querySelector(arguments[0]).textContent", selector
+    )
 
 
 def _settled(browser):
@@ -380,7 +468,10 @@ def _settled(browser):
 
 
 def _slide(browser, k):
-    script = "const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new Event('input'))"
+    script = (
+        "const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new"
+        " Event('input'))"
+    )
     browser.execute_script(script, k)
     _settled(browser)
 
@@ -396,7 +487,9 @@ def _pin(browser, chart="position"):
 def test_it_loads_without_a_console_message(opened, width, dark):
     browser = opened(width=width, dark=dark)
     assert browser.get_log("browser") == []
-    assert browser.execute_script("return document.documentElement.dataset.theme") == ("dark" if dark else "light")
+    assert browser.execute_script("return document.documentElement.dataset.theme") == (
+        "dark" if dark else "light"
+    )
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width
     assert len(browser.find_elements("css selector", ".chart canvas")) >= 12
 
@@ -414,7 +507,9 @@ def test_the_page_of_a_flight_moves_the_gripper_with_the_slider(browser, tmp_pat
     axis = np.array([1.0, 0.0, 0.0])
     flight = Flight(t, y, figures, axis, [(30.0, 2.0), (15.0, 0.5)], 0.01, surface)
     path = tmp_path / "flight.html"
-    path.write_text(build_flight_page("flight", ["found"], flight, [("status", "found")]), encoding="utf-8")
+    path.write_text(
+        build_flight_page("flight", ["found"], flight, [("status", "found")]), encoding="utf-8"
+    )
     browser.get(path.as_uri())
     _slide(browser, 10)
     assert browser.get_log("browser") == []
@@ -423,12 +518,16 @@ def test_the_page_of_a_flight_moves_the_gripper_with_the_slider(browser, tmp_pat
     pictures = []
     for k in (10, 30):
         _slide(browser, k)
-        assert browser.execute_script("return document.querySelector('#scene canvas').dataset.painted") == str(k)
+        assert browser.execute_script(
+            "return document.querySelector('#scene canvas').dataset.painted"
+        ) == str(k)
         pictures.append(browser.find_element("css selector", "#scene canvas").screenshot_as_base64)
     assert pictures[0] != pictures[1]
 
 
-@pytest.mark.parametrize(("degrees", "length", "mouth"), [(35.0, 2.0, 0.01), (15.0, 0.48, 0.05), (80.0, 1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("degrees", "length", "mouth"), [(35.0, 2.0, 0.01), (15.0, 0.48, 0.05), (80.0, 1.0, 0.0)]
+)
 def test_the_lines_of_a_cone_lie_on_it_and_end_at_its_range(degrees, length, mouth):
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     points = cone_lines(axis, degrees, length, mouth)
@@ -453,7 +552,10 @@ def test_the_slider_moves_the_markers_the_text_and_the_3d_view(opened):
     _slide(browser, 10)
     left, words = _pin(browser), _text(browser, "#now")
     assert words == "scan 10 · 2.00 s · ● used"
-    assert browser.execute_script("return document.querySelector('#scene canvas').dataset.painted") == "10"
+    assert (
+        browser.execute_script("return document.querySelector('#scene canvas').dataset.painted")
+        == "10"
+    )
     _slide(browser, 22)
     assert _pin(browser) > left
     assert _pin(browser, "sigma") == pytest.approx(_pin(browser, "nees"), abs=1)
@@ -474,7 +576,9 @@ def test_hover_reads_every_chart_and_ends(opened, make_rows):
     hovered = _text(browser, "#now")
     k = int(re.match(r"scan (\d+)", hovered)[1])
     assert abs(k - 30) <= 2
-    assert float(_text(browser, "#chart-position output")) == pytest.approx(1000 * rows[k].pos_err_m, rel=1e-3)
+    assert float(_text(browser, "#chart-position output")) == pytest.approx(
+        1000 * rows[k].pos_err_m, rel=1e-3
+    )
     assert float(_text(browser, "#chart-nees output")) == pytest.approx(rows[k].nees, rel=1e-3)
     ActionChains(browser).move_to_element(browser.find_element("id", "verdict")).perform()
     _settled(browser)
@@ -532,7 +636,8 @@ def test_the_page_works_with_the_keyboard_alone(opened):
     slider.send_keys(Keys.ARROW_RIGHT)
     assert browser.execute_script(value) == "1"
     tabbed = (
-        "return [...document.querySelectorAll('button, input, figure, canvas[role], a')].every((e) => e.tabIndex >= 0)"
+        "return [...document.querySelectorAll('button, input, figure, canvas[role], a')].every((e)"
+        " => e.tabIndex >= 0)"
     )
     assert browser.execute_script(tabbed)
     scene_canvas = browser.find_element("css selector", "#scene canvas")
@@ -546,7 +651,9 @@ def test_the_page_works_with_the_keyboard_alone(opened):
 def test_points_are_coloured_by_residual_or_by_intensity(browser, make_rows, tmp_path):
     rows = make_rows(3)
     points = _view(rows).clouds[0].points
-    cloud = thin_cloud(0, points, np.linspace(0, 0.01, len(points)), np.linspace(200, 0, len(points)))
+    cloud = thin_cloud(
+        0, points, np.linspace(0, 0.01, len(points)), np.linspace(200, 0, len(points))
+    )
     path = tmp_path / "bright.html"
     path.write_text(_page(rows, view=View(BOX, FACES, (cloud,))), encoding="utf-8")
     browser.get(path.as_uri())
@@ -554,7 +661,9 @@ def test_points_are_coloured_by_residual_or_by_intensity(browser, make_rows, tmp
     canvas = browser.find_element("css selector", "#scene canvas")
     by_residual = canvas.screenshot_as_png
     assert "residual 0" in _text(browser, "#scene")
-    (button,) = [b for b in browser.find_elements("css selector", "#scene button") if "intensity" in b.text]
+    (button,) = [
+        b for b in browser.find_elements("css selector", "#scene button") if "intensity" in b.text
+    ]
     browser.execute_script("arguments[0].click()", button)
     _settled(browser)
     assert "intensity 0" in _text(browser, "#scene")
@@ -635,10 +744,16 @@ def _contrast(one, two):
 @pytest.mark.parametrize("n", [1, 2])
 def test_a_run_of_one_scan_loads(opened, make_rows, n):
     rows = make_rows(n, pos_err_m=None, rot_err_deg=None)
-    browser = opened(rows=rows, truth=None, poses=(), view=None) if n == 1 else opened(rows=rows, view=None)
+    browser = (
+        opened(rows=rows, truth=None, poses=(), view=None)
+        if n == 1
+        else opened(rows=rows, view=None)
+    )
     assert browser.get_log("browser") == []
     assert _text(browser, "#now").startswith("scan 0 ")
-    low, high = browser.execute_script("const x = uPlot.sync('time').plots[0].scales.x; return [x.min, x.max];")
+    low, high = browser.execute_script(
+        "const x = uPlot.sync('time').plots[0].scales.x; return [x.min, x.max];"
+    )
     assert high - low <= 1.0
 
 
@@ -654,7 +769,9 @@ def test_a_comparison_overlays_and_reads_runs_of_different_rates(browser, tmp_pa
     path.write_text(build_comparison(results, []), encoding="utf-8")
     browser.get(path.as_uri())
     assert browser.get_log("browser") == []
-    outputs = "return [...document.querySelectorAll('#chart-sigma1 output')].map((o) => o.textContent)"
+    outputs = (
+        "return [...document.querySelectorAll('#chart-sigma1 output')].map((o) => o.textContent)"
+    )
     _slide(browser, 4)
     one, two = browser.execute_script(outputs)
     assert one == two != "\u2013"
@@ -713,7 +830,9 @@ def test_a_bar_has_a_tooltip_and_hovering_moves_the_3d_view(opened):
     return over.title;"""
     assert browser.execute_script(script).startswith("flagged: no scan, 4.00 s to 5.00 s")
     _settled(browser)
-    assert "no points of this scan" in _text(browser, "#scene")  # the scan under the pointer is in the blackout
+    assert "no points of this scan" in _text(
+        browser, "#scene"
+    )  # the scan under the pointer is in the blackout
     assert not _text(browser, "#now").startswith("scan 0 ")
 
 
@@ -723,12 +842,20 @@ def test_the_tables_and_figures_of_a_campaign_can_be_read_at_every_width(browser
     from avsreplay.sweep.statistics import quantiles, rate
     from avsreplay.sweep.summary import HEADLINES, Cell, SweepSummary, WorstRun
 
-    rates = {name: rate(3, 9) for name in ("converged", "capture planned", "no fault missed", "no false alarm")}
+    rates = {
+        name: rate(3, 9)
+        for name in ("converged", "capture planned", "no fault missed", "no false alarm")
+    }
     metrics = {name: quantiles([0.1 * k for k in range(9)]) for name in HEADLINES}
     cells = tuple(
-        Cell({"scenario.scanner.noise_m": noise}, 9, {"ok": 9}, metrics, rates, None) for noise in (0.004, 0.008)
+        Cell({"scenario.scanner.noise_m": noise}, 9, {"ok": 9}, metrics, rates, None)
+        for noise in (0.004, 0.008)
     )
-    worst = (WorstRun("a" * 24, 1, 0, 3325833263181678374, "ok", "position error 0.01085 m (healthy scan)"),)
+    worst = (
+        WorstRun(
+            "a" * 24, 1, 0, 3325833263181678374, "ok", "position error 0.01085 m (healthy scan)"
+        ),
+    )
     summary = SweepSummary("noise", 18, 18, {"ok": 18}, cells, None, worst=worst)
     (tmp_path / "page.html").write_text(build_sweep_page(summary), encoding="utf-8")
     for width in (1400, 390):

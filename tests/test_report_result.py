@@ -13,13 +13,21 @@ import pytest
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
-from avsreplay.report import Summary
 from avsreplay.report.export import write_tum
 from avsreplay.report.jsonl import read_rows, write_rows
 from avsreplay.report.result import facts_record, load_result, motion_samples
+from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
 
-TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
+TRUTH = State(
+    [0, 0, 0, 1],
+    [0.1, 0, 0],
+    [0, 0, 5],
+    [0, 0, 0],
+    [0.25, -0.4],
+    [0.5, 0.6, -0.4],
+    exp([0, 0, 0.1]),
+)
 DISC = State(
     [0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [-1.0, 0.0], [0.5, 0.6, -0.4], exp([0, 0, 0.1])
 )  # no such body
@@ -51,7 +59,10 @@ def _view():
         thin_cloud(1, np.zeros((0, 3))),
         thin_cloud(2, np.ones((5, 3))),
     ]
-    paths = [PathView(5, np.zeros((4, 3), np.float32)), PathView(9, np.ones((2, 3), np.float32), 0.25)]
+    paths = [
+        PathView(5, np.zeros((4, 3), np.float32)),
+        PathView(9, np.ones((2, 3), np.float32), 0.25),
+    ]
     return View(vertices, faces, tuple(clouds), tuple(paths))
 
 
@@ -73,7 +84,8 @@ def test_the_summary_is_read_back_unchanged(folder):
 def test_the_garbage_collector_rests_while_rows_are_read(folder, monkeypatch):
     states = []
     monkeypatch.setattr(
-        "avsreplay.report.result.read_rows", lambda path: states.append(gc.isenabled()) or read_rows(path)
+        "avsreplay.report.result.read_rows",
+        lambda path: states.append(gc.isenabled()) or read_rows(path),
     )
     load_result(folder[0])
     (folder[0] / "rows.jsonl").write_text("{}\n")
@@ -157,7 +169,11 @@ def test_no_rows_is_one_line(tmp_path):
         ("run.json", "[]", "not a JSON object"),
         ("run.json", '{"facts": {"labels": [{"no": 1}]}}', "not as written"),
         ("run.json", '{"facts": {"truth": {"q_ab": 1}}}', "not as written"),
-        ("run.json", json.dumps({"facts": facts_record(labels=None, truth=DISC, counts={})}), "not as written"),
+        (
+            "run.json",
+            json.dumps({"facts": facts_record(labels=None, truth=DISC, counts={})}),
+            "not as written",
+        ),
         ("run.json", '{"facts": []}', None),
         ("run.json", '{"facts": [1]}', "not as written"),
         ("truth.tum", "1 2 3", r"truth\.tum:1: not 'stamp"),
@@ -192,6 +208,8 @@ def test_a_view_with_a_part_missing_or_wrong(folder, missing):
 def test_samples_of_a_motion_ascend():
     """A log may contain a scan twice, and times that go back."""
     poses = [Pose.identity() for _ in range(4)]
-    times, kept = motion_samples(list(zip([5_000_000_000, 1_000_000_000, 5_000_000_000, 2**62], poses, strict=True)), 0)
+    times, kept = motion_samples(
+        list(zip([5_000_000_000, 1_000_000_000, 5_000_000_000, 2**62], poses, strict=True)), 0
+    )
     assert times.tolist() == [1.0, 5.0, 2**62 * 1e-9]
     assert [id(p) for p in kept] == [id(poses[k]) for k in (1, 0, 3)]

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from avsreplay.estimate.chart import AXIS_PERMUTATIONS, permute_axes
 from avsreplay.geometry import exp, matrix
 from avsreplay.records import Label, State
-from avsreplay.report import NEES_BAND, NIS_BAND, Summary, SummaryFold
+from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary, SummaryFold
 from avsreplay.report.summary_parts import Statistics, events
 from avsreplay.report.summary_tables import fact_lines, in_one_line, manoeuvre_table
 
@@ -29,8 +29,14 @@ def test_statistics_agree_with_numpy_in_any_order(values, rng):
     array = np.array(values)
     assert spread.count == len(values)
     assert spread.rmse == pytest.approx(math.sqrt(np.mean(array**2)), rel=1e-12, abs=1e-9)
-    assert (spread.mean, spread.std) == pytest.approx((array.mean(), array.std()), rel=1e-9, abs=1e-6)
-    assert (spread.median, spread.min, spread.max) == (pytest.approx(np.median(array)), array.min(), array.max())
+    assert (spread.mean, spread.std) == pytest.approx(
+        (array.mean(), array.std()), rel=1e-9, abs=1e-6
+    )
+    assert (spread.median, spread.min, spread.max) == (
+        pytest.approx(np.median(array)),
+        array.min(),
+        array.max(),
+    )
     shuffled = list(values)
     rng.shuffle(shuffled)
     assert Statistics.of(shuffled) == spread
@@ -51,7 +57,9 @@ def test_errors_are_split_by_gamma(make_rows):
     for state, gamma in ((summary.pose_healthy, 1), (summary.pose_coasting, 0)):
         expected = [r.pos_err_m for r in rows if r.gamma == gamma]
         assert state.position_m == Statistics.of(expected)
-        assert state.rotation_deg == Statistics.of([r.rot_err_deg for r in rows if r.gamma == gamma])
+        assert state.rotation_deg == Statistics.of(
+            [r.rot_err_deg for r in rows if r.gamma == gamma]
+        )
     assert summary.registration_flagged.position_m is None
     assert summary.registration_healthy.position_m.count == 34
 
@@ -72,11 +80,19 @@ def test_row_by_row_is_the_same_as_all_at_once(make_rows):
 
 def test_no_rows_make_a_summary():
     summary = Summary.fold([])
-    assert (summary.scans, summary.duration_s, summary.convergence.t1_s, summary.longest_coast) == (0, 0.0, None, None)
+    assert (summary.scans, summary.duration_s, summary.convergence.t1_s, summary.longest_coast) == (
+        0,
+        0.0,
+        None,
+        None,
+    )
 
 
 def _flag(rows, where, reason="fit_error", fault=None):
-    return [dataclasses.replace(r, gamma=0, reason=reason, fault=fault) if r.seq in where else r for r in rows]
+    return [
+        dataclasses.replace(r, gamma=0, reason=reason, fault=fault) if r.seq in where else r
+        for r in rows
+    ]
 
 
 @pytest.fixture
@@ -90,7 +106,10 @@ def _label(rows, kind, first, last, harmful=True):
 
 def test_a_flagged_label_is_detected_and_recovery_counts_late_scans(clean):
     rows = [dataclasses.replace(r, fault="clutter") if 10 <= r.seq <= 14 else r for r in clean]
-    rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if 11 <= r.seq <= 16 else r for r in rows]
+    rows = [
+        dataclasses.replace(r, gamma=0, reason="fit_error") if 11 <= r.seq <= 16 else r
+        for r in rows
+    ]
     faults = Summary.fold(rows, labels=[_label(rows, "clutter", 10, 14)]).faults
     (episode,) = faults.episodes
     assert (faults.injected, faults.detected, faults.missed) == (1, 1, 0)
@@ -103,8 +122,14 @@ def test_a_flagged_label_is_detected_and_recovery_counts_late_scans(clean):
 
 
 def test_an_unflagged_harmful_label_is_missed_and_a_harmless_one_is_not(clean):
-    rows = [dataclasses.replace(r, fault={5: "range_bias", 9: "partial_occlusion"}.get(r.seq)) for r in clean]
-    labels = [_label(rows, "range_bias", 5, 5), _label(rows, "partial_occlusion", 9, 9, harmful=False)]
+    rows = [
+        dataclasses.replace(r, fault={5: "range_bias", 9: "partial_occlusion"}.get(r.seq))
+        for r in clean
+    ]
+    labels = [
+        _label(rows, "range_bias", 5, 5),
+        _label(rows, "partial_occlusion", 9, 9, harmful=False),
+    ]
     faults = Summary.fold(rows, labels=labels).faults
     assert (faults.injected, faults.missed, faults.missed_scans) == (1, 1, 1)
     assert [e.recover_s for e in faults.episodes] == [None, None]
@@ -134,7 +159,10 @@ def test_two_windows_of_one_kind_keep_their_own_scans(clean):
 
 def test_a_stamp_outside_its_window_is_matched_to_its_label(clean):
     label = _label(clean, "stamp_jump", 12, 12)
-    rows = [dataclasses.replace(r, t_ns=r.t_ns + 90_000_000, fault="stamp_jump") if r.seq == 12 else r for r in clean]
+    rows = [
+        dataclasses.replace(r, t_ns=r.t_ns + 90_000_000, fault="stamp_jump") if r.seq == 12 else r
+        for r in clean
+    ]
     assert Summary.fold(rows, labels=[label]).faults.episodes[0].scans == 1
 
 
@@ -142,7 +170,11 @@ def test_rows_alone_give_labels_where_the_log_gave_none(clean):
     rows = _flag(_flag(clean, {5, 6}, fault="clutter"), {7, 20}, fault="frozen")
     faults = Summary.fold(rows).faults
     assert faults.known
-    assert [(e.kind, e.scans) for e in faults.episodes] == [("clutter", 2), ("frozen", 1), ("frozen", 1)]
+    assert [(e.kind, e.scans) for e in faults.episodes] == [
+        ("clutter", 2),
+        ("frozen", 1),
+        ("frozen", 1),
+    ]
 
 
 def test_without_labels_a_flag_is_not_called_false(clean):
@@ -169,7 +201,9 @@ def test_delay_is_counted_from_the_labels_first_scan(clean):
 
 
 def test_a_fault_seen_only_in_what_follows_it_needs_recovery(clean):
-    rows = _flag([dataclasses.replace(r, fault="frozen") if r.seq == 10 else r for r in clean], {11, 12})
+    rows = _flag(
+        [dataclasses.replace(r, fault="frozen") if r.seq == 10 else r for r in clean], {11, 12}
+    )
     (episode,) = Summary.fold(rows, labels=[_label(rows, "frozen", 10, 10)]).faults.episodes
     assert (episode.detected, episode.recover_scans, episode.lost) == (False, 2, False)
     assert episode.recover_s == pytest.approx(0.4)
@@ -185,9 +219,14 @@ def test_a_fault_that_lasts_to_the_end_is_not_called_lost(clean):
 
 
 def test_the_errors_of_a_fault_are_apart_by_what_was_done_with_the_scan(clean):
-    rows = [dataclasses.replace(r, pos_err_m=0.001 * r.seq, rot_err_deg=40.0 - r.seq) for r in clean]
+    rows = [
+        dataclasses.replace(r, pos_err_m=0.001 * r.seq, rot_err_deg=40.0 - r.seq) for r in clean
+    ]
     rows = [dataclasses.replace(r, fault="clutter") if 10 <= r.seq <= 14 else r for r in rows]
-    rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq in (11, 12, 16, 17) else r for r in rows]
+    rows = [
+        dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq in (11, 12, 16, 17) else r
+        for r in rows
+    ]
     gone = _label(rows, "dropped", 20, 21)
     rows = [r for r in rows if r.seq not in (20, 21)]
     faults = Summary.fold(rows, labels=[_label(clean, "clutter", 10, 14), gone]).faults
@@ -236,22 +275,47 @@ def test_parameters_are_compared_with_the_truth(make_rows):
 
 
 def test_values_in_the_fixture_frame_are_the_same_for_every_order_of_the_principal_axes(make_rows):
-    """24 descriptions of one body: the paper's parameters differ and say so, the others have the same true values."""
-    in_c = {"rate_cx_radps": 0.1, "rate_cy_radps": 0.0, "rate_cz_radps": 0.02, "rate_c_1s_radps": 0.003,
-            "ixx": 0.3, "iyy": 0.3, "izz": 0.4, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0,
-            "moment_small": 0.3, "moment_middle": 0.3, "moment_large": 0.4,
-            "com_x_m": 0.1, "com_y_m": 0.2, "com_z_m": 0.3}  # fmt: skip
+    """24 descriptions of one body.
+
+    The paper's parameters differ and say so, the others have the same true values.
+    """
+    in_c = {
+        "rate_cx_radps": 0.1,
+        "rate_cy_radps": 0.0,
+        "rate_cz_radps": 0.02,
+        "rate_c_1s_radps": 0.003,
+        "ixx": 0.3,
+        "iyy": 0.3,
+        "izz": 0.4,
+        "ixy": 0.0,
+        "ixz": 0.0,
+        "iyz": 0.0,
+        "moment_small": 0.3,
+        "moment_middle": 0.3,
+        "moment_large": 0.4,
+        "com_x_m": 0.1,
+        "com_y_m": 0.2,
+        "com_z_m": 0.3,
+    }
     rows = make_rows(2, **in_c)
     truths = [permute_axes(_truth(w_b=[0.1, -0.2, 0.3]), each) for each in AXIS_PERMUTATIONS]
     found = [{p.name: p for p in Summary.fold(rows, truth=truth).parameters} for truth in truths]
-    free = {name for name, p in found[0].items() if p.note == "does not depend on the order of the principal axes"}
+    free = {
+        name
+        for name, p in found[0].items()
+        if p.note == "does not depend on the order of the principal axes"
+    }
     assert len(free) == 4
     assert set(found[0]) - free == {"sigma1", "sigma2", "c (varrho)", "mu"}
     assert "arbitrary" in found[0]["sigma1"].note
     for name in free:
-        np.testing.assert_allclose([p[name].truth for p in found], [found[0][name].truth] * len(found), atol=1e-12)
+        np.testing.assert_allclose(
+            [p[name].truth for p in found], [found[0][name].truth] * len(found), atol=1e-12
+        )
     assert len({tuple(np.round(p["c (varrho)"].truth, 9)) for p in found}) == len(found)
-    assert found[0]["rate in {C}"].truth == pytest.approx(matrix(exp([0, 0, 0.1])).T @ [0.1, -0.2, 0.3])
+    assert found[0]["rate in {C}"].truth == pytest.approx(
+        matrix(exp([0, 0, 0.1])).T @ [0.1, -0.2, 0.3]
+    )
     assert found[0]["rate in {C}"].one_sigma == 0.003
 
 
@@ -289,18 +353,28 @@ def test_a_replan_is_a_plan_that_differs(make_rows):
 def test_a_planner_without_a_plan_has_a_status_and_no_time(make_rows):
     rows = make_rows(20, plan_status="infeasible_within_horizon", capture_time_s=None)
     capture = Summary.fold(rows).capture
-    assert (capture.replans, capture.last_s, capture.status) == (0, None, "infeasible_within_horizon")
+    assert (capture.replans, capture.last_s, capture.status) == (
+        0,
+        None,
+        "infeasible_within_horizon",
+    )
 
 
 def test_hindsight_gripper_and_actions_are_reported(make_rows):
     rows = make_rows(6, blackout=range(0))
     rows[1] = dataclasses.replace(rows[1], plan_miss_m=0.02)
     rows[3] = dataclasses.replace(rows[3], plan_miss_m=0.01, action="capture")
-    rows[4] = dataclasses.replace(rows[4], capture_miss_m=0.002, capture_miss_mps=0.001, capture_miss_deg=0.3)
+    rows[4] = dataclasses.replace(
+        rows[4], capture_miss_m=0.002, capture_miss_mps=0.001, capture_miss_deg=0.3
+    )
     summary = Summary.fold(rows)
     capture = summary.capture
     assert (capture.plan_miss_m.count, capture.plan_miss_m.max) == (2, 0.02)
-    assert (capture.miss.position_m, capture.miss.speed_mps, capture.miss.rotation_deg) == (0.002, 0.001, 0.3)
+    assert (capture.miss.position_m, capture.miss.speed_mps, capture.miss.rotation_deg) == (
+        0.002,
+        0.001,
+        0.3,
+    )
     assert capture.actions == {"approach": 5, "capture": 1}
     facts = dict(fact_lines(summary))
     assert facts["gripper"] == "closed 2 mm, 1 mm/s, 0.3 deg from the true grasp point"
@@ -349,7 +423,10 @@ def test_moments_follow_from_the_inertia_ratios() -> None:
 
 
 def test_each_manoeuvre_is_listed_as_last_reported(make_rows):
-    """The first is corrected by a later row and withdrawn by none; the second is reported five scans later."""
+    """The first is corrected by a later row and withdrawn by none.
+
+    The second is reported five scans later.
+    """
     rows = make_rows(20)
     first = {
         "manoeuvres": 1,
@@ -360,17 +437,24 @@ def test_each_manoeuvre_is_listed_as_last_reported(make_rows):
     }
     rows[5:] = [dataclasses.replace(r, **first) for r in rows[5:]]
     rows[6:] = [dataclasses.replace(r, manoeuvre_s=0.9, manoeuvre_mps=0.01) for r in rows[6:]]
-    rows[11:] = [dataclasses.replace(r, manoeuvres=2, manoeuvre_s=2.1, manoeuvre_mps=0.03) for r in rows[11:]]
+    rows[11:] = [
+        dataclasses.replace(r, manoeuvres=2, manoeuvre_s=2.1, manoeuvre_mps=0.03) for r in rows[11:]
+    ]
     found = Summary.fold(rows).velocity_changes
     assert [(m.t_s, m.velocity_mps, m.reported_s) for m in found] == [
         (0.9, 0.01, rows[5].t_s),
         (2.1, 0.03, rows[11].t_s),
     ]
-    lines = [[str(getattr(cell, "text", cell)) for cell in line] for line in manoeuvre_table(Summary.fold(rows)).rows]
+    lines = [
+        [str(getattr(cell, "text", cell)) for cell in line]
+        for line in manoeuvre_table(Summary.fold(rows)).rows
+    ]
     assert [line[0] for line in lines] == ["0.90", "2.10"]
     assert [line[2] for line in lines] == ["10", "30"]
     (text,) = events(rows, found, None)
-    assert text == "the target's velocity changed 2 times, most significantly at 2.1 s by 30 +- 1 mm/s"
+    assert (
+        text == "the target's velocity changed 2 times, most significantly at 2.1 s by 30 +- 1 mm/s"
+    )
 
 
 def test_a_manoeuvre_that_is_withdrawn_is_not_listed(make_rows):
@@ -394,9 +478,15 @@ def test_without_a_scan_free_of_faults_no_rate_of_false_alarms_is_stated(clean):
 
 
 def test_manoeuvres_are_those_that_the_last_rows_describe(clean):
-    """A row counts the manoeuvres and describes the last one; a later count of fewer withdraws the others."""
+    """A row counts the manoeuvres and describes the last one.
+
+    A later count of fewer withdraws the others.
+    """
     described = [(0, None), (1, 1.0), (1, 1.1), (2, 4.0), (2, None), (2, 4.2), (1, 1.2)]
-    rows = [dataclasses.replace(r, manoeuvres=n, manoeuvre_s=t) for r, (n, t) in zip(clean, described, strict=False)]
+    rows = [
+        dataclasses.replace(r, manoeuvres=n, manoeuvre_s=t)
+        for r, (n, t) in zip(clean, described, strict=False)
+    ]
     two, one = (Summary.fold(rows[:n]).velocity_changes for n in (6, 7))
     assert [(c.reported_s, c.t_s) for c in two] == [(rows[1].t_s, 1.1), (rows[3].t_s, 4.2)]
     assert [(c.reported_s, c.t_s) for c in one] == [(rows[1].t_s, 1.2)]

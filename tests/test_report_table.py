@@ -13,9 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay.records import Label
-from avsreplay.report import Summary
+from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import print_tables
-from avsreplay.report.table import Table, choose_rows, decimals, head, make_console, print_table, state_cell
+from avsreplay.report.table import (
+    Table,
+    choose_rows,
+    decimals,
+    head,
+    make_console,
+    print_table,
+    state_cell,
+)
 from avsreplay.rows import columns
 
 
@@ -41,10 +49,24 @@ def test_no_cell_is_cut_at_80(make_rows):
 
 
 def test_every_parameter_is_named_at_80(make_rows):
-    known = {"ixx": 0.4, "iyy": 0.3, "izz": 0.3, "ixy": 0.0051, "ixz": -0.0123, "iyz": -0.0451, "inertia_1s": 0.01}
+    known = {
+        "ixx": 0.4,
+        "iyy": 0.3,
+        "izz": 0.3,
+        "ixy": 0.0051,
+        "ixz": -0.0123,
+        "iyz": -0.0451,
+        "inertia_1s": 0.01,
+    }
     text = _printed(make_rows(5, **known))
-    for name, value in zip(("xx", "yy", "zz", "xy", "xz", "yz"), list(known.values())[:6], strict=True):
-        line = next(line for line in text.splitlines() if line.startswith(f"inertia / trace in {{C}} {name}"))
+    for name, value in zip(
+        ("xx", "yy", "zz", "xy", "xz", "yz"), list(known.values())[:6], strict=True
+    ):
+        line = next(
+            line
+            for line in text.splitlines()
+            if line.startswith(f"inertia / trace in {{C}} {name}")
+        )
         assert f"{value:.4f}" in line
 
 
@@ -68,7 +90,10 @@ def test_units_are_in_the_headings(make_rows):
 def test_lengths_are_in_metres_from_1_m_on_and_in_millimetres_below(make_rows):
     for error, cell, unit in ((0.0123, "12.3", "[mm]"), (1.25, "1.2500", "[m]")):
         text = _printed(make_rows(3, pos_err_m=error, rms_m=0.5), width=200).split("Errors")[0]
-        heads, rows = text.split("scan ")[0] + text.split("scan ")[1].split("\n")[0], text.split("\n")
+        heads, rows = (
+            text.split("scan ")[0] + text.split("scan ")[1].split("\n")[0],
+            text.split("\n"),
+        )
         assert unit in heads
         assert any(f" {cell} " in row for row in rows), text
 
@@ -122,7 +147,10 @@ def test_small_targets_get_their_figures():
 
 
 def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
-    rows = [dataclasses.replace(r, fault={30: "range_bias", 35: "clutter"}.get(r.seq, r.fault)) for r in make_rows(40)]
+    rows = [
+        dataclasses.replace(r, fault={30: "range_bias", 35: "clutter"}.get(r.seq, r.fault))
+        for r in make_rows(40)
+    ]
     labels = [
         Label("full_occlusion", rows[20].t_ns, rows[25].t_ns),
         Label("range_bias", rows[30].t_ns, rows[30].t_ns),
@@ -140,7 +168,9 @@ def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
 
 def test_the_fault_table_shows_the_detection_time_and_a_track_that_is_not_recovered(make_rows):
     rows = [dataclasses.replace(r, gamma=1, reason="ok", fault=None) for r in make_rows(40)]
-    rows = [dataclasses.replace(r, fault="partial_occlusion") if 10 <= r.seq < 30 else r for r in rows]
+    rows = [
+        dataclasses.replace(r, fault="partial_occlusion") if 10 <= r.seq < 30 else r for r in rows
+    ]
     rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq >= 12 else r for r in rows]
     window = (rows[10].t_ns, rows[29].t_ns)
     labels = [Label("partial_occlusion", *window), Label("dropped", rows[35].t_ns, rows[36].t_ns)]
@@ -164,17 +194,28 @@ def test_brackets_in_a_cell_are_text(make_rows):
 
 
 def test_importing_the_report_loads_no_heavy_library():
-    code = "import avsreplay.report, sys; print([m for m in ('rich', 'plotly', 'pyarrow') if m in sys.modules])"
+    code = (
+        "import avsreplay.report, sys; print([m for m in ('rich', 'plotly', 'pyarrow') if m in"
+        " sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("tight", [False, True])
-@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=6), st.integers(20, 90))
-def test_no_number_and_no_name_is_cut_at_any_width(tight: bool, values: list[float], width: int) -> None:
+@given(
+    st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=6),
+    st.integers(20, 90),
+)
+def test_no_number_and_no_name_is_cut_at_any_width(
+    tight: bool, values: list[float], width: int
+) -> None:
     stream = io.StringIO()
     texts = [f"{value:.5g}" for value in values]
-    rows = tuple((f"name_of_a_long_metric_{k}", "some words that can wrap", t, t) for k, t in enumerate(texts))
+    rows = tuple(
+        (f"name_of_a_long_metric_{k}", "some words that can wrap", t, t)
+        for k, t in enumerate(texts)
+    )
     table = Table("title", ("metric", "meaning", "baseline", "this"), rows, align="nlr")
     print_table(make_console(stream, width=width), table, tight=tight)
     lines = stream.getvalue().splitlines()

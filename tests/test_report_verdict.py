@@ -1,4 +1,7 @@
-"""The verdict: no run with a serious problem passes, and every reason states what, when and how large."""
+"""The verdict.
+
+No run with a serious problem passes, and every reason states what, when and how large.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,16 @@ import numpy as np
 import pytest
 
 from avsreplay.records import Label
-from avsreplay.report import Summary
 from avsreplay.report.export import dump_document
 from avsreplay.report.moments import worst_moments
 from avsreplay.report.page import build_page
+from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import Grade, first_pose, verdict_of
 
-HEADER = {"model": {"extent_m": 8.0}, "config": {"init": "log", "estimator": {"start": "auto"}, "plan": {}}}
+HEADER = {
+    "model": {"extent_m": 8.0},
+    "config": {"init": "log", "estimator": {"start": "auto"}, "plan": {}},
+}
 
 
 def _labels(rows):
@@ -37,7 +43,10 @@ def _good(make_rows, n=100, **changes):
 def _scattered(rows, metres):
     """Rows with position errors that scatter about a value."""
     factors = np.random.default_rng(2).uniform(0.5, 1.5, len(rows))
-    return [dataclasses.replace(row, pos_err_m=metres * float(f)) for row, f in zip(rows, factors, strict=True)]
+    return [
+        dataclasses.replace(row, pos_err_m=metres * float(f))
+        for row, f in zip(rows, factors, strict=True)
+    ]
 
 
 def test_a_good_run_passes(make_rows):
@@ -47,11 +56,21 @@ def test_a_good_run_passes(make_rows):
 
 
 def test_no_healthy_scan_fails(make_rows):
-    rows = _good(make_rows, gamma=0, reason="not_aligned", nis=None, converged=False, pos_err_m=7.0, rot_err_deg=90.0)
+    rows = _good(
+        make_rows,
+        gamma=0,
+        reason="not_aligned",
+        nis=None,
+        converged=False,
+        pos_err_m=7.0,
+        rot_err_deg=90.0,
+    )
     found = _judged(rows)
     assert found.grade is Grade.FAIL
     assert "none of the 100 scans was used (mostly not aligned)" in found.line
-    assert not any("error" in reason.text for reason in found.reasons)  # errors of a start that nothing corrected
+    assert not any(
+        "error" in reason.text for reason in found.reasons
+    )  # errors of a start that nothing corrected
 
 
 def test_a_single_scan_that_is_not_used_is_said_in_the_singular(make_rows):
@@ -60,7 +79,10 @@ def test_a_single_scan_that_is_not_used_is_said_in_the_singular(make_rows):
 
 
 def test_one_used_scan_of_35_fails(make_rows):
-    rows = [dataclasses.replace(r, gamma=int(r.seq == 0), reason="fit_error") for r in make_rows(35, fault=None)]
+    rows = [
+        dataclasses.replace(r, gamma=int(r.seq == 0), reason="fit_error")
+        for r in make_rows(35, fault=None)
+    ]
     assert _judged(rows, labels=None).grade is Grade.FAIL
 
 
@@ -70,31 +92,52 @@ def test_one_used_scan_of_35_fails(make_rows):
         (
             "pos_err_m",
             0.1,
-            "the position error grows: median 16 mm in the first third of the used scans, 85 mm in the last",
+            (
+                "the position error grows: median 16 mm in the first third of the used scans, 85 mm"
+                " in the last"
+            ),
         ),
         (
             "rot_err_deg",
             1.0,
-            "the attitude error grows: median 0.16 deg in the first third of the used scans, 0.85 deg",
+            (
+                "the attitude error grows: median 0.16 deg in the first third of the used scans,"
+                " 0.85 deg"
+            ),
         ),
     ],
 )
 def test_an_error_that_grows_is_stated(make_rows, column, end, said):
-    """An error in proportion to the time. In the reverse order it decreases, as while an estimate converges."""
+    """An error in proportion to the time.
+
+    In the reverse order it decreases, as while an estimate converges.
+    """
     rows = make_rows(100, seed=3)
     errors = [end * k / 100 for k in range(1, 101)]
     grown = [dataclasses.replace(row, **{column: e}) for row, e in zip(rows, errors, strict=True)]
-    shrunk = [dataclasses.replace(row, **{column: e}) for row, e in zip(rows, errors[::-1], strict=True)]
-    assert next(reason.text for reason in _judged(grown).reasons if "grows" in reason.text).startswith(said)
+    shrunk = [
+        dataclasses.replace(row, **{column: e}) for row, e in zip(rows, errors[::-1], strict=True)
+    ]
+    assert next(
+        reason.text for reason in _judged(grown).reasons if "grows" in reason.text
+    ).startswith(said)
     assert not any("grows" in reason.text for reason in _judged(shrunk).reasons)
-    small = [dataclasses.replace(row, **{column: e / 100}) for row, e in zip(rows, errors, strict=True)]
-    assert not any("grows" in reason.text for reason in _judged(small).reasons)  # 0.8 mm of 8 m, 0.01 deg
-    assert not any("grows" in reason.text for reason in _judged(grown[:80], labels=None).reasons)  # too few scans
+    small = [
+        dataclasses.replace(row, **{column: e / 100}) for row, e in zip(rows, errors, strict=True)
+    ]
+    assert not any(
+        "grows" in reason.text for reason in _judged(small).reasons
+    )  # 0.8 mm of 8 m, 0.01 deg
+    assert not any(
+        "grows" in reason.text for reason in _judged(grown[:80], labels=None).reasons
+    )  # too few scans
 
 
 @pytest.mark.parametrize(("spread", "said"), [(0.001, True), (0.2, False)])
 def test_errors_that_are_the_same_in_all_scans_are_those_of_another_frame(make_rows, spread, said):
-    """A constant displacement and rotation between the frames of model and truth, with the noise of the poses."""
+    """A constant displacement and rotation between the frames of model and truth, with the noise of
+    the poses.
+    """
     rng, rows = np.random.default_rng(4), make_rows(100, seed=3)
     noise = 1.0 + spread * rng.normal(size=(100, 2))
     moved = [
@@ -109,23 +152,34 @@ def test_errors_that_are_the_same_in_all_scans_are_those_of_another_frame(make_r
 
 
 @pytest.mark.parametrize(
-    ("metres", "degrees", "said"), [(1.0, 0.0, True), (0.0, 30.0, True), (1.0, 30.0, True), (0.1, 1.0, False)]
+    ("metres", "degrees", "said"),
+    [(1.0, 0.0, True), (0.0, 30.0, True), (1.0, 30.0, True), (0.1, 1.0, False)],
 )
 def test_a_displaced_or_a_turned_frame_is_found(make_rows, metres, degrees, said):
-    """Only one of both may be there: the other errors are then those of the estimate, which scatter."""
+    """Only one of both may be there.
+
+    The other errors are then those of the estimate, which scatter.
+    """
     rng, rows = np.random.default_rng(4), make_rows(100, seed=3)
     noise = np.abs(rng.normal(size=(100, 2))) * (0.02, 0.5)
     moved = [
-        dataclasses.replace(row, pos_err_m=float(np.hypot(metres, a)), rot_err_deg=float(np.hypot(degrees, b)))
+        dataclasses.replace(
+            row, pos_err_m=float(np.hypot(metres, a)), rot_err_deg=float(np.hypot(degrees, b))
+        )
         for row, (a, b) in zip(rows, noise, strict=True)
     ]
-    assert any("the same in all used scans" in reason.text for reason in _judged(moved).reasons) == said
+    assert (
+        any("the same in all used scans" in reason.text for reason in _judged(moved).reasons)
+        == said
+    )
 
 
 def test_a_large_error_that_scatters_is_not_that_of_another_frame(make_rows):
     rng, rows = np.random.default_rng(5), make_rows(100, seed=3)
-    rows = [dataclasses.replace(r, pos_err_m=2.0 * float(e), rot_err_deg=1.0) for r, e in
-            zip(rows, 1.0 + 0.15 * rng.normal(size=100), strict=True)]  # fmt: skip
+    rows = [
+        dataclasses.replace(r, pos_err_m=2.0 * float(e), rot_err_deg=1.0)
+        for r, e in zip(rows, 1.0 + 0.15 * rng.normal(size=100), strict=True)
+    ]
     reasons = [reason.text for reason in _judged(rows).reasons]
     assert not any("the same in all used scans" in text for text in reasons)
     assert any("median position error" in text for text in reasons)
@@ -147,7 +201,10 @@ def test_a_missed_fault_fails_and_is_named(make_rows):
 
 
 def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
-    rows = [dataclasses.replace(r, gamma=0, reason="pose_jump") if r.seq >= 85 else r for r in _good(make_rows)]
+    rows = [
+        dataclasses.replace(r, gamma=0, reason="pose_jump") if r.seq >= 85 else r
+        for r in _good(make_rows)
+    ]
     assert "no scan after 16.8 s was used" in _judged(rows).line
 
 
@@ -165,15 +222,31 @@ PUSH = {
 @pytest.mark.parametrize(
     ("changes", "grade", "text"),
     [
-        ({"pos_err_m": 0.51}, Grade.FAIL, "median position error of all scans is 0.51 m, 6.4 % of the model"),
+        (
+            {"pos_err_m": 0.51},
+            Grade.FAIL,
+            "median position error of all scans is 0.51 m, 6.4 % of the model",
+        ),
         ({"pos_err_m": 0.2}, Grade.CHECK, "2.5 % of the model"),
         ({"rot_err_deg": 178.0}, Grade.FAIL, "median attitude error of all scans is 178 deg"),
         ({"rms_m": 0.3}, Grade.CHECK, "check unit, scale and model"),
-        ({"nees": 100.0}, Grade.CHECK, "the covariance is too small (overconfident): only 0 % of NEES inside"),
+        (
+            {"nees": 100.0},
+            Grade.CHECK,
+            "the covariance is too small (overconfident): only 0 % of NEES inside",
+        ),
         ({"nees": 1.0}, Grade.CHECK, "the covariance is too large"),
         ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band, 100 % above it"),
-        ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),
-        ({"reinitialised": 2}, Grade.CHECK, "the estimate was reinitialised 2 times, first at 0.0 s"),
+        (
+            {"consistent": False},
+            Grade.CHECK,
+            "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s",
+        ),
+        (
+            {"reinitialised": 2},
+            Grade.CHECK,
+            "the estimate was reinitialised 2 times, first at 0.0 s",
+        ),
         (PUSH, Grade.CHECK, "the target's velocity changed at 4.0 s by 10 +- 0.2 mm/s"),
         ({"converged": False}, Grade.CHECK, "did not converge"),
     ],
@@ -197,15 +270,21 @@ def test_convergence_that_is_withdrawn_for_the_last_scans_is_a_reason(make_rows)
 def test_losses_and_an_interruption_are_reasons(make_rows):
     rows = _good(make_rows)
     found = _judged(rows, counts={"losses": 2}, header={**HEADER, "interrupted_after": 100})
-    assert found.line == (
-        "CHECK: the replay was interrupted after 100 scans; 2 damaged places of the log were left out."
+    assert (
+        found.line
+        == "CHECK: the replay was interrupted after 100 scans; 2 damaged places of the log were"
+        " left out."
     )
 
 
 def test_the_worst_reason_is_first_and_at_most_three_are_in_the_line(make_rows):
-    found = _judged(_scattered(_good(make_rows, rms_m=0.3, nees=100.0, nis=40.0, reinitialised=1), 1.0))
+    found = _judged(
+        _scattered(_good(make_rows, rms_m=0.3, nees=100.0, nis=40.0, reinitialised=1), 1.0)
+    )
     assert found.line.startswith("FAIL: the median position error")
-    assert found.line.count(";") == 4  # three reasons, one of them with a semicolon, and the count of the others
+    assert (
+        found.line.count(";") == 4
+    )  # three reasons, one of them with a semicolon, and the count of the others
     assert re.search(r"(1 more reason|[2-9] more reasons)\.$", found.line)
 
 
@@ -228,8 +307,13 @@ def test_the_worst_moments_do_not_overlap_and_state_their_cause(make_rows):
     assert 1 <= len(found) <= 5
     spans = sorted((m.start_s, m.end_s) for m in found)
     assert all(a[1] < b[0] for a, b in itertools.pairwise(spans))
-    assert any(m.what.startswith("position error 500 mm, ") and rows[m.row].seq == 70 for m in found)
-    assert any(m.what.startswith("6 scans not used") and m.cause == "injected: full occlusion" for m in found)
+    assert any(
+        m.what.startswith("position error 500 mm, ") and rows[m.row].seq == 70 for m in found
+    )
+    assert any(
+        m.what.startswith("6 scans not used") and m.cause == "injected: full occlusion"
+        for m in found
+    )
 
 
 def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
@@ -247,20 +331,30 @@ def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
 
 
 def test_a_manoeuvre_is_the_cause_of_the_scans_that_were_rejected_before_it_was_decided(make_rows):
-    rows = _good(make_rows, n=40, gamma=1, reason="ok", fault=None, nis=6.0, converged=True, manoeuvres=0)
+    rows = _good(
+        make_rows, n=40, gamma=1, reason="ok", fault=None, nis=6.0, converged=True, manoeuvres=0
+    )
     late = {"manoeuvres": 1, "manoeuvre_s": 50.24}
     changed = {k: {"gamma": 0, "reason": "doubtful", "nis": 300.0} for k in (20, 21)}
     changed[22] = {"nis": 208.0}
-    rows = [dataclasses.replace(r, **(late if r.seq > 20 else {}), **changed.get(r.seq, {})) for r in rows]
+    rows = [
+        dataclasses.replace(r, **(late if r.seq > 20 else {}), **changed.get(r.seq, {}))
+        for r in rows
+    ]
     found = [m.cause for m in sorted(worst_moments(rows), key=lambda m: m.start_s)]
     manoeuvre = "manoeuvre of the target at 50.2 s"
     assert found == [f"rejected: doubtful; {manoeuvre}", manoeuvre]
     rejected = [dataclasses.replace(r, manoeuvres=0) for r in rows]
-    assert {m.cause for m in worst_moments(rejected)} == {"rejected: doubtful", "first used scan after rejected scans"}
+    assert {m.cause for m in worst_moments(rejected)} == {
+        "rejected: doubtful",
+        "first used scan after rejected scans",
+    }
 
 
 def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
-    """Some scans of the fault were flagged, so that it counts as detected, but others moved the estimate."""
+    """Some scans of the fault were flagged, so that it counts as detected, but others moved the
+    estimate.
+    """
     rows = _good(make_rows)
     labels = _labels(rows)
     at = next(r.seq for r in rows if r.fault)
@@ -285,7 +379,9 @@ def test_a_wrong_unit_stands_before_the_failures_that_it_explains(make_rows):
     good = _judged(_good(make_rows), header={**HEADER, "preflight": advice})
     assert good.line.startswith("CHECK: the model seems to be in inches")
     bad = _judged(_scattered(_good(make_rows), 1.0), header={**HEADER, "preflight": advice})
-    assert bad.line.startswith("FAIL: the model seems to be in inches; add --model-unit inch; the median position")
+    assert bad.line.startswith(
+        "FAIL: the model seems to be in inches; add --model-unit inch; the median position"
+    )
 
 
 def test_json_and_page_carry_the_verdict_first(make_rows):
@@ -298,7 +394,10 @@ def test_json_and_page_carry_the_verdict_first(make_rows):
     assert document["verdict"]["changed_settings"] == header["changed_settings"]
     page = build_page(rows, summary, header)
     assert (
-        page.index("CHECK: ") < page.index("Worst moments") < page.index("Injected faults") < page.index('id="charts"')
+        page.index("CHECK: ")
+        < page.index("Worst moments")
+        < page.index("Injected faults")
+        < page.index('id="charts"')
     )
     assert "faults.policy = &#34;all&#34;" in page
 
@@ -306,5 +405,7 @@ def test_json_and_page_carry_the_verdict_first(make_rows):
 def test_any_rows_get_a_verdict(make_rows):
     rng = np.random.default_rng(1)
     for n in (0, 1, 2, 7):
-        rows = [dataclasses.replace(r, gamma=int(rng.integers(2)), fault=None) for r in make_rows(n)]
+        rows = [
+            dataclasses.replace(r, gamma=int(rng.integers(2)), fault=None) for r in make_rows(n)
+        ]
         assert _judged(rows, labels=None, header=None).line

@@ -32,7 +32,14 @@ def test_json_is_one_document_with_summary_and_rows(result):
 def test_result_directory_holds_every_documented_file(result):
     out, document = result
     names = {p.name for p in out.iterdir()}
-    assert {"rows.jsonl", "run.json", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz"} <= names
+    assert {
+        "rows.jsonl",
+        "run.json",
+        "estimate.tum",
+        "registration.tum",
+        "truth.tum",
+        "beliefs.npz",
+    } <= names
     rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
     assert rows == document["rows"]
     estimate = np.loadtxt(out / "estimate.tum")
@@ -59,17 +66,26 @@ def test_beliefs_with_a_constant_acceleration_read_back_as_written(result, tmp_p
     out, _ = result
     plain, written, rng = read_beliefs(out / "beliefs.npz"), Beliefs(), np.random.default_rng(1)
     beliefs = [
-        DrivenBelief(b.t_ns, b.x, b.P, rng.normal(size=6), np.eye(6), rng.normal(size=(20, 6))) if k % 3 == 1 else b
+        (
+            DrivenBelief(b.t_ns, b.x, b.P, rng.normal(size=6), np.eye(6), rng.normal(size=(20, 6)))
+            if k % 3 == 1
+            else b
+        )
         for k, b in enumerate(plain)
     ]
     for belief in beliefs:
-        scan = SimpleNamespace(outcome=SimpleNamespace(belief=belief), truth=SimpleNamespace(pose=None))
+        scan = SimpleNamespace(
+            outcome=SimpleNamespace(belief=belief), truth=SimpleNamespace(pose=None)
+        )
         written(scan)
     written.write(tmp_path / "beliefs.npz")
     for found, belief in zip(read_beliefs(tmp_path / "beliefs.npz"), beliefs, strict=True):
         assert type(found) is type(belief)
         if isinstance(belief, DrivenBelief):
-            assert all(np.array_equal(getattr(found, name), getattr(belief, name)) for name in ("u", "P_u", "cross"))
+            assert all(
+                np.array_equal(getattr(found, name), getattr(belief, name))
+                for name in ("u", "P_u", "cross")
+            )
 
 
 @pytest.mark.parametrize("numbers", [[1000], [-1]])
@@ -77,7 +93,12 @@ def test_an_acceleration_of_a_belief_that_does_not_exist_is_refused(result, tmp_
     out, _ = result
     with np.load(out / "beliefs.npz") as data:
         arrays = dict(data)
-    drive = {"driven": np.array(numbers), "u": np.zeros((1, 6)), "P_u": np.eye(6)[None], "cross": np.zeros((1, 20, 6))}
+    drive = {
+        "driven": np.array(numbers),
+        "u": np.zeros((1, 6)),
+        "P_u": np.eye(6)[None],
+        "cross": np.zeros((1, 20, 6)),
+    }
     np.savez(tmp_path / "beliefs.npz", **arrays, **drive)
     with pytest.raises(UnreadableInput, match="has no belief"):
         read_beliefs(tmp_path / "beliefs.npz")
@@ -96,7 +117,9 @@ def test_overwrite_never_removes_what_is_no_result(cli, fixtures_folder, tmp_pat
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "thesis.txt").write_text("years of work")
-    done = cli("run", fixtures_folder / "tumble.mcap", "-o", precious, "--overwrite", "--n-scans", 3)
+    done = cli(
+        "run", fixtures_folder / "tumble.mcap", "-o", precious, "--overwrite", "--n-scans", 3
+    )
     assert done.code == 2
     assert (precious / "thesis.txt").read_text() == "years of work"
 
@@ -111,19 +134,36 @@ def test_a_failed_run_leaves_no_half_result(cli, fixtures_folder, tmp_path):
 def test_flags_beat_the_file_and_the_file_beats_the_default(cli, fixtures_folder, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text('[faults]\npolicy = "all"\n[plan]\na_max_mps2 = 0.07\n')
-    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "--json", "--config", config, "--policy", "any")
+    done = cli(
+        "run",
+        fixtures_folder / "tumble.mcap",
+        "--n-scans",
+        2,
+        "--json",
+        "--config",
+        config,
+        "--policy",
+        "any",
+    )
     effective = json.loads(done.out)["header"]["config"]
     assert effective["faults"]["policy"] == "any"
     assert effective["plan"]["a_max_mps2"] == 0.07
     by_environment = cli(
-        "run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "--json", env={"AVSREPLAY_RUN_POLICY": "all"}
+        "run",
+        fixtures_folder / "tumble.mcap",
+        "--n-scans",
+        2,
+        "--json",
+        env={"AVSREPLAY_RUN_POLICY": "all"},
     )
     assert json.loads(by_environment.out)["header"]["config"]["faults"]["policy"] == "all"
 
 
 def test_start_takes_a_time_too(cli, fixtures_folder):
     whole = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--json").out)["rows"]
-    late = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--json", "--start", 2.0, "--n-scans", 3).out)["rows"]
+    late = json.loads(
+        cli("run", fixtures_folder / "tumble.mcap", "--json", "--start", 2.0, "--n-scans", 3).out
+    )["rows"]
     assert len(late) == 3
     assert late[0]["t_ns"] == next(r["t_ns"] for r in whole if r["t_s"] >= 2.0)
 
@@ -145,26 +185,38 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
             seen.setdefault(connection.topic, []).append(message)
-    assert {t: len(m) for t, m in seen.items() if t in ("/tf", "/points_aligned", "/diagnostics")} == {
+    assert {
+        t: len(m) for t, m in seen.items() if t in ("/tf", "/points_aligned", "/diagnostics")
+    } == {
         "/tf": 2 * count,  # the estimate and the true pose
         "/points_aligned": count,
         "/diagnostics": count,
     }
     assert len(seen["/registration/pose"]) >= healthy
-    assert [s.status[0].message for s in seen["/diagnostics"]] == [r["reason"] for r in document["rows"]]
+    assert [s.status[0].message for s in seen["/diagnostics"]] == [
+        r["reason"] for r in document["rows"]
+    ]
     first, row = seen["/estimate/pose"][0], document["rows"][0]
     assert first.pose.pose.position.x == row["x_m"]
     assert np.linalg.eigvalsh(first.pose.covariance.reshape(6, 6)).min() > 0.0
     assert len(seen["/model"][0].points) % 3 == 0
     assert seen["/truth/model"][0].header.frame_id == "target_true"
-    kinds, elsewhere = (int, float), re.compile("seq|t_ns|(reg_)?([xyz]_m|q[xyzw])")  # bool is an int
+    kinds, elsewhere = (
+        (int, float),
+        re.compile("seq|t_ns|(reg_)?([xyz]_m|q[xyzw])"),
+    )  # bool is an int
     shown = {
-        n for row in document["rows"] for n, v in row.items() if isinstance(v, kinds) and not elsewhere.fullmatch(n)
+        n
+        for row in document["rows"]
+        for n, v in row.items()
+        if isinstance(v, kinds) and not elsewhere.fullmatch(n)
     }
     assert shown <= set(seen["/rows"][0].__dataclass_fields__)
     for name in shown | {"plan_miss_m"}:
         values = [np.nan if row[name] is None else row[name] for row in document["rows"]]
-        np.testing.assert_array_equal([getattr(message, name) for message in seen["/rows"]], values, name)
+        np.testing.assert_array_equal(
+            [getattr(message, name) for message in seen["/rows"]], values, name
+        )
     cloud = next(m for m in seen["/points_aligned"] if m.width)
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "residual"]
     points = np.frombuffer(cloud.data.tobytes(), np.dtype([("p", "<f4", 3), ("residual", "<f4")]))
@@ -184,7 +236,9 @@ def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
     for message, row in zip(messages, document["rows"], strict=True):
         covariance = message.pose.covariance.reshape(6, 6)
         assert np.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(row["pos_1s_m"], rel=1e-9)
-        assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(row["rot_1s_deg"], rel=1e-9)
+        assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(
+            row["rot_1s_deg"], rel=1e-9
+        )
 
 
 def test_a_run_is_written_for_rerun(fixtures_folder, tmp_path):
@@ -198,7 +252,13 @@ def test_a_run_is_written_for_rerun(fixtures_folder, tmp_path):
         stream.close()
     written = (tmp_path / "x.rrd").read_bytes()
     assert len(written) > 100 * len(rows)
-    for name in (b"camera/estimate/model", b"camera/position_3_sigma", b"camera/plan", b"rows/nis", b"rows/reason"):
+    for name in (
+        b"camera/estimate/model",
+        b"camera/position_3_sigma",
+        b"camera/plan",
+        b"rows/nis",
+        b"rows/reason",
+    ):
         assert name in written
 
 
@@ -222,7 +282,10 @@ def test_what_rerun_needs_is_said_in_one_line(target, says, fixtures_folder, mon
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with Run(Job(source=fixtures_folder / "tumble.mcap")) as run, pytest.raises(UsageError) as caught:
+    with (
+        Run(Job(source=fixtures_folder / "tumble.mcap")) as run,
+        pytest.raises(UsageError) as caught,
+    ):
         viewers.RerunStream(run, target)
     assert says in str(caught.value)
 
@@ -248,11 +311,19 @@ def test_the_cones_of_the_approach_are_in_the_viewer_log(fixtures_folder, tmp_pa
 
     angle, length, mouth = 20.0, 0.5, 0.03
     values = {"final_deg": angle, "final_range_m": length, "mouth_m": mouth}
-    limits = [word for name, value in values.items() for word in ("--set", f"limits.{name}={value}")]
-    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, *limits, "-o", tmp_path / "r")
+    limits = [
+        word for name, value in values.items() for word in ("--set", f"limits.{name}={value}")
+    ]
+    done = cli(
+        "run", fixtures_folder / "tumble.mcap", "--n-scans", 3, *limits, "-o", tmp_path / "r"
+    )
     assert done.code == 0, done.err
     with AnyReader([tmp_path / "r" / "result.mcap"]) as reader:
-        (found,) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/plan/cone"]
+        (found,) = [
+            reader.deserialize(raw, c.msgtype)
+            for c, _, raw in reader.messages()
+            if c.topic == "/plan/cone"
+        ]
     points = np.array([(p.x, p.y, p.z) for p in found.points])
     away = np.linalg.norm(points, axis=1)
     across = np.linalg.norm(points[:, 1:], axis=1)
@@ -278,8 +349,13 @@ def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_fol
     assert cli("run", log, "--n-scans", 4, "--update-golden", golden).code == 0
     done = cli("run", log, "--n-scans", 4, "--golden", golden, "--set", "register.n_max=1")
     assert done.code == 1
-    heading = "settings that differ from their defaults: n_scans = 4 (default all); register.n_max = 1 (default 200)"
-    assert " ".join(done.out.split()).index(heading) < " ".join(done.out.split()).index("Golden: first")
+    heading = (
+        "settings that differ from their defaults: n_scans = 4 (default all); register.n_max = 1"
+        " (default 200)"
+    )
+    assert " ".join(done.out.split()).index(heading) < " ".join(done.out.split()).index(
+        "Golden: first"
+    )
 
 
 @pytest.mark.slow
@@ -292,7 +368,9 @@ def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     assert cli("run", log, "--n-scans", 5, "--require", "check").code == 0
 
 
-def test_reading_options_are_stated_in_head_json_page_and_comparison(cli, fixtures_folder, tmp_path):
+def test_reading_options_are_stated_in_head_json_page_and_comparison(
+    cli, fixtures_folder, tmp_path
+):
     given = ["--model-scale", "1.0001", "--crop-range", "0.5,90", "--n-scans", "2"]
     stated = {
         "model_scale = 1.0001 (default 1.0)",
@@ -311,7 +389,9 @@ def test_reading_options_are_stated_in_head_json_page_and_comparison(cli, fixtur
     assert all(line in page for line in stated)
     compared = cli("compare", bare, out, "--json").out
     model, *settings = json.loads(compared)["results"][1]["conclusion"]["settings"]
-    assert re.fullmatch(r"model = satellite.ply (\w{8}) \(baseline satellite.ply (?!\1)\w{8}\)", model)
+    assert re.fullmatch(
+        r"model = satellite.ply (\w{8}) \(baseline satellite.ply (?!\1)\w{8}\)", model
+    )
     assert set(settings) == {
         "model_scale = 1.0001 (baseline 1.0)",
         "crop_range = [0.5, 90.0] (baseline not set)",

@@ -12,9 +12,9 @@ import trimesh
 from avsreplay.geometry import IDENTITY_QUAT, Pose
 from avsreplay.log import SourceOptions
 from avsreplay.records import Fit
-from avsreplay.register import Registrar, registrar
-from avsreplay.register.registrar import POSTPONED
-from avsreplay.report import Summary
+from avsreplay.register import registrar
+from avsreplay.register.registrar import POSTPONED, Registrar
+from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import Grade, verdict_of
 from avsreplay.run import Job, Run
 
@@ -57,12 +57,17 @@ def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(monkeypa
 
 
 def test_a_back_end_that_returns_its_guess_is_no_sensor(monkeypatch):
-    """The first pose is that of the global search; the later ones would be those of the filter itself, with NIS 0."""
+    """The first pose is that of the global search.
+
+    The later ones would be those of the filter itself, with NIS 0.
+    """
     _replace_backend(monkeypatch, lambda points, guess: Fit(guess, 1, True))
     with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
         rows = list(run.rows())
     message = "back end 'horn' returned its guess unchanged, although the residuals require a step"
-    assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [("failed", 0, message)] * 3
+    assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [
+        ("failed", 0, message)
+    ] * 3
     verdict = verdict_of(rows, Summary.fold(rows))
     assert verdict.grade is Grade.FAIL
     assert any(message in reason.text for reason in verdict.reasons)
@@ -74,10 +79,15 @@ def test_a_healthy_scan_has_no_message():
 
 
 def test_a_wrong_model_is_searched_for_ever_more_rarely(monkeypatch, tmp_path):
-    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans; the rows say so."""
+    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans.
+
+    The rows say so.
+    """
     made = []
     search = Registrar._acquire
-    monkeypatch.setattr(Registrar, "_acquire", lambda *args, **flags: made.append(1) or search(*args, **flags))
+    monkeypatch.setattr(
+        Registrar, "_acquire", lambda *args, **flags: made.append(1) or search(*args, **flags)
+    )
     model = tmp_path / "other.ply"
     trimesh.creation.torus(1.5, 0.5).export(model)
     with Run(Job(source=LOG, options=SourceOptions(n_scans=24, model=model))) as run:

@@ -14,7 +14,15 @@ from avsreplay.result_dir import ResultDirectory, ResultWriter
 from avsreplay.run import Job, Run
 
 LOG = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
-FILES = ("rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "result.mcap", "view.npz")
+FILES = (
+    "rows.jsonl",
+    "estimate.tum",
+    "registration.tum",
+    "truth.tum",
+    "beliefs.npz",
+    "result.mcap",
+    "view.npz",
+)
 
 
 def _write(out, prefetch, n_scans=15):
@@ -27,7 +35,9 @@ def _write(out, prefetch, n_scans=15):
 def test_one_thread_and_three_write_the_same_bytes(tmp_path):
     _write(tmp_path / "one", prefetch=0)
     _write(tmp_path / "three", prefetch=2)
-    same, differ, missing = filecmp.cmpfiles(tmp_path / "one", tmp_path / "three", FILES, shallow=False)
+    same, differ, missing = filecmp.cmpfiles(
+        tmp_path / "one", tmp_path / "three", FILES, shallow=False
+    )
     assert (sorted(same), differ, missing) == (sorted(FILES), [], [])
 
 
@@ -52,7 +62,10 @@ def test_an_error_of_the_pipeline_is_raised_where_the_rows_are_taken(monkeypatch
 
     monkeypatch.setattr(pipeline, "step", broken)
     before = set(threading.enumerate())
-    with Run(Job(source=LOG, prefetch=2)) as run, pytest.raises(ZeroDivisionError, match="in the pipeline"):
+    with (
+        Run(Job(source=LOG, prefetch=2)) as run,
+        pytest.raises(ZeroDivisionError, match="in the pipeline"),
+    ):
         list(run.rows())
     assert set(threading.enumerate()) <= before
 

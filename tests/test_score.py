@@ -26,7 +26,11 @@ def _rows(**selection):
 
 def _unscored(row):
     fields = dataclasses.asdict(row)
-    return {k: v for k, v in fields.items() if not k.startswith(SCORED) and k not in ("fault", "reference")}
+    return {
+        k: v
+        for k, v in fields.items()
+        if not k.startswith(SCORED) and k not in ("fault", "reference")
+    }
 
 
 def test_a_wrong_truth_changes_the_score_and_no_other_column(monkeypatch):
@@ -42,7 +46,9 @@ def test_a_wrong_truth_changes_the_score_and_no_other_column(monkeypatch):
     monkeypatch.setattr(Source, "truth_poses", lambda source: [])
     misled = _rows(n_scans=12)
     assert [_unscored(row) for row in misled] == [_unscored(row) for row in honest]
-    assert all(row.fault == "occlusion" and row.pos_err_m > 1.0 and row.nees is None for row in misled)
+    assert all(
+        row.fault == "occlusion" and row.pos_err_m > 1.0 and row.nees is None for row in misled
+    )
 
 
 def test_errors_are_distances_to_the_truth_of_the_scan():
@@ -54,14 +60,20 @@ def test_errors_are_distances_to_the_truth_of_the_scan():
         estimate, truth = np.array([scan.row.x_m, scan.row.y_m, scan.row.z_m]), scan.truth.pose
         assert scan.row.pos_err_m == pytest.approx(np.linalg.norm(estimate - truth.t), abs=1e-12)
         cosine = abs(float(scan.outcome.pose.q @ truth.q))
-        assert scan.row.rot_err_deg == pytest.approx(np.degrees(2.0 * np.arccos(min(cosine, 1.0))), abs=1e-5)
+        assert scan.row.rot_err_deg == pytest.approx(
+            np.degrees(2.0 * np.arccos(min(cosine, 1.0))), abs=1e-5
+        )
 
 
 def test_a_reference_is_fitted_when_asked_for_and_not_in_the_constructor(monkeypatch):
     passes = []
     scans = Source.scans
-    monkeypatch.setattr(Source, "scans", lambda source, *args: passes.append(1) or scans(source, *args))
-    with Run(Job(source=LOG, options=SourceOptions(n_scans=12), assignments=("reference=fit",))) as run:
+    monkeypatch.setattr(
+        Source, "scans", lambda source, *args: passes.append(1) or scans(source, *args)
+    )
+    with Run(
+        Job(source=LOG, options=SourceOptions(n_scans=12), assignments=("reference=fit",))
+    ) as run:
         assert passes == []
         shown = []
         run.fit_reference(lambda items, count, what: shown.append((count, what)) or items)

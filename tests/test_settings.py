@@ -19,12 +19,12 @@ from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.batch import FitParams
 from avsreplay.log import SourceOptions
-from avsreplay.plan import Limits
+from avsreplay.plan.robot import Limits
 from avsreplay.register.surface_index import IcpParams
 from avsreplay.report.gate import GateRules
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scenario import ScenarioParams
-from avsreplay.sweep import Campaign
+from avsreplay.sweep.campaign import Campaign
 
 
 class Policy(Enum):
@@ -162,18 +162,25 @@ def test_dump_is_plain_and_builds_back():
         ({"inner": {"gain": math.inf}}, "gain is inf, must be above 0"),
         ({"inner": {"gain": 0.0}}, "gain is 0.0"),
         ({"inner": {"limit": 0.0}}, r"limit is 0.0, must be above 0 \[m\]"),
-        ({"inner": {"axis": (0.0, 2.0, 0.0)}}, r"axis is \[0.0, 2.0, 0.0\], each value must be at least -1"),
+        (
+            {"inner": {"axis": (0.0, 2.0, 0.0)}},
+            r"axis is \[0.0, 2.0, 0.0\], each value must be at least -1",
+        ),
     ],
 )
 def test_a_value_outside_its_declared_range_is_refused(change, what):
-    cls, values = (Inner, change["inner"]) if "inner" in change else (Outer, {"name": "x", **change})
+    cls, values = (
+        (Inner, change["inner"]) if "inner" in change else (Outer, {"name": "x", **change})
+    )
     with pytest.raises(ValueError, match=what):
         cls(**values)
 
 
 @given(st.floats(allow_nan=True), st.sampled_from(["count", "weight", "gain"]))
 def test_a_float_is_accepted_exactly_within_the_bounds(value, name):
-    allowed = {"count": 0 <= value < 10, "weight": 0 <= value <= 1, "gain": 0 < value < math.inf}[name]
+    allowed = {"count": 0 <= value < 10, "weight": 0 <= value <= 1, "gain": 0 < value < math.inf}[
+        name
+    ]
     try:
         Inner(gain=value) if name == "gain" else Outer(name="x", **{name: value})
         accepted = True
@@ -202,7 +209,9 @@ def test_lengths_that_scale_with_the_target_are_filled_in_and_given_values_are_k
 )
 def test_a_misspelt_key_is_answered_with_the_nearest_of_the_whole_tree(assignment, hint):
     with pytest.raises(UsageError) as caught:
-        toml_document.build(Outer, toml_document.override(toml_document.parse(TEXT, "s.toml"), [assignment]))
+        toml_document.build(
+            Outer, toml_document.override(toml_document.parse(TEXT, "s.toml"), [assignment])
+        )
     assert hint in str(caught.value)
     assert str(caught.value).startswith(f"--set {assignment}: ")
 
@@ -218,7 +227,9 @@ def test_a_hint_names_only_keys_that_exist():
             load_config(None, {}, [assignment])
         hint = caught.value.hint
         table = "register." if assignment.startswith("register.") else ""
-        named = re.findall(r"'([\w.]+)'", hint) or [f"{table}{k}" for k in hint.partition(": ")[2].split(", ")]
+        named = re.findall(r"'([\w.]+)'", hint) or [
+            f"{table}{k}" for k in hint.partition(": ")[2].split(", ")
+        ]
         assert named
         assert set(named) <= known, hint
     with pytest.raises(UsageError) as caught:
@@ -227,7 +238,12 @@ def test_a_hint_names_only_keys_that_exist():
     assert example in known
 
 
-CHANGES = ["register.gate_m=0.123", "estimator.start=cold", "init=auto", "plan.robot_position_m=[1, 2.5, -3]"]
+CHANGES = [
+    "register.gate_m=0.123",
+    "estimator.start=cold",
+    "init=auto",
+    "plan.robot_position_m=[1, 2.5, -3]",
+]
 
 
 @pytest.mark.parametrize("assignments", [[], CHANGES])
@@ -241,7 +257,16 @@ def test_a_written_configuration_reads_back_as_the_same_object(assignments):
     )
 
 
-PARAMETER_CLASSES = [RunConfig, ScenarioParams, Campaign, SourceOptions, Limits, GateRules, FitParams, IcpParams]
+PARAMETER_CLASSES = [
+    RunConfig,
+    ScenarioParams,
+    Campaign,
+    SourceOptions,
+    Limits,
+    GateRules,
+    FitParams,
+    IcpParams,
+]
 
 
 @pytest.mark.parametrize("cls", PARAMETER_CLASSES, ids=lambda c: c.__name__)
@@ -251,8 +276,20 @@ def test_every_setting_is_declared_with_its_meaning(cls):
         assert not (entry.declared.of_extent and entry.declared.unset), entry.key
         optional = type(None) in typing.get_args(entry.hint)
         assert optional or entry.declared.of_extent is None, entry.key
-        suffixes = {"_m": "m", "_s": "s", "_deg": "deg", "_rad": "rad", "_mps": "m/s", "_radps": "rad/s", "_hz": "Hz"}
-        unit = suffixes.get(f"_{entry.key.rpartition('_')[2]}") if "_" in entry.key.rpartition(".")[2] else None
+        suffixes = {
+            "_m": "m",
+            "_s": "s",
+            "_deg": "deg",
+            "_rad": "rad",
+            "_mps": "m/s",
+            "_radps": "rad/s",
+            "_hz": "Hz",
+        }
+        unit = (
+            suffixes.get(f"_{entry.key.rpartition('_')[2]}")
+            if "_" in entry.key.rpartition(".")[2]
+            else None
+        )
         assert unit is None or entry.declared.unit == unit, entry.key
 
 
@@ -261,7 +298,9 @@ def test_every_setting_is_read_by_the_program(cls):
     package = Path(avsreplay.__file__).parent
     code = "\n".join(path.read_text(encoding="utf-8") for path in sorted(package.rglob("*.py")))
     read = set(re.findall(r"\.(\w+)", code)) | set(re.findall(r"[\"'](\w+)[\"']", code))
-    assert not [entry.key for entry in settings.entries(cls) if entry.key.rpartition(".")[2] not in read]
+    assert not [
+        entry.key for entry in settings.entries(cls) if entry.key.rpartition(".")[2] not in read
+    ]
 
 
 def test_no_parameter_class_validates_by_hand():

@@ -1,4 +1,6 @@
-"""The true motion against DOP853, its conserved quantities, and the paper's ratio form of the same dynamics."""
+"""The true motion against DOP853, its conserved quantities, and the paper's ratio form of the same
+dynamics.
+"""
 
 from dataclasses import replace
 
@@ -40,7 +42,9 @@ def oracle():
         return np.r_[0.5 * geometry.multiply(q, [*w, 0.0]), inverse @ -np.cross(w, inertia @ w)]
 
     start = np.r_[PARAMS.attitude_xyzw, PARAMS.rate_radps]
-    return solve_ivp(rates, (0, SPAN), start, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=TIMES).y.T
+    return solve_ivp(
+        rates, (0, SPAN), start, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=TIMES
+    ).y.T
 
 
 def test_attitude_and_rate_agree_with_dop853_to_1e_10(motion, oracle):
@@ -55,7 +59,10 @@ def test_energy_and_angular_momentum_are_conserved_to_1e_10(motion):
     momentum = np.einsum("nij,nj->ni", geometry.matrix(q), w @ BODY.inertia_c)
     energy = 0.5 * np.einsum("ni,ij,nj->n", w, BODY.inertia_c, w)
     assert_allclose(
-        momentum, np.broadcast_to(momentum[0], momentum.shape), rtol=0, atol=1e-10 * np.linalg.norm(momentum[0])
+        momentum,
+        np.broadcast_to(momentum[0], momentum.shape),
+        rtol=0,
+        atol=1e-10 * np.linalg.norm(momentum[0]),
     )
     assert_allclose(energy, energy[0], rtol=1e-10)
 
@@ -68,16 +75,24 @@ def test_the_ratio_form_of_the_dynamics_gives_the_same_motion(motion):
 
     def rates(_t, y):
         q, w = y[:4], y[4:]
-        return np.r_[0.5 * geometry.multiply(q, [*w, 0.0]), ratios * np.array([w[1] * w[2], w[0] * w[2], w[0] * w[1]])]
+        return np.r_[
+            0.5 * geometry.multiply(q, [*w, 0.0]),
+            ratios * np.array([w[1] * w[2], w[0] * w[2], w[0] * w[1]]),
+        ]
 
-    ends = solve_ivp(rates, (0, SPAN), np.r_[first.q_ab, first.w_b], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    ends = solve_ivp(
+        rates, (0, SPAN), np.r_[first.q_ab, first.w_b], method="DOP853", rtol=1e-13, atol=1e-14
+    ).y[:, -1]
     last = motion.state(SPAN)
     assert geometry.angle(geometry.multiply(geometry.conjugate(last.q_ab), ends[:4])) < 1e-10
     assert_allclose(last.w_b, ends[4:], atol=1e-11)
 
 
 def test_the_fixture_is_fixed_to_the_body(motion):
-    """T_ac from the state equals the mass centre carried by the model's own coordinates; velocity is its slope."""
+    """T_ac from the state equals the mass centre carried by the model's own coordinates.
+
+    Velocity is its slope.
+    """
     for t in (0.0, 7.3, 61.0):
         R_ac, t_ac = motion.poses([t])
         state = motion.state(t)
@@ -91,23 +106,31 @@ def test_the_fixture_is_fixed_to_the_body(motion):
 
 def test_the_mass_centre_drifts_straight(motion):
     _, _, centre, velocity = motion.states(TIMES)
-    assert_allclose(centre, np.array(PARAMS.position_m) + TIMES[:, None] * PARAMS.velocity_mps, atol=1e-12)
+    assert_allclose(
+        centre, np.array(PARAMS.position_m) + TIMES[:, None] * PARAMS.velocity_mps, atol=1e-12
+    )
     assert_allclose(velocity, np.broadcast_to(PARAMS.velocity_mps, velocity.shape), atol=1e-15)
 
 
 def test_the_dense_output_is_smooth_across_steps(motion):
     for edge in motion._starts[1:6]:
-        for before, after in zip(motion.states([edge - 1e-9]), motion.states([edge + 1e-9]), strict=True):
+        for before, after in zip(
+            motion.states([edge - 1e-9]), motion.states([edge + 1e-9]), strict=True
+        ):
             assert_allclose(before, after, atol=1e-8)
 
 
 def test_a_body_at_rest_stays_at_rest():
-    q, w, _, _ = Motion(BODY, MotionParams(rate_radps=(0, 0, 0)), 50.0, rng()).states([0.0, 25.0, 50.0])
+    q, w, _, _ = Motion(BODY, MotionParams(rate_radps=(0, 0, 0)), 50.0, rng()).states(
+        [0.0, 25.0, 50.0]
+    )
     assert_allclose(q, np.broadcast_to([0, 0, 0, 1], q.shape))
     assert_allclose(w, 0)
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 1.0), (0.3, 0.98, 0.98), (0.02, 1.0, 1.0), (0.9, 1.0, 1.0999)])
+@pytest.mark.parametrize(
+    "moments", [(1.0, 1.0, 1.0), (0.3, 0.98, 0.98), (0.02, 1.0, 1.0), (0.9, 1.0, 1.0999)]
+)
 def test_symmetric_and_slender_bodies_keep_their_momentum(moments):
     body = with_axes(moments, geometry.exp([0.2, 0.5, -1.0]), np.zeros(3))
     motion = Motion(body, MotionParams(rate_radps=(0.3, 0.2, -0.1)), 30.0, rng())
@@ -117,7 +140,10 @@ def test_symmetric_and_slender_bodies_keep_their_momentum(moments):
 
 
 def test_disturbances_move_the_velocity_as_their_level_says():
-    """Over n held steps the velocity walks by std step sqrt(n): a chi-square over 40 seeds and 3 axes."""
+    """Over n held steps the velocity walks by std step sqrt(n).
+
+    A chi-square over 40 seeds and 3 axes.
+    """
     std, step, span = 1e-3, 0.5, 20.0
     params = MotionParams(force_std_mps2=std, disturbance_step_s=step)
     ends = [Motion(BODY, params, span, rng(seed)).states([span])[3][0] for seed in range(40)]
@@ -131,13 +157,18 @@ def test_a_disturbance_torque_changes_the_rate_by_its_share():
     motion = Motion(BODY, params, 0.1, rng(3))
     eps = 1e-3 * rng(3).standard_normal(3)
     _, w, _, _ = motion.states([0.1])
-    assert_allclose(w[0], np.linalg.solve(BODY.inertia_c, np.trace(BODY.inertia_c) * eps) * 0.1, rtol=1e-4)
+    assert_allclose(
+        w[0], np.linalg.solve(BODY.inertia_c, np.trace(BODY.inertia_c) * eps) * 0.1, rtol=1e-4
+    )
 
 
 def test_disturbed_motion_is_continuous_and_repeats():
     params = MotionParams(rate_radps=(0.1, 0.05, 0), torque_std_radps2=1e-4, force_std_mps2=1e-3)
     one, two = (Motion(BODY, params, 20.0, rng(9)) for _ in range(2))
-    assert all(np.array_equal(a, b) for a, b in zip(one.states(TIMES / 6), two.states(TIMES / 6), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(one.states(TIMES / 6), two.states(TIMES / 6), strict=True)
+    )
     for edge in (1.0, 2.0, 13.0):
         for before, after in zip(one.states([edge - 1e-9]), one.states([edge + 1e-9]), strict=True):
             assert_allclose(before, after, atol=1e-8)
@@ -177,7 +208,9 @@ def test_the_relative_orbit_is_that_of_clohessy_and_wiltshire(n):
     radial, normal = np.array([0.6, 0.0, 0.8]), np.array([0.0, -1.0, 0.0])
     along = np.cross(normal, radial)
     r0, v0 = np.array(PARAMS.position_m), np.array(PARAMS.velocity_mps)
-    params = replace(PARAMS, orbit_rate_radps=n, radial_a=tuple(radial), orbit_normal_a=tuple(normal))
+    params = replace(
+        PARAMS, orbit_rate_radps=n, radial_a=tuple(radial), orbit_normal_a=tuple(normal)
+    )
     path = Motion(BODY, params, 600.0, rng())
     axes = np.stack([radial, along, normal])
     v_rotating = axes @ (v0 - n * np.cross(normal, r0))
@@ -191,12 +224,16 @@ def test_the_relative_orbit_is_that_of_clohessy_and_wiltshire(n):
     numeric = (path.states(times[1:-1] + 1e-3)[2] - path.states(times[1:-1] - 1e-3)[2]) / 2e-3
     assert_allclose(velocity[1:-1], numeric, atol=1e-5 * np.abs(velocity).max())
     free = Motion(BODY, PARAMS, 600.0, rng()).states([600.0])[2][0]
-    assert np.linalg.norm(free - centre[-1]) > 0.5  # the approximation of free motion is off by that
+    assert (
+        np.linalg.norm(free - centre[-1]) > 0.5
+    )  # the approximation of free motion is off by that
 
 
 def test_an_orbit_does_not_change_the_attitude():
     moving = Motion(BODY, replace(PARAMS, orbit_rate_radps=0.00113), SPAN, rng())
-    assert_allclose(moving.states(TIMES)[0], Motion(BODY, PARAMS, SPAN, rng()).states(TIMES)[0], atol=1e-12)
+    assert_allclose(
+        moving.states(TIMES)[0], Motion(BODY, PARAMS, SPAN, rng()).states(TIMES)[0], atol=1e-12
+    )
 
 
 def test_axes_of_an_orbit_must_be_orthonormal():

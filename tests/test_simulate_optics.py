@@ -14,12 +14,14 @@ from avsreplay import settings, toml_document
 from avsreplay.errors import UsageError
 from avsreplay.log import read_surface
 from avsreplay.records import Surface
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
 from avsreplay.simulate.inertia import principal
 from avsreplay.simulate.motion import Motion, MotionParams
 from avsreplay.simulate.optics import Material, beam, crosstalk, face_optics, merged
 from avsreplay.simulate.rays import Pattern, Preset, ScannerParams
 from avsreplay.simulate.scanner import Scanner
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import builtin_surface
 
 BODY = principal(np.diag([1.0, 1.1, 1.2]), np.zeros(3))
 CLEAN = ScannerParams(rays=(33, 33), fov_deg=(40.0, 40.0), noise_m=0.0, outlier_ratio=0.0)
@@ -31,7 +33,9 @@ def rng(seed=0):
 
 def plate(z=0.0, x=(-1.0, 1.0), y=(-1.0, 1.0)):
     """Corners and faces of a rectangle at z that faces the camera."""
-    corners = np.array([[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]], dtype=np.float64)
+    corners = np.array(
+        [[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]], dtype=np.float64
+    )
     return corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)
 
 
@@ -41,7 +45,9 @@ def scanner(params, *plates, at=3.0, tilt_rad=0.0, materials=()):
     shifts = np.cumsum([0, *(len(p[0]) for p in plates[:-1])])
     faces = np.concatenate([p[1] + s for p, s in zip(plates, shifts, strict=True)]).astype(np.int32)
     attitude = (math.sin(tilt_rad / 2), 0.0, 0.0, math.cos(tilt_rad / 2))
-    motion = MotionParams(attitude_xyzw=attitude, rate_radps=(0.0, 0.0, 0.0), position_m=(0.0, 0.0, at))
+    motion = MotionParams(
+        attitude_xyzw=attitude, rate_radps=(0.0, 0.0, 0.0), position_m=(0.0, 0.0, at)
+    )
     surface = Surface(corners, faces, "plates", "")
     return Scanner(params, surface, Motion(BODY, motion, 10.0, rng()), materials)
 
@@ -59,11 +65,14 @@ def test_a_beam_has_the_second_moments_of_a_uniform_cone():
 
 
 def test_a_beam_on_a_plane_returns_the_range_of_its_centre():
-    narrow, wide = (scanner(replace(CLEAN, divergence_mrad=d), plate()).cast(0.0) for d in (0.0, 5.0))
+    narrow, wide = (
+        scanner(replace(CLEAN, divergence_mrad=d), plate()).cast(0.0) for d in (0.0, 5.0)
+    )
     at_centre = np.abs(narrow.directions[:, :2]).max(axis=1) < 0.2
     found = {tuple(d): r for d, r in zip(wide.directions, wide.ranges, strict=True)}
     gap = [
-        abs(found[tuple(d)] - r) for d, r in zip(narrow.directions[at_centre], narrow.ranges[at_centre], strict=True)
+        abs(found[tuple(d)] - r)
+        for d, r in zip(narrow.directions[at_centre], narrow.ranges[at_centre], strict=True)
     ]
     assert max(gap) < 3.0 * 0.005**2
 
@@ -102,7 +111,9 @@ def test_intensity_follows_lambert_and_the_square_of_the_range(tilt_deg):
     material = Material("grey", reflectance=0.4)
     params = replace(CLEAN, rays=(1, 1), fov_deg=(0.1, 0.1), reference_m=2.0)
     near, far = (
-        scanner(params, plate(), at=d, tilt_rad=math.radians(tilt_deg), materials=[material]).cast(0.0).intensities
+        scanner(params, plate(), at=d, tilt_rad=math.radians(tilt_deg), materials=[material])
+        .cast(0.0)
+        .intensities
         for d in (2.0, 6.0)
     )
     assert_allclose(near, 0.4 * math.cos(math.radians(tilt_deg)), rtol=1e-9)
@@ -114,32 +125,47 @@ def test_a_specular_surface_is_lost_except_near_its_normal():
     params = replace(CLEAN, intensity_min=0.05, reference_m=3.0)
     seen = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[foil]).cast(0.0)
     angle = np.degrees(np.arccos(seen.cosines))
-    limit = 3.0 * math.sqrt(math.log(20.0 / 0.04))  # where the lobe has fallen to 0.04 = 0.05 - 0.01
+    limit = 3.0 * math.sqrt(
+        math.log(20.0 / 0.04)
+    )  # where the lobe has fallen to 0.04 = 0.05 - 0.01
     assert len(angle) > 0
     assert angle.max() < limit
-    white = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("white", reflectance=1.0)]).cast(0.0)
+    white = scanner(
+        params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("white", reflectance=1.0)]
+    ).cast(0.0)
     assert len(white.ranges) == 33 * 33 > 2 * len(seen.ranges)
 
 
 def test_materials_apply_to_the_faces_in_their_box_the_last_one_first():
     corners, faces = plate()
     other, more = plate(x=(2.0, 3.0))
-    surface = Surface(np.concatenate([corners, other]), np.concatenate([faces, more + 4]).astype(np.int32), "two", "")
+    surface = Surface(
+        np.concatenate([corners, other]),
+        np.concatenate([faces, more + 4]).astype(np.int32),
+        "two",
+        "",
+    )
     right = (1.5, -9.0, -9.0, 9.0, 9.0, 9.0)
-    optics = face_optics(surface, [Material("all", reflectance=0.2), Material("r", box_m=right, dropout_ratio=0.9)])
+    optics = face_optics(
+        surface, [Material("all", reflectance=0.2), Material("r", box_m=right, dropout_ratio=0.9)]
+    )
     assert optics.diffuse.tolist() == [0.2, 0.2, 0.5, 0.5]
     assert optics.dropouts.tolist() == [0.0, 0.0, 0.9, 0.9]
 
 
 def test_dropouts_of_a_material_come_at_their_rate():
     params = replace(CLEAN, rays=(100, 100), dropout_ratio=0.2)
-    scan = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("m", dropout_ratio=0.5)])
+    scan = scanner(
+        params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("m", dropout_ratio=0.5)]
+    )
     clean = scan.cast(0.0)
     kept = len(scan.disturb(clean, rng(1)).ranges)
     assert stats.binomtest(kept, len(clean.ranges), 0.8 * 0.5).pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("growth", "incidence"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 0.5)])
+@pytest.mark.parametrize(
+    ("growth", "incidence"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 0.5)]
+)
 def test_noise_grows_with_range_and_incidence(growth, incidence):
     params = replace(CLEAN, rays=(80, 80), fov_deg=(3.0, 3.0), noise_m=0.01, reference_m=2.0)
     params = replace(params, noise_growth=growth, noise_incidence=incidence)
@@ -161,7 +187,9 @@ def test_ranges_are_quantised():
 
 
 def test_a_spinning_scanner_measures_a_column_at_once():
-    params = replace(CLEAN, rays=(20, 16), fov_deg=(60.0, 30.0), pattern=Pattern.SPINNING, scan_s=0.1)
+    params = replace(
+        CLEAN, rays=(20, 16), fov_deg=(60.0, 30.0), pattern=Pattern.SPINNING, scan_s=0.1
+    )
     scan = scanner(params, plate(x=(-9, 9), y=(-9, 9)))
     d, t = scan._rays[0], scan._times
     azimuth = np.degrees(np.arctan2(d[:, 0], d[:, 2]))
@@ -170,11 +198,15 @@ def test_a_spinning_scanner_measures_a_column_at_once():
     for each in np.unique(t):
         assert np.ptp(azimuth[t == each]) < 1e-9
     assert_allclose(np.unique(np.round(np.diff(np.unique(np.round(azimuth, 9))), 9)), 3.0)
-    assert_allclose(np.unique(np.round(elevation, 9)), np.arange(-15 + 0.9375, 15, 1.875), atol=1e-8)
+    assert_allclose(
+        np.unique(np.round(elevation, 9)), np.arange(-15 + 0.9375, 15, 1.875), atol=1e-8
+    )
 
 
 def test_a_lissajous_figure_closes_and_covers_the_field_of_view():
-    params = replace(CLEAN, rays=(60, 60), pattern=Pattern.LISSAJOUS, lissajous=(11, 13), scan_s=1.0)
+    params = replace(
+        CLEAN, rays=(60, 60), pattern=Pattern.LISSAJOUS, lissajous=(11, 13), scan_s=1.0
+    )
     d = scanner(params, plate())._rays[0]
     u, v = (np.degrees(np.arctan2(d[:, k], d[:, 2])) / 20.0 for k in (0, 1))
     assert_allclose(np.abs([u, v]).max(axis=1), 1.0, atol=1e-3)
@@ -187,13 +219,20 @@ def test_a_lissajous_figure_closes_and_covers_the_field_of_view():
 
 @pytest.mark.parametrize("preset", [p.value for p in Preset if p is not Preset.NONE])
 def test_a_preset_gives_scans_and_its_figures_are_defaults_only(preset):
-    figures = tomllib.loads(resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8"))[preset]
-    text = "duration_s = 3.0\nrate_hz = 0.35\n[motion]\nposition_m = [0.0, 0.0, 2.2]\n[target]\nshape = 'bracket'\n"
+    figures = tomllib.loads(
+        resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8")
+    )[preset]
+    text = (
+        "duration_s = 3.0\nrate_hz = 0.35\n[motion]\nposition_m = [0.0, 0.0, 2.2]\n[target]\nshape"
+        " = 'bracket'\n"
+    )
     text += f"[scanner]\npreset = '{preset}'\nnoise_m = 0.0123\n"
     scenario = scenario_of(toml_document.parse(text, "s.toml"))
     assert scenario.params.scanner.noise_m == 0.0123
     plain = settings.dump(scenario.params.scanner)
-    assert {k: plain[k] for k in figures if k != "noise_m"} == {k: v for k, v in figures.items() if k != "noise_m"}
+    assert {k: plain[k] for k in figures if k != "noise_m"} == {
+        k: v for k, v in figures.items() if k != "noise_m"
+    }
     scan = next(iter(simulate(scenario, builtin_surface(scenario.params.target.shape)).scans()))
     assert len(scan.points) > 100
     assert (scan.times_s is not None) == (figures["pattern"] != "flash")
@@ -201,7 +240,9 @@ def test_a_preset_gives_scans_and_its_figures_are_defaults_only(preset):
 
 def test_presets_are_exactly_the_classes():
     text = resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8")
-    assert set(tomllib.loads(text)) == {preset.value for preset in Preset if preset is not Preset.NONE}
+    assert set(tomllib.loads(text)) == {
+        preset.value for preset in Preset if preset is not Preset.NONE
+    }
 
 
 def grid_of(found):
@@ -210,7 +251,10 @@ def grid_of(found):
 
 
 def test_more_returns_of_a_beam_separate_the_surfaces_on_an_edge():
-    """Half of each beam on the edge meets the near plate, half the far one: both ranges return, without a mixture."""
+    """Half of each beam on the edge meets the near plate, half the far one.
+
+    Both ranges return, without a mixture.
+    """
     wide = replace(CLEAN, divergence_mrad=40.0, merge_m=0.1)
     plates = (plate(0.0, x=(-1.0, 0.0)), plate(1.0, x=(-3.0, 3.0), y=(-3.0, 3.0)))
     one = scanner(wide, *plates).cast(0.0)
@@ -219,11 +263,19 @@ def test_more_returns_of_a_beam_separate_the_surfaces_on_an_edge():
     z = np.round(two.directions[at_edge, 2] * two.ranges[at_edge], 1)
     assert set(z) == {3.0, 4.0}
     assert len(two.ranges) > len(one.ranges)
-    assert np.abs(np.round(one.directions[:, 2] * one.ranges, 1)[:, None] - [3.0, 4.0]).min(axis=1).max() < 0.05
+    assert (
+        np.abs(np.round(one.directions[:, 2] * one.ranges, 1)[:, None] - [3.0, 4.0])
+        .min(axis=1)
+        .max()
+        < 0.05
+    )
 
 
 def test_range_walk_is_proportional_to_the_logarithm_of_the_intensity():
-    materials = [Material("left", box_m=(-9, -9, -9, 0, 9, 9), reflectance=1.0), Material("right", reflectance=0.01)]
+    materials = [
+        Material("left", box_m=(-9, -9, -9, 0, 9, 9), reflectance=1.0),
+        Material("right", reflectance=0.01),
+    ]
     params = replace(CLEAN, range_walk_m=0.05, reference_m=3.0, max_incidence_deg=90.0)
     left, right = plate(x=(-2.0, -0.1)), plate(x=(0.1, 2.0))
     at = scanner(params, left, right, materials=materials[::-1])
@@ -231,16 +283,24 @@ def test_range_walk_is_proportional_to_the_logarithm_of_the_intensity():
     walked = at.disturb(clean, rng())
     assert_allclose(walked.ranges - clean.ranges, -0.05 * np.log10(clean.intensities), atol=1e-12)
     dark = clean.directions[:, 0] > 0.0
-    assert_allclose((walked.ranges - clean.ranges)[dark].mean() - (walked.ranges - clean.ranges)[~dark].mean(), 0.1,
-                    atol=0.02)  # fmt: skip
+    assert_allclose(
+        (walked.ranges - clean.ranges)[dark].mean() - (walked.ranges - clean.ranges)[~dark].mean(),
+        0.1,
+        atol=0.02,
+    )
 
 
 def test_stray_light_pulls_all_ranges_to_that_of_the_strongest_return():
-    """A retro-reflector at 2 m and a plate at 4 m: phasors of a long modulation wave give the weighted mean."""
+    """A retro-reflector at 2 m and a plate at 4 m.
+
+    Phasors of a long modulation wave give the weighted mean.
+    """
     ranges, intensities, ratio = np.array([4.0, 4.2, 2.0]), np.array([0.5, 0.1, 100.0]), 1e-3
     found = crosstalk(ranges, intensities, ratio)
     wave = 1e4  # [m], long against the differences of range
-    phasors = intensities * np.exp(2j * np.pi * ranges / wave) + ratio * 100.0 * np.exp(2j * np.pi * 2.0 / wave)
+    phasors = intensities * np.exp(2j * np.pi * ranges / wave) + ratio * 100.0 * np.exp(
+        2j * np.pi * 2.0 / wave
+    )
     assert_allclose(found, np.angle(phasors) * wave / (2.0 * np.pi), rtol=1e-6)
     assert np.all(found[:2] < ranges[:2])
     assert_allclose(found[2], 2.0)
@@ -248,11 +308,19 @@ def test_stray_light_pulls_all_ranges_to_that_of_the_strongest_return():
 
 
 def test_a_saturated_return_blooms_over_the_rays_around_it():
-    """A retro-reflector seen by the central ray only fills a disc of bloom_deg; outside nothing changes."""
-    reflector = [Material("reflector", box_m=(-0.05, -0.05, -0.2, 0.05, 0.05, -0.1), retroreflectance=50.0)]
+    """A retro-reflector seen by the central ray only fills a disc of bloom_deg.
+
+    Outside nothing changes.
+    """
+    reflector = [
+        Material("reflector", box_m=(-0.05, -0.05, -0.2, 0.05, 0.05, -0.1), retroreflectance=50.0)
+    ]
     parts = (plate(-0.15, x=(-0.04, 0.04), y=(-0.04, 0.04)), plate())
     params = replace(CLEAN, saturation=2.0, max_incidence_deg=90.0)
-    sharp, blooming = (scanner(replace(params, bloom_deg=d), *parts, materials=reflector).cast(0.0) for d in (0.0, 5.0))
+    sharp, blooming = (
+        scanner(replace(params, bloom_deg=d), *parts, materials=reflector).cast(0.0)
+        for d in (0.0, 5.0)
+    )
     before, after = grid_of(sharp), grid_of(blooming)
     centre = np.array([0.0, 0.0, 1.0])
     for direction, value in after.items():
@@ -265,14 +333,23 @@ def test_a_saturated_return_blooms_over_the_rays_around_it():
 
 
 def test_the_sun_blinds_specular_faces_that_mirror_it():
-    """A tilted mirror returns nothing if the sun is in the mirrored direction of the ray, and all if it is not."""
+    """A tilted mirror returns nothing if the sun is in the mirrored direction of the ray, and all
+    if it is not.
+    """
     tilt = math.radians(20.0)
     mirror = [Material("cells", specular=5.0, specular_width_deg=2.0)]
     n = np.array([0.0, math.sin(tilt), -math.cos(tilt)])
     ray = np.array([0.0, 0.0, 1.0])
     mirrored = ray - 2.0 * (ray @ n) * n
     params = replace(CLEAN, fov_deg=(2.0, 2.0), max_incidence_deg=90.0)
-    cast = lambda sun, m: len(scanner(replace(params, sun_a=sun), plate(), tilt_rad=tilt, materials=m).cast(0.0).ranges)  # noqa: E731
+
+    def cast(sun, m):
+        return len(
+            scanner(replace(params, sun_a=sun), plate(), tilt_rad=tilt, materials=m)
+            .cast(0.0)
+            .ranges
+        )
+
     everything = cast(None, mirror)
     assert everything == 33 * 33
     assert cast(tuple(mirrored), mirror) == 0
@@ -305,5 +382,7 @@ f -6 -2 -5
     for group in ("panel", "wing", "black"):
         optics = face_optics(surface, [Material("m", group=group, reflectance=0.9)])
         assert_allclose(optics.diffuse, np.where(x > 0.0, 0.9, 0.5))
-    with pytest.raises(UsageError, match="no group 'nose' in the model; groups of the model: black, body, panel"):
+    with pytest.raises(
+        UsageError, match="no group 'nose' in the model; groups of the model: black, body, panel"
+    ):
         face_optics(surface, [Material("m", group="nose")])

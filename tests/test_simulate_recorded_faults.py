@@ -1,4 +1,6 @@
-"""Faults on recorded scans change the scans of their window as labelled, equally for equal seeds."""
+"""Faults on recorded scans change the scans of their window as labelled, equally for equal
+seeds.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,7 @@ from avsreplay.cli.record import EPILOG, record_command
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record
 from avsreplay.records import Scan, ScanStatus
-from avsreplay.simulate import RecordedFault, disturbed
-from avsreplay.simulate.recorded_faults import RECORDED_KINDS, range_noise
+from avsreplay.simulate.recorded_faults import RECORDED_KINDS, RecordedFault, disturbed, range_noise
 from avsreplay.simulate.scanner import Returns
 
 NS = 1_000_000_000
@@ -26,7 +27,9 @@ CHANGES_POINTS = {
 def plane(seed, towards=(0.0, 0.0, 1.0), n=1500, noise=0.004, dtype=np.float32):
     """A plane of 2 m x 2 m at 5 m in a direction, with noise along the direction."""
     rng = np.random.default_rng(seed)
-    points = np.column_stack([rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), 5.0 + noise * rng.standard_normal(n)])
+    points = np.column_stack(
+        [rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), 5.0 + noise * rng.standard_normal(n)]
+    )
     turn = Rotation.align_vectors([towards], [[0.0, 0.0, 1.0]])[0]
     return turn.apply(points).astype(dtype)
 
@@ -45,7 +48,10 @@ def same(one, two):
 
 
 def test_the_help_of_record_lists_every_kind_with_its_default_strength():
-    shown = {f"{kind}:{default:g}" if default is not None else kind for kind, (default, _) in RECORDED_KINDS.items()}
+    shown = {
+        f"{kind}:{default:g}" if default is not None else kind
+        for kind, (default, _) in RECORDED_KINDS.items()
+    }
     assert shown <= set(EPILOG.split())
 
 
@@ -74,7 +80,9 @@ def test_the_seed_decides():
     assert not any(map(same, faulty(scans(), text, seed=4), faulty(scans(), text, seed=5)))
 
 
-@pytest.mark.parametrize("towards", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.5, -0.6, 0.2)])
+@pytest.mark.parametrize(
+    "towards", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.5, -0.6, 0.2)]
+)
 def test_strengths_mean_what_the_table_says_in_any_direction(towards):
     def one(text):
         return faulty(scans(1, towards=towards), text)[0].points.astype(float)
@@ -86,7 +94,9 @@ def test_strengths_mean_what_the_table_says_in_any_direction(towards):
     def share_kept(after):
         return sum(tuple(p) in unchanged for p in after) / len(before)
 
-    assert np.linalg.norm(one("range_bias:0:1:0.25"), axis=1) - ranges == pytest.approx(0.25, abs=1e-5)
+    assert np.linalg.norm(one("range_bias:0:1:0.25"), axis=1) - ranges == pytest.approx(
+        0.25, abs=1e-5
+    )
     moved = one("outliers:0:1:0.3")
     wrong = np.abs(np.linalg.norm(moved, axis=1) - ranges) > 1e-4
     assert wrong.mean() == pytest.approx(0.3, abs=0.05)
@@ -114,7 +124,9 @@ def test_the_noise_is_estimated_from_the_scan_and_multiplied(noise):
 def test_a_frozen_window_repeats_the_scan_before_it_and_a_stamp_jump_moves_the_stamp():
     given = scans()
     frozen = faulty(given, "frozen:4:3")
-    assert [scan.points.tobytes() == given[3].points.tobytes() for scan in frozen[4:7]] == [True] * 3
+    assert [scan.points.tobytes() == given[3].points.tobytes() for scan in frozen[4:7]] == [
+        True
+    ] * 3
     assert [scan.t_ns for scan in frozen] == [scan.t_ns for scan in given]
     jumped = faulty(given, "stamp_jump:4:1:12.5")
     assert jumped[4].t_ns - given[4].t_ns == 12_500_000_000
@@ -122,9 +134,9 @@ def test_a_frozen_window_repeats_the_scan_before_it_and_a_stamp_jump_moves_the_s
 
 
 def test_frame_rate_keeps_every_nth_scan():
-    assert [scan is not None for scan in faulty(scans(), "frame_rate:2:6:3")] == [True] * 3 + [False] * 2 + [True] + [
+    assert [scan is not None for scan in faulty(scans(), "frame_rate:2:6:3")] == [True] * 3 + [
         False
-    ] * 2 + [True] * 2
+    ] * 2 + [True] + [False] * 2 + [True] * 2
 
 
 def test_times_of_points_stay_with_their_points():
@@ -132,7 +144,16 @@ def test_times_of_points_stay_with_their_points():
     found = faulty([Scan(0, 0, points, times_s=times, log_ns=EPOCH)], "subsampled:0:1:0.5")[0]
     expected = {tuple(p): t for p, t in zip(points, times, strict=True)}
     assert all(
-        abs(expected[min(expected, key=lambda q, p=p: sum((a - b) ** 2 for a, b in zip(p, q, strict=True)))] - t) < 1e-6
+        abs(
+            expected[
+                min(
+                    expected,
+                    key=lambda q, p=p: sum((a - b) ** 2 for a, b in zip(p, q, strict=True)),
+                )
+            ]
+            - t
+        )
+        < 1e-6
         for p, t in list(zip(found.points, found.times_s, strict=True))[:5]
     )
 
@@ -158,15 +179,21 @@ def test_times_of_points_stay_with_their_points():
 )
 def test_a_wrong_fault_is_one_line(text, what, fixtures_folder, tmp_path):
     log = str(fixtures_folder / "tumble.mcap")
-    done = CliRunner().invoke(record_command, [log, "-o", str(tmp_path / "o.mcap"), "--fault", text])
+    done = CliRunner().invoke(
+        record_command, [log, "-o", str(tmp_path / "o.mcap"), "--fault", text]
+    )
     assert done.exit_code == 2
     assert what in done.output
     assert not (tmp_path / "o.mcap").exists()
 
 
-def test_a_recorded_log_with_faults_has_labels_and_the_truth_of_the_scans_as_they_were(fixtures_folder, tmp_path):
+def test_a_recorded_log_with_faults_has_labels_and_the_truth_of_the_scans_as_they_were(
+    fixtures_folder, tmp_path
+):
     log, out = fixtures_folder / "tumble.mcap", tmp_path / "faulty.mcap"
-    faults = tuple(RecordedFault.parse(t) for t in ("stamp_jump:1:0.5:9", "clutter:2:1:0.3", "dropped:9:0.5"))
+    faults = tuple(
+        RecordedFault.parse(t) for t in ("stamp_jump:1:0.5:9", "clutter:2:1:0.3", "dropped:9:0.5")
+    )
     done = record(log, out, options=RecordOptions(faults=faults, fault_seed=7))
     assert {kind for kind, *_ in done.faults} >= {"stamp_jump", "clutter", "dropped"}
     with open_source(log, SourceOptions()) as one, open_source(out, SourceOptions()) as two:
@@ -191,7 +218,9 @@ def test_a_recorded_log_with_faults_has_labels_and_the_truth_of_the_scans_as_the
 
 def test_a_fault_after_the_end_is_said(fixtures_folder, tmp_path):
     faults = (RecordedFault.parse("empty:900:1"),)
-    done = record(fixtures_folder / "tumble.mcap", tmp_path / "o.mcap", options=RecordOptions(faults=faults))
+    done = record(
+        fixtures_folder / "tumble.mcap", tmp_path / "o.mcap", options=RecordOptions(faults=faults)
+    )
     assert done.note == "faults outside of the recording are left out: empty"
 
 
@@ -204,10 +233,14 @@ def test_a_shortened_scenario_lists_its_own_faults_only(tmp_path):
     )
     whole = record(tmp_path / "s.toml", tmp_path / "whole.mcap")
     assert [fault[0] for fault in whole.faults] == ["empty", "frozen"]
-    cut = record(tmp_path / "s.toml", tmp_path / "cut.mcap", reading=SourceOptions(duration_s=4.0))  # last scan: 3.5 s
+    cut = record(
+        tmp_path / "s.toml", tmp_path / "cut.mcap", reading=SourceOptions(duration_s=4.0)
+    )  # last scan: 3.5 s
     assert [fault[0] for fault in cut.faults] == ["empty"]
     assert cut.note == "faults outside of the recording are left out: frozen"
     with open_source(tmp_path / "cut.mcap") as source:
         assert [label.kind for label in source.header.labels] == ["empty"]
-    again = record(tmp_path / "whole.mcap", tmp_path / "part.mcap", reading=SourceOptions(end_s=3.0))
+    again = record(
+        tmp_path / "whole.mcap", tmp_path / "part.mcap", reading=SourceOptions(end_s=3.0)
+    )
     assert [fault[0] for fault in again.faults] == ["empty"]

@@ -1,4 +1,6 @@
-"""Rays against the mesh, range noise against its distribution, scans of finite duration against the true motion."""
+"""Rays against the mesh, range noise against its distribution, scans of finite duration against the
+true motion.
+"""
 
 from dataclasses import replace
 
@@ -11,18 +13,22 @@ from scipy import stats
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend
 from avsreplay.records import Surface
-from avsreplay.simulate import Shape, builtin_surface, rays
+from avsreplay.simulate import rays
 from avsreplay.simulate.motion import Motion, MotionParams
 from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster, ScannerParams
 from avsreplay.simulate.scanner import Scanner
-from avsreplay.simulate.target import TargetParams, body
+from avsreplay.simulate.target import Shape, TargetParams, body, builtin_surface
 
-needs_embree = pytest.mark.skipif(not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed")
+needs_embree = pytest.mark.skipif(
+    not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed"
+)
 SURFACE = builtin_surface()
 MESH = trimesh.Trimesh(SURFACE.vertices, SURFACE.faces, process=False)
 CLEAN = ScannerParams(rays=(40, 40), noise_m=0.0, outlier_ratio=0.0)
 SPIN = MotionParams(
-    attitude_xyzw=tuple(geometry.exp([0.1, 1.4, 0.2])), rate_radps=(0.1, 0.2, -0.2), velocity_mps=(0.02, 0, 0)
+    attitude_xyzw=tuple(geometry.exp([0.1, 1.4, 0.2])),
+    rate_radps=(0.1, 0.2, -0.2),
+    velocity_mps=(0.02, 0, 0),
 )
 
 
@@ -54,7 +60,11 @@ def test_both_engines_give_the_same_returns():
     a, b = (scanner(replace(CLEAN, engine=e)).cast(1.0) for e in (Engine.EMBREE, Engine.EXACT))
     assert abs(len(a.ranges) - len(b.ranges)) <= 2
     both = {tuple(d): r for d, r in zip(a.directions, a.ranges, strict=True)}
-    gap = [abs(both[tuple(d)] - r) for d, r in zip(b.directions, b.ranges, strict=True) if tuple(d) in both]
+    gap = [
+        abs(both[tuple(d)] - r)
+        for d, r in zip(b.directions, b.ranges, strict=True)
+        if tuple(d) in both
+    ]
     assert np.mean(np.array(gap) < 1e-9) > 0.999
 
 
@@ -64,17 +74,26 @@ def test_nothing_stands_in_front_of_a_return():
     returns = scan.cast(0.0)
     R_ac, t_ac = scan._motion.poses([0.0])
     origin, towards = (-t_ac @ R_ac[0]), returns.directions @ R_ac[0]
-    located, ray, _ = MESH.ray.intersects_location(np.repeat(origin, len(towards), 0), towards, multiple_hits=True)
+    located, ray, _ = MESH.ray.intersects_location(
+        np.repeat(origin, len(towards), 0), towards, multiple_hits=True
+    )
     nearest = np.full(len(towards), np.inf)
     np.minimum.at(nearest, ray, np.linalg.norm(located - origin, axis=1))
     assert_allclose(returns.ranges, nearest, atol=1e-5)
 
 
 def test_a_wall_is_seen_at_its_distance():
-    wall = Surface(np.array([[-9.0, -9, 0], [9, -9, 0], [0, 18, 0]]), np.array([[0, 1, 2]], np.int32), "wall", "")
+    wall = Surface(
+        np.array([[-9.0, -9, 0], [9, -9, 0], [0, 18, 0]]),
+        np.array([[0, 1, 2]], np.int32),
+        "wall",
+        "",
+    )
     for engine in (Engine.EXACT, Engine.AUTO):
         towards = geometry.normalise(np.array([[0.0, 0, 0, 1]]))[:, [0, 1, 3]]
-        ranges, cosine, faces = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), towards)
+        ranges, cosine, faces = RayCaster(wall, engine).ranges(
+            np.array([[0.1, 0.2, -3.0]]), towards
+        )
         assert_allclose(ranges, 3.0, atol=1e-12)
         assert_allclose(cosine, 1.0)
         assert (faces >= 0).all()
@@ -105,7 +124,9 @@ def test_range_noise_is_white_and_of_its_level():
     params = replace(CLEAN, noise_m=0.01, rays=(80, 80))
     scan = scanner(params)
     clean = scan.cast(0.0)
-    errors = np.concatenate([scan.disturb(clean, rng(k)).ranges - clean.ranges for k in range(5)]) / 0.01
+    errors = (
+        np.concatenate([scan.disturb(clean, rng(k)).ranges - clean.ranges for k in range(5)]) / 0.01
+    )
     low, high = stats.chi2(len(errors)).ppf([5e-4, 1 - 5e-4])
     assert low < np.sum(errors**2) < high
     assert abs(np.mean(errors)) < 3.3 / np.sqrt(len(errors))
@@ -128,7 +149,13 @@ def test_outliers_and_dropouts_have_their_share():
     n = len(clean.ranges)
     assert stats.binomtest(n - len(kept.ranges), n, 0.2).pvalue > 1e-3
     truth = {tuple(d): r for d, r in zip(clean.directions, clean.ranges, strict=True)}
-    wrong = np.array([r for d, r in zip(kept.directions, kept.ranges, strict=True) if abs(truth[tuple(d)] - r) > 1e-12])
+    wrong = np.array(
+        [
+            r
+            for d, r in zip(kept.directions, kept.ranges, strict=True)
+            if abs(truth[tuple(d)] - r) > 1e-12
+        ]
+    )
     assert stats.binomtest(len(wrong), len(kept.ranges), 0.1).pvalue > 1e-3
     window = (params.range_min_m, params.range_max_m - params.range_min_m)
     assert stats.kstest(wrong, "uniform", window).pvalue > 1e-3
@@ -143,7 +170,9 @@ def test_points_of_a_rolling_scan_put_back_by_their_own_pose_lie_on_the_mesh():
     assert distance_to_mesh(points_c).max() < 1e-6
     R_0, t_0 = scan._motion.poses([2.0])
     as_one = (returns.directions * returns.ranges[:, None] - t_0) @ R_0[0]
-    assert distance_to_mesh(as_one).max() > 0.05  # by the pose at the stamp they do not: the target turned 0.3 rad
+    assert (
+        distance_to_mesh(as_one).max() > 0.05
+    )  # by the pose at the stamp they do not: the target turned 0.3 rad
     assert np.all(np.diff(returns.times_s) > 0)
     assert 0 <= returns.times_s[0] < returns.times_s[-1] < 1.0
 
@@ -160,10 +189,17 @@ def test_a_raster_of_a_still_target_is_a_flash_of_the_same_rays():
 @pytest.mark.parametrize("pattern", list(Pattern))
 def test_the_field_of_view_bounds_every_ray(view, pattern):
     params = replace(
-        CLEAN, fov_deg=(20.0, 10.0), view=view, pattern=pattern, scan_s=float(pattern is not Pattern.FLASH)
+        CLEAN,
+        fov_deg=(20.0, 10.0),
+        view=view,
+        pattern=pattern,
+        scan_s=float(pattern is not Pattern.FLASH),
     )
     d = scanner(params)._rays[0]
-    across, down = np.degrees(np.arctan2(d[:, 0], d[:, 2])), np.degrees(np.arctan2(d[:, 1], d[:, 2]))
+    across, down = (
+        np.degrees(np.arctan2(d[:, 0], d[:, 2])),
+        np.degrees(np.arctan2(d[:, 1], d[:, 2])),
+    )
     assert np.abs(across).max() < 10
     assert np.abs(down).max() < 5
     assert np.abs(across).max() > 9.5
@@ -175,7 +211,9 @@ def test_the_field_of_view_bounds_every_ray(view, pattern):
 
 def test_range_gate_and_grazing_returns():
     flat = replace(CLEAN, max_incidence_deg=90.0)
-    assert len(scanner(replace(CLEAN, max_incidence_deg=60.0)).cast(0.0).ranges) < len(scanner(flat).cast(0.0).ranges)
+    assert len(scanner(replace(CLEAN, max_incidence_deg=60.0)).cast(0.0).ranges) < len(
+        scanner(flat).cast(0.0).ranges
+    )
     near = scanner(replace(flat, range_max_m=5.0)).cast(0.0)
     assert 0 < len(near.ranges) < len(scanner(flat).cast(0.0).ranges)
     assert near.ranges.max() <= 5.0

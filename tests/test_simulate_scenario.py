@@ -15,10 +15,11 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.records import ScanStatus
 from avsreplay.report.charts import KINDS
-from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
 from avsreplay.simulate.faults import InjectedFault, Kind, active, label
 from avsreplay.simulate.recorded_faults import RECORDED_KINDS
-from avsreplay.simulate.scenario import StartParams, belief
+from avsreplay.simulate.scenario import StartParams, belief, load_scenario, scenario_of
+from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.target import builtin_surface
 
 SURFACE = builtin_surface()
 MESH = trimesh.Trimesh(SURFACE.vertices, SURFACE.faces, process=False)
@@ -60,7 +61,12 @@ def plain():
 def test_the_builtin_scenario_is_the_documented_one():
     s = load_scenario()
     p = s.params
-    assert (p.duration_s, p.rate_hz, p.scanner.noise_m, p.scanner.outlier_ratio) == (120.0, 5.0, 0.008, 0.02)
+    assert (p.duration_s, p.rate_hz, p.scanner.noise_m, p.scanner.outlier_ratio) == (
+        120.0,
+        5.0,
+        0.008,
+        0.02,
+    )
     assert math.hypot(*p.motion.rate_radps) == pytest.approx(0.1, rel=1e-3)
     assert math.hypot(*p.motion.position_m) == pytest.approx(5.0, rel=1e-2)
     kinds = [(f.kind, f.start_s, f.duration_s) for f in p.fault]
@@ -73,7 +79,10 @@ def test_the_builtin_scenario_is_the_documented_one():
     assert np.abs(start.w_b - truth.w_b).max() < 0.01
     assert np.abs(start.sigma - truth.sigma).max() < 0.1
     assert np.abs(start.c_b - truth.c_b).max() < 0.1
-    assert np.degrees(geometry.angle(geometry.multiply(geometry.conjugate(truth.q_bc), start.q_bc))) < 2.0
+    assert (
+        np.degrees(geometry.angle(geometry.multiply(geometry.conjugate(truth.q_bc), start.q_bc)))
+        < 2.0
+    )
 
 
 def test_builtin_scans_have_about_4000_points():
@@ -146,7 +155,9 @@ def test_a_partial_occlusion_hides_its_share_from_one_side(plain, hidden):
         assert abs(np.sum(good) - (1 - hidden) * n) < 3
         assert np.sum(~good) < 3 * 0.05 * n
     middle = [
-        np.mean(s.points[on_model(s) < 0.1, :2], axis=0) - np.mean(plain[s.seq].points[:, :2], axis=0) for s in run[4:6]
+        np.mean(s.points[on_model(s) < 0.1, :2], axis=0)
+        - np.mean(plain[s.seq].points[:, :2], axis=0)
+        for s in run[4:6]
     ]
     assert middle[0] @ middle[1] > 0.9 * np.linalg.norm(middle[0]) * np.linalg.norm(middle[1])
 
@@ -179,7 +190,9 @@ def test_frozen_scans_repeat_the_last_one_before(plain):
     for scan in run[4:6]:
         assert np.array_equal(scan.points, plain[3].points)
         assert scan.t_ns == plain[scan.seq].t_ns
-    assert scans(fault("frozen", start=0.0))[0].points.shape == plain[0].points.shape  # nothing to repeat yet
+    assert (
+        scans(fault("frozen", start=0.0))[0].points.shape == plain[0].points.shape
+    )  # nothing to repeat yet
 
 
 def test_stamps_jump_and_the_log_clock_does_not(plain):
@@ -223,7 +236,10 @@ def test_the_first_belief_is_drawn_from_its_own_covariance():
 
 
 def _error(truth, mean):
-    """The 20 errors as the state convention has them: q = dq (x) q_hat, mu = mu_hat (x) dmu, all else a difference."""
+    """The 20 errors as the state convention has them.
+
+    Q = dq (x) q_hat, mu = mu_hat (x) dmu, all else a difference.
+    """
     dq = geometry.normalise(geometry.multiply(geometry.conjugate(mean.q_ab), truth.q_ab))
     dmu = geometry.normalise(geometry.multiply(truth.q_bc, geometry.conjugate(mean.q_bc)))
     plain = [getattr(truth, n) - getattr(mean, n) for n in ("w_b", "r_a", "v_a", "sigma", "c_b")]
@@ -232,7 +248,9 @@ def _error(truth, mean):
 
 def test_offsets_that_are_given_are_used_as_they_are():
     truth = simulate(scenario(), SURFACE).header.truth
-    given = StartParams(rate_offset_radps=(0.01, 0, 0), mu_offset_deg=(0, 2.0, 0), sigma_offset=(0.0, 0.05))
+    given = StartParams(
+        rate_offset_radps=(0.01, 0, 0), mu_offset_deg=(0, 2.0, 0), sigma_offset=(0.0, 0.05)
+    )
     mean = belief(given, truth, 0, np.random.Generator(np.random.PCG64(0))).x
     assert_allclose(mean.w_b - truth.w_b, [0.01, 0, 0], atol=1e-15)
     assert_allclose(mean.sigma - truth.sigma, [0, 0.05], atol=1e-15)
@@ -334,7 +352,9 @@ def test_a_model_is_named_beside_the_scenario(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "path", sorted((Path(__file__).parent.parent / "docs" / "scenarios").glob("*.toml")), ids=lambda p: p.stem
+    "path",
+    sorted((Path(__file__).parent.parent / "docs" / "scenarios").glob("*.toml")),
+    ids=lambda p: p.stem,
 )
 def test_the_ready_scenarios_see_their_target(path):
     loaded = load_scenario(path)
@@ -346,7 +366,9 @@ def test_the_ready_scenarios_see_their_target(path):
 
 def test_the_three_strengths_of_faults_hold_every_kind():
     for level in ("weak", "medium", "strong"):
-        params = load_scenario(Path(__file__).parent.parent / "docs" / "scenarios" / f"faults-{level}.toml").params
+        params = load_scenario(
+            Path(__file__).parent.parent / "docs" / "scenarios" / f"faults-{level}.toml"
+        ).params
         assert {f.kind for f in params.fault} == set(Kind)
 
 

@@ -17,10 +17,11 @@ from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Scan
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
 from avsreplay.simulate.rays import FieldOfView, Pattern, ray_grid
+from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.simulate.scene import SceneObject
-from avsreplay.simulate.target import ply_bytes
+from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.target import builtin_surface, ply_bytes
 
 SURFACE = builtin_surface()
 BASE = """
@@ -63,7 +64,10 @@ def test_a_wall_in_front_hides_the_target():
 
 
 def test_a_black_object_hides_what_is_behind_without_returning_anything():
-    near = "[[object]]\nname = 'plate'\nsize_m = [9.0, 9.0, 0.1]\nposition_m = [0.0, 0.0, 2.0]\nreflectance = 0.0\n"
+    near = (
+        "[[object]]\nname = 'plate'\nsize_m = [9.0, 9.0, 0.1]\nposition_m = [0.0, 0.0,"
+        " 2.0]\nreflectance = 0.0\n"
+    )
     _, _, points = scans_of("intensity_min = 1e-6\n" + near)
     assert [len(p) for p in points] == [0] * 4
 
@@ -94,7 +98,9 @@ def test_an_occluder_is_where_its_motion_puts_it(pattern):
     scanner = "pattern = 'raster'\nscan_s = 0.9\n" if pattern == "raster" else ""
     _, scans, clouds = scans_of(scanner + text)
     for k, (scan, points) in enumerate(zip(scans, clouds, strict=True)):
-        times = k + (np.zeros(len(points)) if scan.times_s is None else scan.times_s.astype(np.float64))
+        times = k + (
+            np.zeros(len(points)) if scan.times_s is None else scan.times_s.astype(np.float64)
+        )
         centre = np.array([-0.5, 0.0, 2.0]) + times[:, None] * np.array([0.3, 0.0, 0.05])
         R = geometry.matrix(geometry.exp(times[:, None] * np.array([0.1, 0.4, -0.3])))
         inside = np.abs(np.einsum("nji,nj->ni", R, points - centre)) / np.array([0.5, 0.3, 0.2])
@@ -113,7 +119,10 @@ def test_objects_leave_the_truth_and_the_noise_of_the_target_alone():
 
 def test_a_mesh_is_read_from_the_scenario_s_folder_and_recorded(tmp_path):
     (tmp_path / "second.ply").write_bytes(ply_bytes(SURFACE.vertices, SURFACE.faces))
-    text = BASE + "[[object]]\nname = 'debris'\nmodel = 'second.ply'\nposition_m = [1.5, 0.0, 8.0]\nduration_s = 2.0\n"
+    text = (
+        BASE + "[[object]]\nname = 'debris'\nmodel = 'second.ply'\nposition_m = [1.5, 0.0,"
+        " 8.0]\nduration_s = 2.0\n"
+    )
     (tmp_path / "s.toml").write_text(text)
     done = record_scenario(load_scenario(tmp_path / "s.toml"), tmp_path / "s.mcap", RecordOptions())
     assert [fault[0] for fault in done.faults] == ["debris"]
@@ -144,8 +153,13 @@ def test_presence_is_half_open():
 
 
 def test_a_launcher_adapter_is_a_hollow_cone():
-    """Every point that is not on the target is on the cone's wall, whose two surfaces are 5 % of a radius apart."""
-    text = "[[object]]\nname = 'adapter'\nshape = 'adapter'\nsize_m = [4.0, 3.0, 1.0]\nposition_m = [0.0, 0.0, 9.0]\n"
+    """Every point that is not on the target is on the cone's wall, whose two surfaces are 5 % of a
+    radius apart.
+    """
+    text = (
+        "[[object]]\nname = 'adapter'\nshape = 'adapter'\nsize_m = [4.0, 3.0, 1.0]\nposition_m ="
+        " [0.0, 0.0, 9.0]\n"
+    )
     _, _, alone = scans_of("range_max_m = 20.0\n")
     _, _, both = scans_of("range_max_m = 20.0\n" + text)
     for target, scene in zip(alone, both, strict=True):
@@ -166,7 +180,9 @@ direction = [0.0, 0.6, 0.8]
 half_angle_deg = 25.0
 particles_per_metre = 0.6
 """
-OPEN = BASE.replace("position_m = [0.0, 0.0, 5.0]", "position_m = [0.0, 0.0, -50.0]")  # the target out of view
+OPEN = BASE.replace(
+    "position_m = [0.0, 0.0, 5.0]", "position_m = [0.0, 0.0, -50.0]"
+)  # the target out of view
 
 
 def plume_depth(params, ray, end):
@@ -183,12 +199,16 @@ def plume_depth(params, ray, end):
 
 
 def test_particles_of_a_plume_have_the_stated_density():
-    """Shares of hit rays and ranges of particles against the integral of the density along the rays."""
+    """Shares of hit rays and ranges of particles against the integral of the density along the
+    rays.
+    """
     params = scenario_of(toml_document.parse(PLUME, "p.toml")).params.plume[0]
     many = 20000
     for aim in ([0.0, 0.0, 1.0], [0.0, 0.3, 1.0], [0.2, 0.1, 1.0]):
         ray = np.array(aim) / np.linalg.norm(aim)
-        drawn = params.particles(np.tile(ray, (many, 1)), np.full(many, 6.0), np.random.default_rng(4))
+        drawn = params.particles(
+            np.tile(ray, (many, 1)), np.full(many, 6.0), np.random.default_rng(4)
+        )
         hit = 1.0 - math.exp(-plume_depth(params, ray, 6.0))
         share = np.isfinite(drawn).mean()
         assert abs(share - hit) < 4.0 * math.sqrt(hit * (1.0 - hit) / many) + 0.003
@@ -229,7 +249,10 @@ def angle_from(points, centre):
 
 
 def test_false_returns_come_from_the_beams_that_look_at_the_earth():
-    """Their share of those beams, and their ranges, are as stated; beams on the target or to the sky have none."""
+    """Their share of those beams, and their ranges, are as stated.
+
+    Beams on the target or to the sky have none.
+    """
     _, _, alone = scans_of("max_incidence_deg = 90.0\n")
     simulation, _, scenes = scans_of("max_incidence_deg = 90.0\n" + LIMB)
     assert simulation.header.labels == ()
@@ -251,24 +274,46 @@ def test_false_returns_come_from_the_beams_that_look_at_the_earth():
 def test_the_earth_moves_with_its_rate_and_with_the_camera():
     turning = LIMB + "rate_radps = [0.0, 0.0, 0.7853981633974483]\n"  # towards -x
     text = OPEN.replace("duration_s = 4.0", "duration_s = 3.0")
-    scans = list(simulate(scenario_of(toml_document.parse(text + turning, "s.toml")), SURFACE).scans())
+    scans = list(
+        simulate(scenario_of(toml_document.parse(text + turning, "s.toml")), SURFACE).scans()
+    )
     for k, scan in enumerate(scans):
         phase = math.pi / 4.0 * k
         points = scan.points.astype(np.float64)
         assert len(points) > 100
         assert angle_from(points, [-math.sin(phase), math.cos(phase), 0.0]).max() < 80.0 + 1e-3
     camera = "[camera]\nrate_radps = [0.0, 0.0, 0.7853981633974483]\n"
-    scans = list(simulate(scenario_of(toml_document.parse(text + LIMB + camera, "s.toml")), SURFACE).scans())
+    scans = list(
+        simulate(scenario_of(toml_document.parse(text + LIMB + camera, "s.toml")), SURFACE).scans()
+    )
     for k, scan in enumerate(scans):
         phase = -math.pi / 4.0 * k
-        assert angle_from(scan.points.astype(np.float64), [-math.sin(phase), math.cos(phase), 0.0]).max() < 80.0 + 1e-3
+        assert (
+            angle_from(
+                scan.points.astype(np.float64), [-math.sin(phase), math.cos(phase), 0.0]
+            ).max()
+            < 80.0 + 1e-3
+        )
 
 
-@pytest.mark.parametrize(("centre", "share"), [([0.0, 0.0, 1.0], 1.0), ([0.0, 1.0, 0.0], 0.5), ([0.0, 0.0, -1.0], 0.0)])
+@pytest.mark.parametrize(
+    ("centre", "share"), [([0.0, 0.0, 1.0], 1.0), ([0.0, 1.0, 0.0], 0.5), ([0.0, 0.0, -1.0], 0.0)]
+)
 def test_glare_of_the_earth_adds_to_the_variance_of_the_ranges(centre, share):
-    wall = "[[object]]\nname = 'wall'\nsize_m = [20.0, 20.0, 0.1]\nposition_m = [0.0, 0.0, 6.0]\nreflectance = 1.0\n"
-    text = OPEN.replace("noise_m = 0.0", "noise_m = 0.01").replace("duration_s = 4.0", "duration_s = 2.0") + wall
-    limb = f"[[limb]]\ncentre_a = {centre}\nradius_deg = 90.0\nglare = 3.0\nstart_s = 1.0\nduration_s = 1.0\n"
+    wall = (
+        "[[object]]\nname = 'wall'\nsize_m = [20.0, 20.0, 0.1]\nposition_m = [0.0, 0.0,"
+        " 6.0]\nreflectance = 1.0\n"
+    )
+    text = (
+        OPEN.replace("noise_m = 0.0", "noise_m = 0.01").replace(
+            "duration_s = 4.0", "duration_s = 2.0"
+        )
+        + wall
+    )
+    limb = (
+        f"[[limb]]\ncentre_a = {centre}\nradius_deg = 90.0\nglare = 3.0\nstart_s = 1.0\nduration_s"
+        " = 1.0\n"
+    )
     simulation = simulate(scenario_of(toml_document.parse(text + limb, "s.toml")), SURFACE)
     noises = []
     for scan in simulation.scans():
@@ -288,7 +333,9 @@ def test_the_tables_of_the_documentation_are_valid():
     assert [params.plume[0].duration_s, params.limb[0].duration_s] == [2.0, 20.0]
 
 
-@pytest.mark.parametrize("text", ["[[plume]]\ndirection = [0.0, 0.0, 2.0]\n", "[[limb]]\ncentre_a = [0.0, 0.0, 0.0]\n"])
+@pytest.mark.parametrize(
+    "text", ["[[plume]]\ndirection = [0.0, 0.0, 2.0]\n", "[[limb]]\ncentre_a = [0.0, 0.0, 0.0]\n"]
+)
 def test_directions_of_plume_and_earth_are_unit_vectors(text):
     with pytest.raises(UsageError, match="unit vector"):
         scenario_of(toml_document.parse(text, "s.toml"))
@@ -296,7 +343,10 @@ def test_directions_of_plume_and_earth_are_unit_vectors(text):
 
 def test_an_appendage_swings_about_its_hinge_and_the_rest_stays():
     """The points on a panel, turned back by the swing about the hinge, lie on the rigid model."""
-    panel = "[[appendage]]\nname = 'panel'\nbox_m = [-9.0, 0.6, -9.0, 9.0, 9.0, 9.0]\nhinge_m = [-0.7, 0.6, 0.3]\n"
+    panel = (
+        "[[appendage]]\nname = 'panel'\nbox_m = [-9.0, 0.6, -9.0, 9.0, 9.0, 9.0]\nhinge_m = [-0.7,"
+        " 0.6, 0.3]\n"
+    )
     panel += "axis_c = [1.0, 0.0, 0.0]\namplitude_deg = 20.0\nfrequency_hz = 0.25\n"
     simulation, scans, swung = scans_of(panel)
     index = SurfaceIndex.build(SURFACE, 0.5)
@@ -304,10 +354,17 @@ def test_an_appendage_swings_about_its_hinge_and_the_rest_stays():
     for scan, points in zip(scans, swung, strict=True):
         T_ac = simulation.truth_of(scan).pose
         p = T_ac.inverse().apply(points)
-        angle = math.radians(20.0) * math.sin(2.0 * math.pi * 0.25 * scan.seq)  # an oracle of its own: a plane rotation
+        angle = math.radians(20.0) * math.sin(
+            2.0 * math.pi * 0.25 * scan.seq
+        )  # an oracle of its own: a plane rotation
         y, z = p[:, 1] - 0.6, p[:, 2] - 0.3
-        back = np.column_stack([p[:, 0], math.cos(angle) * y + math.sin(angle) * z + 0.6,
-                                -math.sin(angle) * y + math.cos(angle) * z + 0.3])  # fmt: skip
+        back = np.column_stack(
+            [
+                p[:, 0],
+                math.cos(angle) * y + math.sin(angle) * z + 0.6,
+                -math.sin(angle) * y + math.cos(angle) * z + 0.3,
+            ]
+        )
         rigid, turned = (np.sqrt(index.closest(x).d2) for x in (p, back))
         assert np.minimum(rigid, turned).max() < 1e-5
         away.append(rigid.max())
@@ -330,7 +387,11 @@ frequency_hz = 3.3
 
 
 def test_the_scans_of_a_moving_camera_lie_on_the_target_after_its_pose(tmp_path):
-    record_scenario(scenario_of(toml_document.parse(BASE + CAMERA, "s.toml")), tmp_path / "m.mcap", RecordOptions())
+    record_scenario(
+        scenario_of(toml_document.parse(BASE + CAMERA, "s.toml")),
+        tmp_path / "m.mcap",
+        RecordOptions(),
+    )
     index = SurfaceIndex.build(SURFACE, 0.5)
     away = {}
     for name, options in (
@@ -341,7 +402,11 @@ def test_the_scans_of_a_moving_camera_lie_on_the_target_after_its_pose(tmp_path)
     ):
         with open_source(tmp_path / "m.mcap", options) as source:
             far = [
-                np.sqrt(index.closest(source.truth_of(scan).pose.inverse().apply(np.float64(scan.points))).d2).max()
+                np.sqrt(
+                    index.closest(
+                        source.truth_of(scan).pose.inverse().apply(np.float64(scan.points))
+                    ).d2
+                ).max()
                 for scan in source.scans()
             ]
         away[name] = max(far)
@@ -355,13 +420,26 @@ def test_the_reported_pose_of_the_camera_has_the_stated_error():
     noisy = CAMERA + "pose_std_m = 0.01\npose_std_deg = 0.5\n"
     text = BASE.replace("duration_s = 4.0", "duration_s = 400.0") + noisy
     simulation = simulate(scenario_of(toml_document.parse(text, "s.toml")), SURFACE)
-    exact = simulate(scenario_of(toml_document.parse(text.replace("= 0.01\n", "= 0.0\n").replace(
-        "pose_std_deg = 0.5", "pose_std_deg = 0.0"), "s.toml")), SURFACE)  # fmt: skip
+    exact = simulate(
+        scenario_of(
+            toml_document.parse(
+                text.replace("= 0.01\n", "= 0.0\n").replace(
+                    "pose_std_deg = 0.5", "pose_std_deg = 0.0"
+                ),
+                "s.toml",
+            )
+        ),
+        SURFACE,
+    )
     empty = np.zeros((0, 3), np.float32)
     scans = [Scan(k, 0, empty, log_ns=EPOCH_NS + k * 1_000_000_000) for k in range(400)]
-    pairs = [(simulation.camera_poses(scan)[0][1], exact.camera_poses(scan)[0][1]) for scan in scans]
+    pairs = [
+        (simulation.camera_poses(scan)[0][1], exact.camera_poses(scan)[0][1]) for scan in scans
+    ]
     shift = np.array([a.t - b.t for a, b in pairs])
-    turn = np.array([geometry.log(geometry.multiply(geometry.conjugate(b.q), a.q)) for a, b in pairs])
+    turn = np.array(
+        [geometry.log(geometry.multiply(geometry.conjugate(b.q), a.q)) for a, b in pairs]
+    )
     assert_allclose(shift.std(), 0.01, rtol=0.1)
     assert_allclose(np.degrees(turn).std(), 0.5, rtol=0.1)
     assert simulation.camera_poses(scans[7])[0][1].t.tolist() == pairs[7][0].t.tolist()  # by seed
@@ -370,13 +448,19 @@ def test_the_reported_pose_of_the_camera_has_the_stated_error():
 def test_intensity_is_written_and_read_back(tmp_path):
     path = tmp_path / "i.mcap"
     _, scans, _ = scans_of("intensity = true\n")
-    record_scenario(scenario_of(toml_document.parse(BASE + "intensity = true\n", "s.toml")), path, RecordOptions())
+    record_scenario(
+        scenario_of(toml_document.parse(BASE + "intensity = true\n", "s.toml")),
+        path,
+        RecordOptions(),
+    )
     with open_source(path, SourceOptions(crop_range=(0.0, 4.9))) as source:
         for scan, made in zip(source.scans(), scans, strict=True):
             near = np.linalg.norm(made.points.astype(np.float64), axis=1) <= 4.9
             np.testing.assert_array_equal(scan.intensities, made.intensities[near])
             assert len(scan.intensities) == len(scan.points) > 0
             r2 = np.sum(scan.points.astype(np.float64) ** 2, axis=1)
-            assert np.all(scan.intensities <= 0.5 / r2 * (1.0 + 1e-4))  # Lambert: at most the reflectance over r^2
+            assert np.all(
+                scan.intensities <= 0.5 / r2 * (1.0 + 1e-4)
+            )  # Lambert: at most the reflectance over r^2
     without = scans_of()[1]
     assert all(scan.intensities is None for scan in without)

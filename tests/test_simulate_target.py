@@ -11,13 +11,24 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.mesh import is_closed
 from avsreplay.records import Surface
-from avsreplay.simulate import Shape, builtin_surface
 from avsreplay.simulate.inertia import body_of, principal
-from avsreplay.simulate.target import TargetParams, body, box, extrusion, frustum, join, shell
+from avsreplay.simulate.target import (
+    Shape,
+    TargetParams,
+    body,
+    box,
+    builtin_surface,
+    extrusion,
+    frustum,
+    join,
+    shell,
+)
 
 RNG = np.random.Generator(np.random.PCG64(5))
 CUBE_TURNS = [  # all 24, some more than once, by another hand
-    geometry.quaternion(trimesh.transformations.euler_matrix(*(np.pi / 2 * np.array(quarters)))[:3, :3])
+    geometry.quaternion(
+        trimesh.transformations.euler_matrix(*(np.pi / 2 * np.array(quarters)))[:3, :3]
+    )
     for quarters in np.ndindex(4, 4, 4)
 ]
 
@@ -42,11 +53,16 @@ def test_the_attachment_reads_back_as_the_surface(shape):
     read = trimesh.load(trimesh.util.wrap_as_stream(surface.data), file_type="ply", process=False)
     assert np.array_equal(read.vertices, surface.vertices)
     assert np.array_equal(read.faces, surface.faces)
-    assert surface.sha256 == hashlib.sha256(surface.data).hexdigest() == builtin_surface(shape).sha256
+    assert (
+        surface.sha256 == hashlib.sha256(surface.data).hexdigest() == builtin_surface(shape).sha256
+    )
 
 
 def test_touching_parts_of_the_satellite_do_not_overlap():
-    """Otherwise its volume, and its inertia, would count material twice: sampled points lie in one part at most."""
+    """Otherwise its volume, and its inertia, would count material twice.
+
+    Sampled points lie in one part at most.
+    """
     surface = builtin_surface()
     parts = trimesh.Trimesh(surface.vertices, surface.faces, process=False).split()
     boxes = np.array([part.bounds for part in parts])
@@ -82,7 +98,11 @@ def test_a_tall_prism_has_the_inertia_of_its_cylinder():
     r, h, n = 0.4, 1.5, 400
     found = body_of(surface_of(frustum(0.0, r, h, r, n)))
     assert_allclose(found.centre_c, [h / 2, 0, 0], atol=1e-13)
-    assert_allclose(np.diag(found.inertia_c), [r**2 / 2, (3 * r**2 + h**2) / 12, (3 * r**2 + h**2) / 12], rtol=1e-4)
+    assert_allclose(
+        np.diag(found.inertia_c),
+        [r**2 / 2, (3 * r**2 + h**2) / 12, (3 * r**2 + h**2) / 12],
+        rtol=1e-4,
+    )
 
 
 def test_an_open_mesh_is_a_thin_shell():
@@ -91,7 +111,9 @@ def test_an_open_mesh_is_a_thin_shell():
     found = body_of(lidless)
     assert not is_closed(lidless.vertices, lidless.faces)
     assert is_closed(solid.vertices, solid.faces)
-    assert_allclose(found.centre_c, [0.1, 0, 0], atol=1e-14)  # five unit squares, the one at x = -1/2 missing
+    assert_allclose(
+        found.centre_c, [0.1, 0, 0], atol=1e-14
+    )  # five unit squares, the one at x = -1/2 missing
     assert_allclose(found.inertia_c[0, 0], (4 * (1 / 4 + 1 / 12) + 1 / 6) / 5, rtol=1e-12)
 
 

@@ -1,4 +1,7 @@
-"""The start of a run and its reference: global search, cold start, deskewing, a fitted reference."""
+"""The start of a run and its reference.
+
+Global search, cold start, deskewing, a fitted reference.
+"""
 
 import json
 
@@ -49,16 +52,25 @@ def test_points_with_times_are_carried_to_one_instant(cli, fixtures_folder):
     with_it, without = rows(cli, log), rows(cli, log, "--no-deskew")
     assert rms(with_it, "reg_rot_err_deg") < 0.2 * rms(without, "reg_rot_err_deg")
     assert rms(with_it, "reg_pos_err_m") < 0.3 * rms(without, "reg_pos_err_m")
-    assert [row["seq"] for row in with_it if row["gamma"] == 0] == [22]  # the scan with the injected clock fault
+    assert [row["seq"] for row in with_it if row["gamma"] == 0] == [
+        22
+    ]  # the scan with the injected clock fault
 
 
 @pytest.mark.parametrize(
-    ("hz", "scan_s", "pattern"), [(2.0, 0.3, "raster"), (1.0, 0.9, "raster"), (5.0, 0.15, "lissajous")]
+    ("hz", "scan_s", "pattern"),
+    [(2.0, 0.3, "raster"), (1.0, 0.9, "raster"), (5.0, 0.15, "lissajous")],
 )
 def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path, hz, scan_s, pattern):
-    """The points are moved to the stamp by a motion that is hardly known; the pose has this error too."""
+    """The points are moved to the stamp by a motion that is hardly known.
+
+    The pose has this error too.
+    """
     scenario, log = tmp_path / "raster.toml", tmp_path / "raster.mcap"
-    text = f"duration_s = {16.0 / hz}\nrate_hz = {hz}\n[scanner]\npattern = '{pattern}'\nscan_s = {scan_s}\n"
+    text = (
+        f"duration_s = {16.0 / hz}\nrate_hz = {hz}\n[scanner]\npattern = '{pattern}'\nscan_s ="
+        f" {scan_s}\n"
+    )
     scenario.write_text(text + "rays = [60, 60]\n", encoding="utf-8")
     assert cli("record", scenario, "-o", log).code == 0
     found = rows(cli, log, "--start", "cold")
@@ -71,7 +83,9 @@ def test_a_reference_is_called_a_fit_and_never_truth(cli, fixtures_folder):
     fitted, true = rows(cli, log, "--reference", "fit"), rows(cli, log)
     assert {row["reference"] for row in fitted} == {"fit"}
     assert {row["reference"] for row in true} == {"truth"}
-    assert all(row["nees"] is None for row in fitted)  # a fit to the same scans judges no covariance
+    assert all(
+        row["nees"] is None for row in fitted
+    )  # a fit to the same scans judges no covariance
     assert rms(fitted, "pos_err_m") < 0.003
     printed = cli("run", log, "--reference", "fit").out
     assert "from fit" in printed

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.simulate import load_scenario
-from avsreplay.sweep import load_campaign
+from avsreplay.simulate.scenario import load_scenario
+from avsreplay.sweep.campaign import load_campaign
 from avsreplay.sweep.expansion import expand
 
 BASE = """
@@ -46,7 +46,10 @@ def test_a_grid_is_every_combination_and_every_repeat(tmp_path):
     assert {(p.cell, p.repeat) for p in points} == {(c, r) for c in range(4) for r in range(3)}
     assert len({p.task.id for p in points}) == 12
     assert [p.seed for p in points] == [table["seed"] for table in tables(plan)]
-    assert {p.task.assignments for p in points} == {('faults.policy="any"',), ('faults.policy="all"',)}
+    assert {p.task.assignments for p in points} == {
+        ('faults.policy="any"',),
+        ('faults.policy="all"',),
+    }
     for point, table in zip(points, tables(plan), strict=True):
         assert table["scanner"]["noise_m"] == point.values["scenario.scanner.noise_m"]
         assert table["duration_s"] == 4.0
@@ -69,9 +72,13 @@ def test_combinations_of_one_repeat_share_their_seed_and_repeats_do_not(tmp_path
 
 def test_a_run_keeps_its_name_when_the_campaign_grows(tmp_path):
     names = {p.task.id for p in plan_of(tmp_path, BASE).points()}
-    grown = BASE.replace("repeats = 3", "repeats = 5").replace("[0.004, 0.008]", "[0.004, 0.008, 0.016]")
+    grown = BASE.replace("repeats = 3", "repeats = 5").replace(
+        "[0.004, 0.008]", "[0.004, 0.008, 0.016]"
+    )
     assert names < {p.task.id for p in plan_of(tmp_path, grown).points()}
-    assert names.isdisjoint(p.task.id for p in plan_of(tmp_path, BASE.replace("seed = 4", "seed = 5")).points())
+    assert names.isdisjoint(
+        p.task.id for p in plan_of(tmp_path, BASE.replace("seed = 4", "seed = 5")).points()
+    )
 
 
 def test_cases_are_alternatives(tmp_path):
@@ -96,14 +103,19 @@ def test_draws_follow_their_distribution_and_are_independent(tmp_path):
     head = "repeats = 300\n[set]\n"
     one = '[[draw]]\nkey = "scenario.scanner.noise_m"\nkind = "uniform"\nlow = 0.01\nhigh = 0.02\n'
     two = '[[draw]]\nkey = "scenario.motion.attitude_xyzw"\nkind = "attitude"\n'
-    three = '[[draw]]\nkey = "scenario.motion.rate_radps"\nkind = "direction"\nlow = 0.1\nhigh = 0.1\n'
+    three = (
+        '[[draw]]\nkey = "scenario.motion.rate_radps"\nkind = "direction"\nlow = 0.1\nhigh = 0.1\n'
+    )
     alone = [t["scanner"]["noise_m"] for t in tables(plan_of(tmp_path, head + one))]
     together = tables(plan_of(tmp_path, head + two + three + one))
     assert alone == [t["scanner"]["noise_m"] for t in together]
     assert stats.kstest(alone, "uniform", (0.01, 0.01)).pvalue > 1e-3
     q = np.array([t["motion"]["attitude_xyzw"] for t in together])
     assert_allclose(np.linalg.norm(q, axis=1), 1)
-    assert stats.kstest(2 * np.arccos(np.abs(q[:, 3])), lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
+    assert (
+        stats.kstest(2 * np.arccos(np.abs(q[:, 3])), lambda a: (a - np.sin(a)) / np.pi).pvalue
+        > 1e-3
+    )
     w = np.array([t["motion"]["rate_radps"] for t in together])
     assert_allclose(np.linalg.norm(w, axis=1), 0.1)
     assert stats.kstest(w[:, 0] / 0.1, "uniform", (-1, 2)).pvalue > 1e-3
@@ -112,14 +124,22 @@ def test_draws_follow_their_distribution_and_are_independent(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "more", "law"),
     [
-        ("normal", "low = 0.5\nhigh = 0.1", lambda v: stats.kstest(v, "norm", (0.5, 0.1)).pvalue > 1e-3),
+        (
+            "normal",
+            "low = 0.5\nhigh = 0.1",
+            lambda v: stats.kstest(v, "norm", (0.5, 0.1)).pvalue > 1e-3,
+        ),
         (
             "log_uniform",
             "low = 0.1\nhigh = 10",
             lambda v: stats.kstest(np.log10(v), "uniform", (-1, 2)).pvalue > 1e-3,
         ),
         ("choice", "values = [0.25, 0.5]", lambda v: set(v) == {0.25, 0.5}),
-        ("integer", "low = 1\nhigh = 3", lambda v: set(v) == {1, 2, 3} and all(isinstance(x, int) for x in v)),
+        (
+            "integer",
+            "low = 1\nhigh = 3",
+            lambda v: set(v) == {1, 2, 3} and all(isinstance(x, int) for x in v),
+        ),
     ],
 )
 def test_kinds_of_draws(tmp_path, kind, more, law):
@@ -147,7 +167,10 @@ def test_scenarios_are_an_axis(tmp_path):
 def test_logs_are_an_axis(tmp_path):
     for name in ("a.mcap", "b.mcap"):
         (tmp_path / name).write_bytes(name.encode())
-    text = 'logs = ["a.mcap", "b.mcap"]\n[[grid]]\nkey = "run.register.backend"\nvalues = ["horn", "kiss"]\n'
+    text = (
+        'logs = ["a.mcap", "b.mcap"]\n[[grid]]\nkey = "run.register.backend"\nvalues = ["horn",'
+        ' "kiss"]\n'
+    )
     points = list(plan_of(tmp_path, text).points())
     assert [p.values["log"] for p in points] == ["a.mcap", "a.mcap", "b.mcap", "b.mcap"]
     assert all(p.task.scenario == "" for p in points)
@@ -172,7 +195,13 @@ def test_logs_are_an_axis(tmp_path):
         ('logs = ["none.mcap"]\n', "No such file"),
         ('logs = ["x"]\n[set]\n"scenario.seed" = 1\n', "cannot be set where logs"),
         ('[[draw]]\nkey = "scenario.seed"\nkind = "choice"\n', "needs values"),
-        ('[[grid]]\nkey = "run.init"\nvalues = ["log"]\n[[draw]]\nkey = "run.init"\nkind = "attitude"\n', "twice"),
+        (
+            (
+                '[[grid]]\nkey = "run.init"\nvalues = ["log"]\n[[draw]]\nkey = "run.init"\nkind ='
+                ' "attitude"\n'
+            ),
+            "twice",
+        ),
     ],
 )
 def test_wrong_campaigns_are_one_line(tmp_path, text, words):
@@ -183,6 +212,13 @@ def test_wrong_campaigns_are_one_line(tmp_path, text, words):
 
 
 def test_settings_given_as_a_table_reach_the_run(tmp_path):
-    text = '[[case]]\nname = "a"\nset = { "run.register" = { n_max = 7, backend = "kiss" }, "run.init" = "auto" }\n'
+    text = (
+        '[[case]]\nname = "a"\nset = { "run.register" = { n_max = 7, backend = "kiss" }, "run.init"'
+        ' = "auto" }\n'
+    )
     (point,) = plan_of(tmp_path, text).points()
-    assert set(point.task.assignments) == {"register.n_max=7", 'register.backend="kiss"', 'init="auto"'}
+    assert set(point.task.assignments) == {
+        "register.n_max=7",
+        'register.backend="kiss"',
+        'init="auto"',
+    }

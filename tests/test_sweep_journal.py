@@ -1,4 +1,7 @@
-"""The journal of a campaign: damaged lines are set aside and their runs repeated; everything else is kept."""
+"""The journal of a campaign: damaged lines are set aside and their runs repeated.
+
+Everything else is kept.
+"""
 
 import math
 import os
@@ -10,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.sweep import SCAN_COLUMNS, RunResult
+from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 from avsreplay.sweep.journal import RESULTS, Journal
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
@@ -30,7 +33,13 @@ def filled(folder, count=3, scans=2):
 
 
 def same(a, b):
-    return (a.id, a.status, a.error, a.metrics, a.episodes) == (b.id, b.status, b.error, b.metrics, b.episodes)
+    return (a.id, a.status, a.error, a.metrics, a.episodes) == (
+        b.id,
+        b.status,
+        b.error,
+        b.metrics,
+        b.episodes,
+    )
 
 
 def test_results_are_read_back(tmp_path):
@@ -81,7 +90,10 @@ def test_a_folder_of_other_results_is_left_alone(tmp_path, name):
 
 
 def test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches(tmp_path):
-    """Each fifth byte and each line end of a journal of 4 runs; a changed line end joins two lines."""
+    """Each fifth byte and each line end of a journal of 4 runs.
+
+    A changed line end joins two lines.
+    """
     path = filled(tmp_path, count=4, scans=0)
     whole = path.read_bytes()
     ids = [line.split(b" ")[1].decode() for line in whole.splitlines()]
@@ -92,7 +104,11 @@ def test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches(tmp_path):
         path.write_bytes(bytes(data))
         (tmp_path / "journal.damaged").unlink(missing_ok=True)
         touched = whole[:place].count(b"\n")
-        allowed = {ids[touched], ids[min(touched + 1, 3)]} if whole[place : place + 1] == b"\n" else {ids[touched]}
+        allowed = (
+            {ids[touched], ids[min(touched + 1, 3)]}
+            if whole[place : place + 1] == b"\n"
+            else {ids[touched]}
+        )
         with Journal(tmp_path) as journal:
             lost = set(ids) - set(journal.status)
             assert lost <= allowed
@@ -101,7 +117,9 @@ def test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches(tmp_path):
                 if run_id in lost:
                     journal.add(result(k, scans=0))
         assert sorted(path.read_bytes().splitlines()) == sorted(whole.splitlines())
-        assert all(same(Journal(tmp_path).result(run_id), result(k)) for k, run_id in enumerate(ids))
+        assert all(
+            same(Journal(tmp_path).result(run_id), result(k)) for k, run_id in enumerate(ids)
+        )
 
 
 def test_a_damaged_line_is_set_aside(tmp_path):
@@ -160,7 +178,10 @@ def test_damaged_scans_are_found_and_their_run_is_made_again(tmp_path, damage):
 
 def test_two_campaigns_cannot_use_one_directory(tmp_path):
     with Journal(tmp_path):
-        with pytest.raises(UsageError, match=f"in use by process {os.getpid()} on ") as caught, Journal(tmp_path):
+        with (
+            pytest.raises(UsageError, match=f"in use by process {os.getpid()} on ") as caught,
+            Journal(tmp_path),
+        ):
             pass
         assert "\n" not in str(caught.value)
     with Journal(tmp_path) as journal:

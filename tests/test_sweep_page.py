@@ -8,7 +8,14 @@ import pytest
 
 from avsreplay.report.episodes import Peak
 from avsreplay.sweep.page import build_sweep_page, words
-from avsreplay.sweep.statistics import FaultKind, ScoreHistogram, consistency, quantiles, rate, typical
+from avsreplay.sweep.statistics import (
+    FaultKind,
+    ScoreHistogram,
+    consistency,
+    quantiles,
+    rate,
+    typical,
+)
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
 
 VOID = {"meta", "link"}
@@ -44,7 +51,14 @@ def curve():
 def summary():
     metrics = dict.fromkeys(HEADLINES) | {"convergence.t1_s": quantiles([1.0, 2.0, 3.0, 4.0])}
     cells = tuple(
-        Cell({"scenario.name": name}, 4, {"ok": 4}, metrics, {"converged": rate(3, 4)}, consistency([20.0] * 4, 20))
+        Cell(
+            {"scenario.name": name},
+            4,
+            {"ok": 4},
+            metrics,
+            {"converged": rate(3, 4)},
+            consistency([20.0] * 4, 20),
+        )
         for name in ("<b>plain</b>", "other")
     )
     detector = Detector(50, 50, rate(40, 50), rate(1, 50), {"rms_m": curve(), "nis": None})
@@ -117,7 +131,9 @@ def test_faults_are_grouped_by_kind_with_false_alarms_first(summary):
     checker.feed(page)
     assert checker.open == []
     found = _cells(page)
-    assert [row[:2] for row in found] == [[k, n] for k in ("none", "clutter ~", "frozen") for n in ("0", "1")]
+    assert [row[:2] for row in found] == [
+        [k, n] for k in ("none", "clutter ~", "frozen") for n in ("0", "1")
+    ]
     assert found[0][2:] == ["", "0.5%", *[""] * 7]
     assert found[2][2:] == ["0.5, 2 s", "0.0%", "0/1", "", "", "0", "", "", ""]
     assert found[4][2:] == ["2 s", "75.0%", "2/2", "1, 1.5", "", "1", "12, 0.004", "1250, 179", ""]

@@ -1,4 +1,7 @@
-"""Whole campaigns: the same bytes with any number of workers, continuation after a kill, workers that die."""
+"""Whole campaigns.
+
+The same bytes with any number of workers, continuation after a kill, workers that die.
+"""
 
 import json
 import os
@@ -14,7 +17,7 @@ from click.testing import CliRunner
 
 from avsreplay.cli.sweep import sweep_command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
-from avsreplay.sweep import load_campaign
+from avsreplay.sweep.campaign import load_campaign
 from avsreplay.sweep.execute import _crashed, run_tasks, write_results
 from avsreplay.sweep.expansion import Task, expand
 from avsreplay.sweep.journal import Journal
@@ -89,21 +92,30 @@ def test_the_results_say_what_was_run(reference, tmp_path):
     assert [cell["rates"]["close"]["successes"] for cell in said["cells"]] == [3, 3]
     assert said["detector"]["detected"]["share"] == 1.0
     for cell in said["cells"]:
-        assert {kind: (found["scans"], found["flagged"]["share"]) for kind, found in cell["kinds"].items()} == {
+        assert {
+            kind: (found["scans"], found["flagged"]["share"])
+            for kind, found in cell["kinds"].items()
+        } == {
             "empty": (6, 1.0),
             "none": (12, 0.0),
         }
         empty = cell["kinds"]["empty"]
         assert (empty["episodes"], empty["detected"]["share"], empty["lost"]) == (3, 1.0, 0)
         assert empty["delay_scans"] == {"count": 3, "median": 0.0, "worst": 0.0}
-        assert (empty["recovery_s"]["worst"], empty["lengths_s"], empty["strengths"]) == (0.0, [0.6], [])
+        assert (empty["recovery_s"]["worst"], empty["lengths_s"], empty["strengths"]) == (
+            0.0,
+            [0.6],
+            [],
+        )
         assert 0 < empty["peak_flagged"]["pos_err_m"] < 0.05
         assert empty["peak_used"] == {"pos_err_m": None, "rot_err_deg": None}
 
 
 @pytest.mark.slow
 def test_noise_matters_in_every_repeat(reference, tmp_path):
-    """Repeats share their seed across combinations, so the noisier one fits worse each time, not only on average."""
+    """Repeats share their seed across combinations, so the noisier one fits worse each time, not
+    only on average.
+    """
     import pyarrow.parquet as pq
 
     (tmp_path / "results.parquet").write_bytes(reference["results.parquet"])
@@ -149,11 +161,25 @@ def test_a_limited_campaign_is_resumed(campaign, reference, tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_campaign_is_resumed(campaign, reference, tmp_path):
-    args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "0"]
-    env = os.environ | {"AVSREPLAY_ARITHMETIC": "native"}  # that of this process, which makes the reference
+    args = [
+        sys.executable,
+        "-m",
+        "avsreplay",
+        "sweep",
+        str(campaign),
+        "-o",
+        str(tmp_path / "out"),
+        "--workers",
+        "0",
+    ]
+    env = os.environ | {
+        "AVSREPLAY_ARITHMETIC": "native"
+    }  # that of this process, which makes the reference
     process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env)
     journal = tmp_path / "out" / "journal.txt"
-    while process.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 2):
+    while process.poll() is None and (
+        not journal.exists() or journal.read_bytes().count(b"\n") < 2
+    ):
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -167,11 +193,25 @@ def test_a_killed_campaign_is_resumed(campaign, reference, tmp_path):
 def test_ctrl_c_ends_workers_without_the_messages_of_dask(campaign, tmp_path):
     """A terminal sends it to every process of the command."""
     campaign.write_text(SMALL.replace("repeats = 3", "repeats = 300"))
-    args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "1"]
-    process = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    args = [
+        sys.executable,
+        "-m",
+        "avsreplay",
+        "sweep",
+        str(campaign),
+        "-o",
+        str(tmp_path / "out"),
+        "--workers",
+        "1",
+    ]
+    process = subprocess.Popen(
+        args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     journal = tmp_path / "out" / "journal.txt"
     for _ in range(600):
-        if process.poll() is not None or (journal.is_file() and journal.read_bytes().count(b"\n") > 1):
+        if process.poll() is not None or (
+            journal.is_file() and journal.read_bytes().count(b"\n") > 1
+        ):
             break
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
@@ -179,13 +219,18 @@ def test_ctrl_c_ends_workers_without_the_messages_of_dask(campaign, tmp_path):
     assert (process.returncode, out) == (130, "")
     lines = [line for line in err.splitlines() if line]
     assert len(lines) == 2, err
-    assert re.fullmatch(r"avsreplay: the results of \d+ runs are saved; the same command continues", lines[0])
+    assert re.fullmatch(
+        r"avsreplay: the results of \d+ runs are saved; the same command continues", lines[0]
+    )
     assert lines[1] == "avsreplay: interrupted"
 
 
 @pytest.mark.slow
 def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, reference, tmp_path):
-    """A cluster of our own, reached by its address as a remote one would be; its first worker is killed mid-run."""
+    """A cluster of our own, reached by its address as a remote one would be.
+
+    Its first worker is killed mid-run.
+    """
     from distributed import Client, LocalCluster
 
     plan = expand(load_campaign(campaign))
@@ -196,7 +241,9 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
     ):
         victims = list(client.run(os.getpid).values())
         seen = []
-        for outcome in run_tasks((p.task for p in plan.points()), scheduler=cluster.scheduler_address):
+        for outcome in run_tasks(
+            (p.task for p in plan.points()), scheduler=cluster.scheduler_address
+        ):
             seen.append(outcome.id)
             journal.add(outcome)
             if len(seen) == 1:
@@ -209,7 +256,9 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
 @pytest.mark.slow
 def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     text = SMALL.replace("repeats = 3", "repeats = 1")
-    text += '[[case]]\nname = "good"\n[[case]]\nname = "cold"\nset = { "run.init" = "9,9,9,0,0,0,1" }\n'
+    text += (
+        '[[case]]\nname = "good"\n[[case]]\nname = "cold"\nset = { "run.init" = "9,9,9,0,0,0,1" }\n'
+    )
     text += '[[case]]\nname = "no back end"\nset = { "run.register.backend" = "nobody" }\n'
     campaign.write_text(text)
     done = sweep(campaign, tmp_path / "out", "--workers", "0")
@@ -239,7 +288,8 @@ def test_a_run_that_raises_is_a_row(monkeypatch):
 def test_recorded_logs_are_swept_as_well(tmp_path):
     path = tmp_path / "logs.toml"
     path.write_text(
-        f'logs = ["{FIXTURES / "tumble.mcap"}"]\n[[grid]]\nkey = "run.guess"\nvalues = ["predicted", "last"]\n'
+        f'logs = ["{FIXTURES / "tumble.mcap"}"]\n[[grid]]\nkey = "run.guess"\nvalues ='
+        ' ["predicted", "last"]\n'
     )
     done = sweep(path, tmp_path / "out", "--workers", "0", "--json")
     assert done.exit_code == 0, done.output
@@ -250,7 +300,9 @@ def test_recorded_logs_are_swept_as_well(tmp_path):
 
 def test_a_dry_run_only_prints_the_plan(campaign, tmp_path):
     done = CliRunner().invoke(sweep_command, [str(campaign), "--plan"])
-    assert done.output.startswith("small: 6 runs, 2 combinations x 3 repeats\n  scanner.noise_m=0.004\n")
+    assert done.output.startswith(
+        "small: 6 runs, 2 combinations x 3 repeats\n  scanner.noise_m=0.004\n"
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["small.toml"]
 
 
@@ -295,19 +347,27 @@ def test_the_worst_run_is_made_again_by_one_command(campaign, reference, tmp_pat
     import pyarrow.parquet as pq
 
     table = pq.read_table(tmp_path / "results.parquet").to_pylist()
-    errors = {row["id"]: max(row["pose_healthy.position_m.max"], row["worst_coast.pos_err_m"]) for row in table}
+    errors = {
+        row["id"]: max(row["pose_healthy.position_m.max"], row["worst_coast.pos_err_m"])
+        for row in table
+    }
     assert worst["id"] == max(errors, key=errors.get)
     row = next(row for row in table if row["id"] == worst["id"])
     assert row["seed"] == worst["seed"]
     again = CliRunner().invoke(
-        sweep_command, [str(campaign), "--run", worst["id"][:10], "-o", str(tmp_path / "again"), "--report"]
+        sweep_command,
+        [str(campaign), "--run", worst["id"][:10], "-o", str(tmp_path / "again"), "--report"],
     )
     assert again.exit_code == 0, again.output
     assert (tmp_path / "again" / "report.html").exists()
-    rows = [json.loads(line) for line in (tmp_path / "again" / "rows.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line) for line in (tmp_path / "again" / "rows.jsonl").read_text().splitlines()
+    ]
     assert len(rows) == row["scans"]
     assert max(r["pos_err_m"] for r in rows) == pytest.approx(errors[worst["id"]], rel=1e-12)
-    unknown = CliRunner().invoke(sweep_command, [str(campaign), "--run", "zz", "-o", str(tmp_path / "x")])
+    unknown = CliRunner().invoke(
+        sweep_command, [str(campaign), "--run", "zz", "-o", str(tmp_path / "x")]
+    )
     assert isinstance(unknown.exception, UsageError)
 
 
@@ -365,7 +425,9 @@ def test_dask_listens_on_the_loopback_only():
 
 @pytest.mark.slow
 def test_whole_flights_of_a_campaign_end_as_those_of_the_plan_command(tmp_path):
-    """Without errors of the thrust every flight captures, with three times the largest thrust none does."""
+    """Without errors of the thrust every flight captures, with three times the largest thrust none
+    does.
+    """
     import pyarrow.parquet as pq
 
     from avsreplay.cli.plan import plan_command
@@ -385,7 +447,10 @@ def test_whole_flights_of_a_campaign_end_as_those_of_the_plan_command(tmp_path):
     assert [cell["rates"]["flights captured"]["successes"] for cell in cells] == [3, 0]
     assert [cell["rates"]["flights captured"]["count"] for cell in cells] == [3, 3]
     assert [cell["rates"]["sure"]["successes"] for cell in cells] == [1, 0]
-    saved, options = str(tmp_path / "saved"), ["--samples", "1", "--every", "99", "--flights", "3", "--json"]
+    saved, options = (
+        str(tmp_path / "saved"),
+        ["--samples", "1", "--every", "99", "--flights", "3", "--json"],
+    )
     CliRunner().invoke(run_command, [str(log), "-o", saved], catch_exceptions=False)
     planned = CliRunner().invoke(plan_command, [saved, *options], catch_exceptions=False)
     flown = json.loads(planned.stdout)["flights"]

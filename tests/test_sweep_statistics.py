@@ -1,4 +1,7 @@
-"""Statistics over runs, against exact distributions and independent formulas; faults by kind, against sums by hand."""
+"""Statistics over runs, against exact distributions and independent formulas.
+
+Faults by kind, against sums by hand.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ from scipy import stats
 
 from avsreplay import settings, toml_document
 from avsreplay.report.episodes import Episode, Peak
-from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
-from avsreplay.sweep import RunResult, load_campaign
+from avsreplay.simulate.scenario import load_scenario
+from avsreplay.sweep.campaign import RunResult, load_campaign
 from avsreplay.sweep.expansion import expand
 from avsreplay.sweep.journal import Journal
 from avsreplay.sweep.statistics import (
@@ -34,7 +37,10 @@ from avsreplay.sweep.statistics import (
 
 
 def test_wilson_intervals_cover_as_they_promise():
-    """Exact coverage over all outcomes of 50 runs at several true shares: near 95 % on average, never far below."""
+    """Exact coverage over all outcomes of 50 runs at several true shares.
+
+    Near 95 % on average, never far below.
+    """
     covered = []
     for p in (0.02, 0.1, 0.5, 0.9, 0.98):
         inside = [rate(k, 50).low <= p <= rate(k, 50).high for k in range(51)]
@@ -113,7 +119,9 @@ def test_scans_without_a_measurement_are_flagged_at_every_threshold():
 def test_a_summary_holds_no_number_that_json_cannot_say():
     from avsreplay.sweep.summary import _finite
 
-    assert json.dumps(_finite({"a": [math.inf, math.nan, 1.0], "b": {"c": -math.inf}}), allow_nan=False)
+    assert json.dumps(
+        _finite({"a": [math.inf, math.nan, 1.0], "b": {"c": -math.inf}}), allow_nan=False
+    )
 
 
 CAMPAIGN = Path(__file__).parent.parent / "docs" / "campaigns" / "faults.toml"
@@ -129,7 +137,14 @@ def kinds_of_fault(lines, metrics):
 
 
 def episode(kind="frozen", **changes):
-    plain = {"harmful": True, "start_s": 2.0, "end_s": 4.0, "scans": 4, "flagged": 4, "detected": True}
+    plain = {
+        "harmful": True,
+        "start_s": 2.0,
+        "end_s": 4.0,
+        "scans": 4,
+        "flagged": 4,
+        "detected": True,
+    }
     return Episode(kind, **{**plain, "recover_scans": 0, "recover_s": 0.0, **changes})
 
 
@@ -144,15 +159,37 @@ def account(unlabelled=100, false_alarms=1, known=True, used=0.01):
 
 EPISODES = (
     episode(delay_s=0.0, delay_scans=0, peak_flagged=Peak(0.1, 5.0), peak_after=Peak(0.2, 1.0)),
-    episode(flagged=1, delay_s=1.5, delay_scans=3, peak_flagged=Peak(0.3, 2.0), peak_used=Peak(0.4, 3.0)),
-    episode(flagged=0, detected=False, recover_s=None, recover_scans=None, lost=True, end_s=8.0, scans=12),
-    episode("clutter", harmful=False, flagged=0, detected=False, recover_s=None, recover_scans=None, strength=0.5),
-    episode("dropped", scans=0, flagged=0, recover_s=1.0, recover_scans=2, peak_after=Peak(0.5, 0.5)),
+    episode(
+        flagged=1, delay_s=1.5, delay_scans=3, peak_flagged=Peak(0.3, 2.0), peak_used=Peak(0.4, 3.0)
+    ),
+    episode(
+        flagged=0,
+        detected=False,
+        recover_s=None,
+        recover_scans=None,
+        lost=True,
+        end_s=8.0,
+        scans=12,
+    ),
+    episode(
+        "clutter",
+        harmful=False,
+        flagged=0,
+        detected=False,
+        recover_s=None,
+        recover_scans=None,
+        strength=0.5,
+    ),
+    episode(
+        "dropped", scans=0, flagged=0, recover_s=1.0, recover_scans=2, peak_after=Peak(0.5, 0.5)
+    ),
 )
 
 
 def test_kinds_are_summed_over_their_windows():
-    kinds = kinds_of_fault(episode_lines(EPISODES), [account(), account(50, 2, used=0.02), account(10, 9, known=False)])
+    kinds = kinds_of_fault(
+        episode_lines(EPISODES), [account(), account(50, 2, used=0.02), account(10, 9, known=False)]
+    )
     assert list(kinds) == ["clutter", "dropped", "frozen", "none"]
     frozen = kinds["frozen"]
     assert (frozen.episodes, frozen.scans, frozen.lost, frozen.lengths_s) == (3, 20, 1, (2.0, 6.0))
@@ -173,7 +210,12 @@ def test_kinds_are_summed_over_their_windows():
 
 def test_a_kind_without_scans_has_a_row():
     dropped = kinds_of_fault(episode_lines(EPISODES), [])["dropped"]
-    assert (dropped.scans, dropped.flagged, dropped.episodes, dropped.detected.share) == (0, None, 1, 1.0)
+    assert (dropped.scans, dropped.flagged, dropped.episodes, dropped.detected.share) == (
+        0,
+        None,
+        1,
+        1.0,
+    )
     assert (dropped.delay_s, dropped.recovery_s, dropped.recovery_scans) == (
         None,
         Typical(1, 1.0, 1.0),
@@ -212,7 +254,9 @@ def test_the_campaign_of_faults_has_every_kind_at_three_strengths():
         for fault in toml_document.parse(task.scenario, "scenario").table["fault"]:
             strength = fault.get("strength")
             how[Kind(fault["kind"])].add(fault["duration_s"] if strength is None else strength)
-    assert {kind.value: len(found) for kind, found in how.items()} == {kind.value: 3 for kind in Kind}
+    assert {kind.value: len(found) for kind, found in how.items()} == {
+        kind.value: 3 for kind in Kind
+    }
 
 
 @pytest.mark.parametrize("name", ["weak", "medium", "strong"])
@@ -226,7 +270,11 @@ def test_windows_of_the_campaign_do_not_overlap(name):
 def test_the_table_for_the_docs_has_a_line_a_kind_and_strength():
     kinds = settings.dump(kinds_of_fault(episode_lines(EPISODES), [account()]))
     cells = [
-        {"values": {"scenario": f"s/faults-{name}.toml", "run.faults.policy": policy}, "runs": 2, "kinds": kinds}
+        {
+            "values": {"scenario": f"s/faults-{name}.toml", "run.faults.policy": policy},
+            "runs": 2,
+            "kinds": kinds,
+        }
         for name in ("weak", "strong")
         for policy in ("any", "all")
     ]
@@ -234,7 +282,11 @@ def test_the_table_for_the_docs_has_a_line_a_kind_and_strength():
     assert [line for line in said.splitlines() if line.startswith("`")] == [
         f"`faults.policy = {policy}`, runs of each strength: 2:" for policy in ("any", "all")
     ]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in said.splitlines() if line.startswith("| ")]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in said.splitlines()
+        if line.startswith("| ")
+    ]
     assert {len(row) for row in rows} == {len(estimate_faults.HEADS)}
     assert [row[:2] for row in rows[2:10]] == [
         *(["none (false alarms)", name] for name in ("weak", "strong")),

@@ -1,4 +1,7 @@
-"""``avsreplay backends`` and ``avsreplay bench``: the registration back ends, their laws, speed and error on a log."""
+"""``avsreplay backends`` and ``avsreplay bench``.
+
+The registration back ends, their laws, speed and error on a log.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,9 @@ if TYPE_CHECKING:
 
     from avsreplay.geometry import Pose
     from avsreplay.records import Alignment, Surface
-    from avsreplay.register import Registrar
     from avsreplay.register.backend import Availability
     from avsreplay.register.contract import LawResult
+    from avsreplay.register.registrar import Registrar
 
     TrueScan = tuple[NDArray[Any], Pose | None]
 
@@ -37,7 +40,10 @@ differ: libraries that stop by their own rules may take another number of iterat
 
 @click.command("backends", epilog=EPILOG)
 @click.option(
-    "--check", "name", metavar="NAME", help="Run the contract tests on this back end; exit code 1 if one fails."
+    "--check",
+    "name",
+    metavar="NAME",
+    help="Run the contract tests on this back end; exit code 1 if one fails.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def backends_command(name: str | None, as_json: bool) -> None:
@@ -55,12 +61,26 @@ def _list(as_json: bool) -> None:
     if as_json:
         _print_json([dataclasses.asdict(state) for state in states])
     else:
-        heads = ("name", "installed", "version", "description", "on other processors", "how to install")
+        heads = (
+            "name",
+            "installed",
+            "version",
+            "description",
+            "on other processors",
+            "how to install",
+        )
         _print_table("Registration back ends", heads, map(_state_row, states))
 
 
 def _state_row(state: Availability) -> tuple[str, ...]:
-    return state.name, "yes" if state.installed else "no", state.version, state.about, state.elsewhere, state.get
+    return (
+        state.name,
+        "yes" if state.installed else "no",
+        state.version,
+        state.about,
+        state.elsewhere,
+        state.get,
+    )
 
 
 def _check(name: str, as_json: bool) -> None:
@@ -69,12 +89,18 @@ def _check(name: str, as_json: bool) -> None:
 
     findings = check(name)
     if as_json:
-        _print_json({"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]})
+        _print_json(
+            {"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]}
+        )
     else:
-        _print_table(f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings))
+        _print_table(
+            f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings)
+        )
     broken = [finding.law for finding in findings if not finding.held]
     if broken:
-        raise CheckFailed(f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name)
+        raise CheckFailed(
+            f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name
+        )
 
 
 def _finding_row(finding: LawResult) -> tuple[str, ...]:
@@ -93,14 +119,24 @@ def _print_table(title: str, heads: tuple[str, ...], rows: Iterable[tuple[str, .
 
 MEMORY_SCANS = 3
 HEADS = (
-    *("back end", "build\n[s]", "median\n[ms]", "95 %\n[ms]", "iterations\nmedian", "rotation\nrms [deg]"),
+    *(
+        "back end",
+        "build\n[s]",
+        "median\n[ms]",
+        "95 %\n[ms]",
+        "iterations\nmedian",
+        "rotation\nrms [deg]",
+    ),
     *("position\nrms [mm]", "failures", "peak\n[MiB]"),
 )
 
 
 @dataclass(slots=True)
 class Tally:
-    """Results of one back end, scan by scan. Times are wall clock; errors are relative to the log's truth."""
+    """Results of one back end, scan by scan. Times are wall clock.
+
+    Errors are relative to the log's truth.
+    """
 
     name: str
     build_s: float = 0.0
@@ -145,8 +181,15 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but data was lost."""
 
 @click.command("bench", epilog=BENCH_EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--backends", default="horn,kiss", show_default=True, help="Names of back ends, separated by commas.")
-@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, if the log has none.")
+@click.option(
+    "--backends",
+    default="horn,kiss",
+    show_default=True,
+    help="Names of back ends, separated by commas.",
+)
+@click.option(
+    "--model", type=click.Path(path_type=Path), help="Model of the target, if the log has none."
+)
 @click.option("--topic", help="The cloud topic, where there are several.")
 @click.option(
     "--n-scans",
@@ -157,11 +200,15 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but data was lost."""
     help="Number of scans, from the first one on.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-def bench_command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
-    """Measure the time and the error of registration back ends, one after the other on each scan of LOG.
+def bench_command(
+    log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool
+) -> None:
+    """Measure the time and the error of registration back ends, one after the other on each scan of
+    LOG.
 
-    The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the
-    same back end found. Times can be compared within one run, but not between two runs.
+    The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise
+    the pose that the same back end found. Times can be compared within one run, but not between two
+    runs.
 
     \f
     Raises:
@@ -176,7 +223,9 @@ def bench_command(log: Path, backends: str, model: Path | None, topic: str | Non
 
     names = list(dict.fromkeys(name.strip() for name in backends.split(",") if name.strip()))
     if not names:
-        raise UsageError("no back end is named", where="--backends", hint="for example --backends horn,kiss")
+        raise UsageError(
+            "no back end is named", where="--backends", hint="for example --backends horn,kiss"
+        )
     with open_source(log, SourceOptions(topic=topic, model=model, n_scans=scans)) as source:
         surface = source.header.surface
         taken = [(scan.points, source.truth_of(scan).pose) for scan in source.scans()]
@@ -191,7 +240,8 @@ def bench_command(log: Path, backends: str, model: Path | None, topic: str | Non
 
 
 def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
-    """Time every back end on every scan that has points; all back ends process a scan before the next scan is taken.
+    """Time every back end on every scan that has points; all back ends process a scan before the
+    next scan is taken.
 
     A scan is its points (n, 3) in {A} [m] and the true pose T_ac, or None.
 
@@ -222,7 +272,10 @@ def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]
 
 
 def _one(tally: Tally, registrar: Registrar, scan: TrueScan, guess: Pose | None) -> Pose | None:
-    """Register one scan, count it, and give the next guess; the first scan is acquired and not counted."""
+    """Register one scan, count it, and give the next guess.
+
+    The first scan is acquired and not counted.
+    """
     from avsreplay.records import AlignStatus
 
     points, truth = scan
@@ -252,13 +305,17 @@ def _count_error(tally: Tally, truth: Pose, found: Alignment) -> None:
 
 
 def _registrar(name: str, surface: Surface) -> Registrar:
-    from avsreplay.register import RegisterParams, Registrar
+    from avsreplay.register.params import RegisterParams
+    from avsreplay.register.registrar import Registrar
 
     return Registrar(surface, RegisterParams(backend=name))
 
 
 def _peak_mib(name: str, surface: Surface, scans: list[TrueScan]) -> float | None:
-    """Peak memory of a fresh process that builds the back end and registers three scans; None if it is unknown."""
+    """Peak memory of a fresh process that builds the back end and registers three scans.
+
+    None if it is unknown.
+    """
     if sys.platform == "win32":
         return None
     from concurrent.futures import ProcessPoolExecutor
@@ -293,4 +350,6 @@ def _print_tallies(summaries: list[dict[str, Any]]) -> None:
         )
         for row in summaries
     )
-    print_table(make_console(plain_width=120), Table("Registration back ends on this log", HEADS, rows))
+    print_table(
+        make_console(plain_width=120), Table("Registration back ends on this log", HEADS, rows)
+    )

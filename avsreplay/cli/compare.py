@@ -60,7 +60,9 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     help="TOML file with the rules that a run must satisfy; exit code 1 if one is broken.",
 )
 @click.option("--junit", type=PATH, help="Write the outcomes of the rules as JUnit XML.")
-@click.option("--github", is_flag=True, help="Print the outcomes of the rules as GitHub annotations.")
+@click.option(
+    "--github", is_flag=True, help="Print the outcomes of the rules as GitHub annotations."
+)
 @click.option(
     "-o",
     "--output",
@@ -69,7 +71,9 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for the summary of a CI job.")
+@click.option(
+    "--markdown", "as_markdown", is_flag=True, help="Print Markdown, for the summary of a CI job."
+)
 @click.option("--all", "show_all", is_flag=True, help="Also print the metrics that are equal.")
 @click.option(
     "--metrics",
@@ -92,20 +96,25 @@ def compare_command(
 ) -> None:
     """Compare saved RESULTS: a conclusion, the settings that differ, and every metric.
 
-    RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline. A folder of
-    several results (one per seed) is compared run by run with the baseline's runs of the same names.
+    RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the
+    baseline. A folder of several results (one per seed) is compared run by run with the baseline's
+    runs of the same names.
 
-    Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 % bootstrap
-    intervals of the paired difference. A figure of two runs that has no interval is neither better nor worse.
+    Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 %
+    bootstrap intervals of the paired difference. A figure of two runs that has no interval is
+    neither better nor worse.
 
     \f
     Raises:
-        UsageError: an option needs --gate, an output cannot be written, or a run has no partner in the baseline.
+        UsageError: an option needs --gate, an output cannot be written, or a run has no partner in
+            the baseline.
         UnreadableInput: a result or the rules cannot be read.
         CheckFailed: a rule of the gate is broken.
     """  # noqa: D301
     if (junit or github) and not gate:
-        raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
+        raise UsageError(
+            "--junit and --github need --gate", hint="name the rules with --gate rules.toml"
+        )
     check_outputs("junit")
     check_outputs("output", overwrite=overwrite)
     rules = gates.load_rules(gate) if gate else ()
@@ -126,7 +135,9 @@ def compare_command(
         from avsreplay.report.page import build_comparison
 
         with output_text(output) as stream:
-            stream.write(build_comparison([group.runs[0] for group in groups], conclusions, outcomes))
+            stream.write(
+                build_comparison([group.runs[0] for group in groups], conclusions, outcomes)
+            )
     for line in gates.github_lines(outcomes) if github else ():
         click.echo(line, err=as_json or as_markdown)
     gates.check_gate(outcomes)
@@ -135,13 +146,19 @@ def compare_command(
 
 
 def _check_sources(runs: Sequence[Result]) -> None:
-    """Raise DataLost if a run whose rules hold cannot be verified, was interrupted, or rests on a damaged log."""
+    """Raise DataLost if a run whose rules hold cannot be verified, was interrupted, or rests on a
+    damaged log.
+    """
     for run in runs:
         if run.losses:
             what = f"the rules hold, but the log of {run.name} was damaged at {run.losses} places"
-            raise DataLost(what, where="--gate", hint="record it again, or repair it with 'avsreplay doctor'")
+            raise DataLost(
+                what, where="--gate", hint="record it again, or repair it with 'avsreplay doctor'"
+            )
         if "interrupted_after" in run.header:
-            raise DataLost(f"the rules hold, but {run.name} was interrupted", where="--gate", hint="run again")
+            raise DataLost(
+                f"the rules hold, but {run.name} was interrupted", where="--gate", hint="run again"
+            )
         if run.unverified and run.whole:
             what = f"the rules hold, but {run.name} cannot be verified: {run.unverified}"
             raise DataLost(what, where="--gate", hint="run again")
@@ -157,7 +174,11 @@ class _Group:
 
 def _group(path: Path) -> _Group:
     """The result at ``path``, or all results in its subfolders."""
-    inside = sorted(found.parent for found in path.glob("*/rows.jsonl")) if not (path / "rows.jsonl").is_file() else []
+    inside = (
+        sorted(found.parent for found in path.glob("*/rows.jsonl"))
+        if not (path / "rows.jsonl").is_file()
+        else []
+    )
     runs = tuple(read_result(folder) for folder in inside or [path])
     return _Group(path.resolve().name if inside else runs[0].name, runs)
 
@@ -173,7 +194,11 @@ def _with_distinct_names(groups: list[_Group]) -> list[_Group]:
             out.append(group)
             continue
         name = f"{group.name}#{so_far[group.name]}"
-        out.append(_Group(name, group.runs if len(group.runs) > 1 else (replace(group.runs[0], name=name),)))
+        out.append(
+            _Group(
+                name, group.runs if len(group.runs) > 1 else (replace(group.runs[0], name=name),)
+            )
+        )
     return out
 
 
@@ -185,23 +210,34 @@ def _paired(base: _Group, other: _Group) -> list[tuple[Result, Result]]:
     alone = sorted(ours.keys() ^ theirs.keys())
     if alone:
         what = f"the runs cannot be paired by name: {', '.join(alone[:3])} without a partner"
-        raise UsageError(what, where=f"{base.name}, {other.name}", hint="give both folders the same subfolders")
+        raise UsageError(
+            what, where=f"{base.name}, {other.name}", hint="give both folders the same subfolders"
+        )
     return [(theirs[name], ours[name]) for name in sorted(ours)]
 
 
 def _outcomes(
-    rules: Sequence[gates.GateRule], base: _Group, pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]]
+    rules: Sequence[gates.GateRule],
+    base: _Group,
+    pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]],
 ) -> list[gates.RuleOutcome]:
-    """The rules on every run against its own baseline; on the runs themselves where there is only one group."""
+    """The rules on every run against its own baseline.
+
+    On the runs themselves where there is only one group.
+    """
     if not rules:
         return []
     if not pairs:
-        return gates.judge(rules, [(run.name, metrics(run.summary)) for run in base.runs], baseline=False)
+        return gates.judge(
+            rules, [(run.name, metrics(run.summary)) for run in base.runs], baseline=False
+        )
     out = []
     for group, listed in pairs:
         for left, right in listed:
             name = group.name if len(listed) == 1 else f"{group.name}/{right.name}"
-            out += gates.judge(rules, [(base.name, metrics(left.summary)), (name, metrics(right.summary))])
+            out += gates.judge(
+                rules, [(base.name, metrics(left.summary)), (name, metrics(right.summary))]
+            )
     return out
 
 
@@ -218,7 +254,9 @@ def _tables(
     found = [settings_table(c) for c in conclusions]
     found += [changes_table(groups[0].name, c, show_all=show_all) for c in conclusions]
     if not conclusions:
-        found += [metrics_table(run.name, list(metrics(run.summary).items())) for run in groups[0].runs]
+        found += [
+            metrics_table(run.name, list(metrics(run.summary).items())) for run in groups[0].runs
+        ]
     return [*found, gates.gate_table(outcomes)]
 
 
@@ -244,26 +282,39 @@ def _print(
 
 
 def _markdown(
-    groups: Sequence[_Group], conclusions: Sequence[Conclusion], outcomes: Sequence[gates.RuleOutcome]
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
 ) -> list[str]:
     from avsreplay.report.table import escaped, markdown
 
     signs = {"better": "✅", "same": "✅", "worse": "❌", "mixed": "⚠️", "no evidence": "❔"}
     lines = [f"### {signs[c.word]} {escaped(c.sentence)}\n" for c in conclusions]
-    return lines + [markdown(table) for table in _tables(groups, conclusions, outcomes) if table.rows]
+    return lines + [
+        markdown(table) for table in _tables(groups, conclusions, outcomes) if table.rows
+    ]
 
 
 def _document(
-    groups: Sequence[_Group], conclusions: Sequence[Conclusion], outcomes: Sequence[gates.RuleOutcome]
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
 ) -> str:
     records: list[dict[str, Any]] = [
-        {"name": group.name, "runs": [{"name": run.name, "metrics": metrics(run.summary)} for run in group.runs]}
+        {
+            "name": group.name,
+            "runs": [{"name": run.name, "metrics": metrics(run.summary)} for run in group.runs],
+        }
         for group in groups
     ]
     for record, conclusion in zip(records[1:], conclusions, strict=True):
         record["conclusion"] = {k: v for k, v in dump(conclusion).items() if k != "divergence"}
         if found := conclusion.divergence:
             first = dump(found.differences[0]) if found.differences else None
-            record["divergence"] = {"cells": found.count, "by_column": dict(found.by_column), "first": first}
+            record["divergence"] = {
+                "cells": found.count,
+                "by_column": dict(found.by_column),
+                "first": first,
+            }
     whole = {"format": "avsreplay-compare/2", "results": records, "gate": dump(list(outcomes))}
     return json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)

@@ -17,7 +17,15 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 CONFIG = "avsreplay.config:RunConfig"
-METHOD = {"no_deskew", "config_file", "robot_file", "assignments", "starts", "paper", "init"}  # names of parameters
+METHOD = {
+    "no_deskew",
+    "config_file",
+    "robot_file",
+    "assignments",
+    "starts",
+    "paper",
+    "init",
+}  # names of parameters
 ASSIGNED = {
     "backend": "register.backend",
     "policy": "faults.policy",
@@ -54,13 +62,21 @@ class _Choice(click.ParamType[str]):
         choices = declared(self.owner, self.key).choices
         return f"[{'|'.join(choices)}]" if choices else None
 
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 (click names them)
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002 (click names it)
+        param: click.Parameter,  # noqa: ARG002 (click names it)
+        incomplete: str,
+    ) -> list[CompletionItem]:
         choices = declared(self.owner, self.key).choices
         return [CompletionItem(choice) for choice in choices if choice.startswith(incomplete)]
 
 
 class SettingOption(click.Option):
-    """An option for one setting. ``owner`` is ``module:class``; ``key`` is the parameter's name where not given."""
+    """An option for one setting. ``owner`` is ``module:class``.
+
+    ``key`` is the parameter's name where not given.
+    """
 
     def __init__(self, names: list[str], owner: str = CONFIG, key: str = "", **more: Any) -> None:
         super().__init__(names, **more)
@@ -71,13 +87,18 @@ class SettingOption(click.Option):
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         """Option and help text, from the declaration."""
         setting = declared(self.owner, self.key).declared
-        notes = [setting.unit and f"[{setting.unit}]", setting.automatic and f"(default: {setting.automatic})"]
+        notes = [
+            setting.unit and f"[{setting.unit}]",
+            setting.automatic and f"(default: {setting.automatic})",
+        ]
         self.help = " ".join(part for part in (setting.doc.removesuffix("."), *notes) if part) + "."
         return super().get_help_record(ctx)
 
 
 class SectionedCommand(click.Command):
-    """A command whose help lists the settings of a run, and those of the input, apart from its other options."""
+    """A command whose help lists the settings of a run, and those of the input, apart from its
+    other options.
+    """
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, each under the heading of its section."""
@@ -107,7 +128,7 @@ def source_setting(*names: str, **more: Any) -> Callable[[F], F]:
     """Decorator: an option for one setting of how a source is read."""
     if "is_flag" in more:
         more.setdefault("default", None)
-    return setting_option(*names, owner="avsreplay.log:SourceOptions", **more)
+    return setting_option(*names, owner="avsreplay.log.options:SourceOptions", **more)
 
 
 def _variable(name: str) -> str:
@@ -118,15 +139,25 @@ def robot_option(**more: Any) -> Callable[[F], F]:
     """Decorator: the option for a robot file."""
     file = click.Path(path_type=Path)
     return click.option(
-        "--robot", "robot_file", type=file, help="TOML file that describes the robot in a table [robot].", **more
+        "--robot",
+        "robot_file",
+        type=file,
+        help="TOML file that describes the robot in a table [robot].",
+        **more,
     )
 
 
 def run_settings(command: F) -> F:
-    """Add the settings of a run to a command: one option each for the frequent ones, ``--config`` and ``--set``."""
+    """Add the settings of a run to a command.
+
+    One option each for the frequent ones, ``--config`` and ``--set``.
+    """
     options = [
         setting_option(
-            f"--{name}", key=key, envvar=_variable(name), metavar="log|truth|auto|POSE" if name == "init" else None
+            f"--{name}",
+            key=key,
+            envvar=_variable(name),
+            metavar="log|truth|auto|POSE" if name == "init" else None,
         )
         for name, key in ASSIGNED.items()
     ]
@@ -161,9 +192,11 @@ def run_settings(command: F) -> F:
 
 
 def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ...]]:
-    """Take the options of ``run_settings`` out of ``flags``: the configuration file and ``a.b=value`` assignments.
+    """Take the options of ``run_settings`` out of ``flags``: the configuration file and
+    ``a.b=value`` assignments.
 
-    Options come after environment variables, so that they take precedence. An error in a value names what gave it.
+    Options come after environment variables, so that they take precedence. An error in a value
+    names what gave it.
     """
     from avsreplay.toml_document import Assignment, toml_value
 
@@ -174,7 +207,9 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
         typed = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         variable = _variable(option[2:].replace("-", "_"))
         given = f"{option} {value}".rstrip() if typed else f"environment {variable}={value or 1}"
-        by_source[typed] += [Assignment(text, given) for text in assignments] if option else assignments
+        by_source[typed] += (
+            [Assignment(text, given) for text in assignments] if option else assignments
+        )
 
     robot_file = flags.pop("robot_file")
     if robot_file is not None:
@@ -210,11 +245,27 @@ Settings of a run are given, in order of precedence, by an option (`--set regist
 
 SECTIONS = (
     ("Run", "Keys of `--config` and `--set`.", "avsreplay.config:RunConfig"),
-    ("Reading a log", "Options of `avsreplay run`, `info` and `record`.", "avsreplay.log:SourceOptions"),
-    ("Constraints of a plan", "Options of `avsreplay plan`.", "avsreplay.plan:Limits"),
-    ("Scenario", "A scenario file, see [Scenarios](scenario.md).", "avsreplay.simulate.scenario:ScenarioParams"),
-    ("Campaign", "A campaign file, see [Campaigns](sweep.md).", "avsreplay.sweep:Campaign"),
-    ("Gate", "A file of rules for `avsreplay compare --gate`, see [CI](ci.md).", "avsreplay.report.gate:GateRules"),
+    (
+        "Reading a log",
+        "Options of `avsreplay run`, `info` and `record`.",
+        "avsreplay.log.options:SourceOptions",
+    ),
+    ("Constraints of a plan", "Options of `avsreplay plan`.", "avsreplay.plan.limits:Limits"),
+    (
+        "Scenario",
+        "A scenario file, see [Scenarios](scenario.md).",
+        "avsreplay.simulate.scenario:ScenarioParams",
+    ),
+    (
+        "Campaign",
+        "A campaign file, see [Campaigns](sweep.md).",
+        "avsreplay.sweep.campaign:Campaign",
+    ),
+    (
+        "Gate",
+        "A file of rules for `avsreplay compare --gate`, see [CI](ci.md).",
+        "avsreplay.report.gate:GateRules",
+    ),
 )
 
 
@@ -226,8 +277,9 @@ SECTIONS = (
 def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any) -> None:
     """Print the effective settings of a run as a TOML file that 'avsreplay run --config' reads.
 
-    With LOG, the log's own [run] table is included. An option takes precedence over an environment variable
-    (AVSREPLAY_RUN_...), that over the --config file, that over the log's own table, and that over the default.
+    With LOG, the log's own [run] table is included. An option takes precedence over an environment
+    variable (AVSREPLAY_RUN_...), that over the --config file, that over the log's own table, and
+    that over the default.
     """
     from avsreplay import settings, toml_document
     from avsreplay.config import load_config
@@ -240,7 +292,10 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
     if as_json:
         click.echo(json.dumps(settings.dump(config), indent=1))
     else:
-        click.echo(toml_document.to_toml(config, "Settings of 'avsreplay run', to be read with --config"), nl=False)
+        click.echo(
+            toml_document.to_toml(config, "Settings of 'avsreplay run', to be read with --config"),
+            nl=False,
+        )
 
 
 def _own_table(log: Path) -> dict[str, Any]:

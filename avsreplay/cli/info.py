@@ -1,4 +1,7 @@
-"""``avsreplay info`` and ``avsreplay doctor``: the content of a log, its damage, and a repaired copy."""
+"""``avsreplay info`` and ``avsreplay doctor``.
+
+The content of a log, its damage, and a repaired copy.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import SectionedCommand, source_setting
-from avsreplay.cli.options import check_outputs, pose_options, read_options, report_losses, source_options
+from avsreplay.cli.options import (
+    check_outputs,
+    pose_options,
+    read_options,
+    report_losses,
+    source_options,
+)
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss, Source
@@ -40,11 +49,11 @@ Examples:
 def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 
-    With a model (in the log or --model) it also checks what a run needs: unit of the model, background points, truth,
-    transforms and time stamps; each finding names the option to add.
+    With a model (in the log or --model) it also checks what a run needs: unit of the model,
+    background points, truth, transforms and time stamps; each finding names the option to add.
 
-    The exit code is 4 if a part of SOURCE could not be read, or a scan cannot be decoded. All scans are decoded, unless
-    SOURCE is larger than 256 MiB.
+    The exit code is 4 if a part of SOURCE could not be read, or a scan cannot be decoded. All scans
+    are decoded, unless SOURCE is larger than 256 MiB.
 
     \f
     Raises:
@@ -67,7 +76,9 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     if as_json:
         checks = [dataclasses.asdict(a) for a in advice]
         broken = [{"scan": seq, "why": why} for seq, why in damaged.items()]
-        click.echo(json.dumps({**_document(info), "damaged_scans": broken, "checks": checks}, indent=2))
+        click.echo(
+            json.dumps({**_document(info), "damaged_scans": broken, "checks": checks}, indent=2)
+        )
     else:
         _print(info, advice, damaged)
     report_losses(opened)
@@ -98,12 +109,15 @@ def _advice(opened: Source, built: bool) -> list[Advice]:
     try:
         open_source(opened.path, opened.options).close()
     except AvsError as error:
-        return [Advice("fail", "scans", f"{error.what}; {error.hint}" if error.hint else error.what)]
+        return [
+            Advice("fail", "scans", f"{error.what}; {error.hint}" if error.hint else error.what)
+        ]
     return []
 
 
 def _advice_of_topics(opened: Source, built: bool, topics: list[str]) -> list[Advice]:
-    """The checks of the topic of clouds in which the model is found, or its size fits, and the option that selects it.
+    """The checks of the topic of clouds in which the model is found, or its size fits, and the
+    option that selects it.
 
     At most four topics are examined.
     """
@@ -113,12 +127,20 @@ def _advice_of_topics(opened: Source, built: bool, topics: list[str]) -> list[Ad
 
     checked = dict[str, list[Advice]]()
     for topic in topics[:4]:
-        with open_source(opened.path, dataclasses.replace(opened.options, topic=topic), inspect=True) as source:
+        with open_source(
+            opened.path, dataclasses.replace(opened.options, topic=topic), inspect=True
+        ) as source:
             checked[topic] = _advice(source, built)
     wrong = {"size": 1, "pose": 2, "scans": 3}
-    best = min(checked, key=lambda name: sum(wrong.get(a.about, 0) for a in checked[name] if a.grade != "ok"))
+    best = min(
+        checked,
+        key=lambda name: sum(wrong.get(a.about, 0) for a in checked[name] if a.grade != "ok"),
+    )
     others = ", ".join(shown(topic) for topic in topics if topic != best)
-    text = f"{len(topics)} topics have clouds; the next findings are those of {shown(best)}, not of {others}"
+    text = (
+        f"{len(topics)} topics have clouds; the next findings are those of {shown(best)}, not of"
+        f" {others}"
+    )
     return [Advice("check", "topic", text, f"--topic {shown(best)}"), *checked[best]]
 
 
@@ -137,7 +159,11 @@ def loss_line(loss: Loss) -> str:
     """Return one line of text about a loss."""
     from avsreplay.log.bytes_io import shown
 
-    parts = [f"{loss.file}: " if loss.file else "", loss.what, f" (byte {loss.offset}, {loss.bytes} bytes"]
+    parts = [
+        f"{loss.file}: " if loss.file else "",
+        loss.what,
+        f" (byte {loss.offset}, {loss.bytes} bytes",
+    ]
     if loss.chunks:
         parts.append(f", {loss.chunks} chunk")
     if loss.messages is not None:
@@ -156,7 +182,9 @@ def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str]) -> None
     print_table(console, _topics(info))
     print_table(console, _faults(info))
     print_table(console, _checks(advice))
-    options = [a.option for a in advice if a.option and not any(map(_is_placeholder, a.option.split()))]
+    options = [
+        a.option for a in advice if a.option and not any(map(_is_placeholder, a.option.split()))
+    ]
     if len(options) > 1:
         click.echo(f"options to add: {' '.join(dict.fromkeys(options))}")
     for loss in info.losses:
@@ -186,20 +214,33 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
         ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
         ("size", f"{info.bytes / 1e6:.3g} MB" if info.bytes >= 1e6 else f"{info.bytes} bytes"),
         ("log clock", " ".join(filter(None, (_time(info.start_ns), "for", span))) if span else "-"),
-        ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "") + _decoded(info)),
+        (
+            "scans",
+            str(info.scans)
+            + (f" on {info.cloud_topic}" if info.cloud_topic else "")
+            + _decoded(info),
+        ),
         ("model", _model(info)),
         ("truth", "yes" if info.truth else "no"),
     ]
     if info.scenario:
-        rows.append(("scenario", "simulated" + ("" if info.seed is None else f", seed {info.seed}")))
-    if info.clock is not None and info.scans and info.topics:  # a folder of scans has no second clock
+        rows.append(
+            ("scenario", "simulated" + ("" if info.seed is None else f", seed {info.seed}"))
+        )
+    if (
+        info.clock is not None and info.scans and info.topics
+    ):  # a folder of scans has no second clock
         rows.append(("clock", _clock(info.clock)))
     return rows + [(name, value) for name, value in info.notes.items()]
 
 
 def _decoded(info: LogInfo) -> str:
     """A remark where only a few scans of a large log were decoded."""
-    return "; 'avsreplay doctor' tests whether all can be decoded" if info.bytes > DECODED_BYTES else ""
+    return (
+        "; 'avsreplay doctor' tests whether all can be decoded"
+        if info.bytes > DECODED_BYTES
+        else ""
+    )
 
 
 def _time(t_ns: int | None) -> str:
@@ -213,14 +254,24 @@ def _time(t_ns: int | None) -> str:
 def _model(info: LogInfo) -> str:
     if info.model is None:
         return "none (give --model)"
-    size = f"{info.model_vertices} vertices, {info.model_faces} triangles, diagonal {info.model_extent_m:.6g} m"
+    size = (
+        f"{info.model_vertices} vertices, {info.model_faces} triangles, diagonal"
+        f" {info.model_extent_m:.6g} m"
+    )
     return f"{info.model}: {size}"
 
 
 def _clock(clock: ClockSummary) -> str:
-    text = f"{clock.clock}; header minus log {clock.offset_s:+.3f} s; median period {clock.period_s:.4f} s"
+    text = (
+        f"{clock.clock}; header minus log {clock.offset_s:+.3f} s; median period"
+        f" {clock.period_s:.4f} s"
+    )
     counts = ("unset", "jumps", "equal", "back", "header_steps", "log_steps")
-    found = [f"{getattr(clock, name)} {name.replace('_', ' ')}" for name in counts if getattr(clock, name)]
+    found = [
+        f"{getattr(clock, name)} {name.replace('_', ' ')}"
+        for name in counts
+        if getattr(clock, name)
+    ]
     return "; ".join([text, *found, *([clock.note] if clock.note else [])])
 
 
@@ -233,13 +284,20 @@ def _topics(info: LogInfo) -> Table:
             *map(shown, (topic.name, topic.type, topic.encoding)),
             str(topic.count),
             number(topic.rate_hz, ".3f"),
-            "-"
-            if topic.first_ns is None or topic.last_ns is None
-            else f"{(topic.last_ns - topic.first_ns) * 1e-9:.3f}",
+            (
+                "-"
+                if topic.first_ns is None or topic.last_ns is None
+                else f"{(topic.last_ns - topic.first_ns) * 1e-9:.3f}"
+            ),
         )
         for topic in info.topics
     )
-    return Table("Topics", ("topic", "type", "encoding", "messages", "rate\n[Hz]", "span\n[s]"), rows, align="lllr")
+    return Table(
+        "Topics",
+        ("topic", "type", "encoding", "messages", "rate\n[Hz]", "span\n[s]"),
+        rows,
+        align="lllr",
+    )
 
 
 def _faults(info: LogInfo) -> Table:
@@ -263,16 +321,30 @@ Examples:
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--topic", help="The cloud topic, if there are several.")
 @click.option(
-    "--repair", "output", type=click.Path(path_type=Path), help="Write every intact record to this file (MCAP only)."
+    "--repair",
+    "output",
+    type=click.Path(path_type=Path),
+    help="Write every intact record to this file (MCAP only).",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--strict", is_flag=True, help="Exit with code 3 if any part is lost.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
+@click.option(
+    "--max-message-mib",
+    type=int,
+    default=128,
+    show_default=True,
+    help="Largest message that is read [MiB].",
+)
 def doctor_command(
-    source: Path, topic: str | None, output: Path | None, overwrite: bool, strict: bool, as_json: bool,
+    source: Path,
+    topic: str | None,
+    output: Path | None,
+    overwrite: bool,
+    strict: bool,
+    as_json: bool,
     max_message_mib: int,
-) -> None:  # fmt: skip
+) -> None:
     """Check SOURCE: structure, checksums, clocks, gaps, duplicates, points, layout and truth.
 
     The exit code is 0 if no part is lost, else 4 (3 with --strict).
@@ -290,7 +362,9 @@ def doctor_command(
     try:
         options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
     except ValueError as error:
-        raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
+        raise UsageError(
+            str(error), where="--max-message-mib", hint="give a whole number of MiB"
+        ) from None
     check_outputs("output", overwrite=overwrite)
     _, findings = examine(source, options)
     done = None
@@ -312,11 +386,15 @@ def _judge(source: Path, findings: list[Finding], strict: bool) -> None:
     if errors:
         what = f"{counted(len(errors), 'error')}, the first: {errors[0].about}: {errors[0].text}"
         repaired = "--repair OUT copies the intact records"
-        hint = repaired if is_mcap(source) else "'avsreplay record' writes a log of the intact scans"
+        hint = (
+            repaired if is_mcap(source) else "'avsreplay record' writes a log of the intact scans"
+        )
         raise (UnreadableInput if strict else DataLost)(what, where=str(source), hint=hint)
 
 
-def _damage(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> dict[str, Any]:
+def _damage(
+    source: Path, findings: list[Finding], output: Path | None, done: Repaired | None
+) -> dict[str, Any]:
     import dataclasses
 
     listed = [{**dataclasses.asdict(f), "severity": f.severity.value} for f in findings]
@@ -324,19 +402,31 @@ def _damage(source: Path, findings: list[Finding], output: Path | None, done: Re
     return {"source": str(source), "findings": listed, "repaired": repaired}
 
 
-def _print_findings(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> None:
+def _print_findings(
+    source: Path, findings: list[Finding], output: Path | None, done: Repaired | None
+) -> None:
     from avsreplay.log.bytes_io import shown
     from avsreplay.report.table import Table, TableCell, make_console, print_line, print_table
 
     marks = {"error": "bad", "warning": "warn", "note": "", "ok": "good"}
     rows = tuple(
-        (TableCell(f.severity.value, marks[f.severity.value]), f.about, shown(f.text), ", ".join(map(str, f.places)))
+        (
+            TableCell(f.severity.value, marks[f.severity.value]),
+            f.about,
+            shown(f.text),
+            ", ".join(map(str, f.places)),
+        )
         for f in findings
     )
     console = make_console(plain_width=WIDTH)
-    print_table(console, Table(shown(source), ("severity", "about", "finding", "at"), rows, align="l"))
+    print_table(
+        console, Table(shown(source), ("severity", "about", "finding", "at"), rows, align="l")
+    )
     if done is not None:
-        kept = f"{done.messages} messages, {done.attachments} attachments, {done.records} metadata records"
+        kept = (
+            f"{done.messages} messages, {done.attachments} attachments, {done.records} metadata"
+            " records"
+        )
         print_line(console, shown(f"repaired: {output}: {kept}"))
         for line in done.dropped:
             print_line(console, shown(f"left out: {line}"))

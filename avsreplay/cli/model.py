@@ -1,4 +1,7 @@
-"""``avsreplay model`` and ``avsreplay odometry``: an unknown target, with and without a model built from its scans."""
+"""``avsreplay model`` and ``avsreplay odometry``.
+
+An unknown target, with and without a model built from its scans.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ from avsreplay.cli.options import (
 from avsreplay.errors import MissingBackend, UsageError
 
 if TYPE_CHECKING:
-    from avsreplay.reconstruct import Deviations, Reconstruction
+    from avsreplay.reconstruct.model import Deviations, Reconstruction
 
 EPILOG = """\b
 Examples:
@@ -37,18 +40,35 @@ Examples:
 
 @click.command("model", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="The model to write (.ply): points with normals.")
-@click.option("--against", type=PATH, help="CAD model to compare the result with; the points are coloured by distance.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=PATH,
+    help="The model to write (.ply): points with normals.",
+)
+@click.option(
+    "--against",
+    type=PATH,
+    help="CAD model to compare the result with; the points are coloured by distance.",
+)
 @click.option(
     "--grasp",
     type=Numbers(3),
     metavar="X,Y,Z",
-    help="Grasp point in the frame that the same command without this option writes [m]; default: the flattest patch.",
+    help=(
+        "Grasp point in the frame that the same command without this option writes [m]; default:"
+        " the flattest patch."
+    ),
 )
 @click.option(
-    "--mesh", type=PATH, help="Also write a triangle mesh (.ply); needs Open3D: pip install 'avsreplay[open3d]'."
+    "--mesh",
+    type=PATH,
+    help="Also write a triangle mesh (.ply); needs Open3D: pip install 'avsreplay[open3d]'.",
 )
-@click.option("--poses", type=PATH, help="Also write the pose of {C} at each scan that was used (TUM).")
+@click.option(
+    "--poses", type=PATH, help="Also write the pose of {C} at each scan that was used (TUM)."
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @source_options
@@ -63,16 +83,17 @@ def model_command(
     as_json: bool,
     **reading: Any,
 ) -> None:
-    """Build a model of the target from the scans of LOG, without a model and without an initial guess.
+    """Build a model of the target from the scans of LOG, without a model and without an initial
+    guess.
 
-    The result is a point cloud with normals in a frame {C} that is fixed to the target: its origin is a grasp point
-    on the surface and its x axis the outward normal there. Ground truth in LOG is not used. 'avsreplay run LOG
-    --model auto' builds the model and replays the log against it in one step.
+    The result is a point cloud with normals in a frame {C} that is fixed to the target: its origin
+    is a grasp point on the surface and its x axis the outward normal there. Ground truth in LOG is
+    not used. 'avsreplay run LOG --model auto' builds the model and replays the log against it in
+    one step.
 
-    The poses of --poses are a fit to all scans together; if the target moves freely, they are those of the fitted
-    motion. Their errors are not independent of one another, as a filter assumes of measurements.
-    \f
-    Raises:
+    The poses of --poses are a fit to all scans together; if the target moves freely, they are those
+    of the fitted motion. Their errors are not independent of one another, as a filter assumes of
+    measurements. \f Raises:
         MissingBackend: a mesh is requested and Open3D is not installed.
         DataLost: a part of LOG could not be read.
     """  # noqa: D301
@@ -81,7 +102,8 @@ def model_command(
     from avsreplay.files import output_path
     from avsreplay.log import open_source, read_surface
     from avsreplay.log.header import surface_bytes
-    from avsreplay.reconstruct import at_grasp, deviations, meshed, reconstruct, reconstruction_ply
+    from avsreplay.reconstruct.model import at_grasp, deviations, meshed, reconstruction_ply
+    from avsreplay.reconstruct.reconstruction import reconstruct
     from avsreplay.report.export import write_tum
 
     for each in (output, mesh):
@@ -92,7 +114,9 @@ def model_command(
         check_suffix(poses, *TUM)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
-        raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
+        raise MissingBackend(
+            "a mesh needs Open3D, which is not installed", where="--mesh", hint=hint
+        )
     cad = read_surface(against) if against else None
     with open_source(log, read_options(reading)) as source:
         made = at_grasp(reconstruct(lambda: tracked(source.scans(), len(source), "reading")))
@@ -114,7 +138,10 @@ def model_command(
 
 
 def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
-    """Return the JSON document: figures of the reconstruction and of its deviations from a CAD model."""
+    """Return the JSON document.
+
+    Figures of the reconstruction and of its deviations from a CAD model.
+    """
     out: dict[str, Any] = {
         "scans_used": made.used,
         "scans_in_log": made.offered,
@@ -153,11 +180,18 @@ def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
 def _text(said: dict[str, Any]) -> str:
     """Return the lines that a person reads."""
     lines = [
-        f"scans used:     {said['scans_used']} of {said['scans_in_log']}, {said['searches']} of them needed a search",
-        f"surface:        {said['points']} points, median 1 sigma {1e3 * said['median_one_sigma_m']:.2f} mm,"
-        f" extent {said['extent_m']:.3f} m",
-        f"seen from:      {100.0 * said['coverage']:.0f} % of all directions; the target turned"
-        f" {said['turn_deg']:.0f} deg",
+        (
+            f"scans used:     {said['scans_used']} of {said['scans_in_log']}, {said['searches']} of"
+            " them needed a search"
+        ),
+        (
+            f"surface:        {said['points']} points, median 1 sigma"
+            f" {1e3 * said['median_one_sigma_m']:.2f} mm, extent {said['extent_m']:.3f} m"
+        ),
+        (
+            f"seen from:      {100.0 * said['coverage']:.0f} % of all directions; the target turned"
+            f" {said['turn_deg']:.0f} deg"
+        ),
         f"consistency:    {1e3 * said['rms_m']:.2f} mm rms between overlapping scans",
         f"frame {{C}}:      {said['frame']}",
     ]
@@ -165,21 +199,34 @@ def _text(said: dict[str, Any]) -> str:
     if motion:
         centre = ", ".join(f"{x:.3f}" for x in motion["mass_centre_m"])
         lines += [
-            f"free motion:    explains the poses to {motion['angle_rms_deg']:.2f} deg and"
-            f" {1e3 * motion['distance_rms_m']:.2f} mm rms",
-            f"mass centre:    ({centre}) m in {{C}}, 1 sigma {1e3 * motion['mass_centre_1s_m']:.1f} mm;"
-            f" principal axes to {motion['principal_axes_1s_deg']:.1f} deg",
+            (
+                f"free motion:    explains the poses to {motion['angle_rms_deg']:.2f} deg and"
+                f" {1e3 * motion['distance_rms_m']:.2f} mm rms"
+            ),
+            (
+                f"mass centre:    ({centre}) m in {{C}}, 1 sigma"
+                f" {1e3 * motion['mass_centre_1s_m']:.1f} mm; principal axes to"
+                f" {motion['principal_axes_1s_deg']:.1f} deg"
+            ),
         ]
     else:
-        lines.append("free motion:    the poses do not follow one; mass centre and principal axes are not known")
+        lines.append(
+            "free motion:    the poses do not follow one; mass centre and principal axes are not"
+            " known"
+        )
     if "mesh_faces" in said:
         lines.append(
-            f"mesh:           {said['mesh_faces']} triangles, {100.0 * said['mesh_interpolated']:.1f} % of the area"
-            " interpolated"
+            f"mesh:           {said['mesh_faces']} triangles,"
+            f" {100.0 * said['mesh_interpolated']:.1f} % of the area interpolated"
         )
     if against:
-        far = f"{1e3 * against['median_m']:.2f} mm median, {1e3 * against['p95_m']:.2f} mm 95 % quantile"
-        share = f"{100.0 * against['points_within']:.1f} % within {1e3 * against['within_m']:.0f} mm"
+        far = (
+            f"{1e3 * against['median_m']:.2f} mm median, {1e3 * against['p95_m']:.2f} mm 95 %"
+            " quantile"
+        )
+        share = (
+            f"{100.0 * against['points_within']:.1f} % within {1e3 * against['within_m']:.0f} mm"
+        )
         lines.append(f"from CAD model: {far}, {share}")
         lines += _table(against["regions"])
     return "\n".join([*lines, *(f"note: {note}" for note in said["notes"])])
@@ -192,8 +239,13 @@ def _table(regions: list[dict[str, Any]]) -> list[str]:
     lines = ["  region    points   size [m]   deviation [m]   centre in the CAD frame [m]"]
     for region in regions:
         centre = ", ".join(f"{x:.3f}" for x in region["centre_m"])
-        deviation = "beyond" if math.isnan(region["deviation_m"]) else f"{region['deviation_m']:+.3f}"
-        lines.append(f"  {region['kind']:<8}{region['points']:>8}{region['size_m']:>11.3f}{deviation:>16}   ({centre})")
+        deviation = (
+            "beyond" if math.isnan(region["deviation_m"]) else f"{region['deviation_m']:+.3f}"
+        )
+        lines.append(
+            f"  {region['kind']:<8}{region['points']:>8}{region['size_m']:>11.3f}{deviation:>16}  "
+            f" ({centre})"
+        )
     return lines
 
 
@@ -209,9 +261,13 @@ Examples:
 
 @click.command("odometry", cls=SectionedCommand, epilog=ODOMETRY_EPILOG)
 @click.argument("log", type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM: .tum or .txt).")
 @click.option(
-    "--size", type=click.FloatRange(LEAST_M, MOST_M), help="Size of the target [m]; default: of the first scan."
+    "-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM: .tum or .txt)."
+)
+@click.option(
+    "--size",
+    type=click.FloatRange(LEAST_M, MOST_M),
+    help="Size of the target [m]; default: of the first scan.",
 )
 @click.option("--no-deskew", is_flag=True, help="Ignore the times of the points.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
@@ -219,11 +275,13 @@ Examples:
 def odometry_command(
     log: Path, output: Path, size: float | None, no_deskew: bool, overwrite: bool, **reading: Any
 ) -> None:
-    """Track an unknown target through the scans of LOG by KISS-ICP, without a model, and write its poses.
+    """Track an unknown target through the scans of LOG by KISS-ICP, without a model, and write its
+    poses.
 
-    The odometry is relative to the target; crop everything that does not move with it. {C} is parallel to the camera
-    frame of the first scan, its origin at the centroid of that scan. Errors accumulate: 'avsreplay model' builds a
-    model with closed loops, and a registration to a model does not drift. The voxel is a hundredth of the size.
+    The odometry is relative to the target; crop everything that does not move with it. {C} is
+    parallel to the camera frame of the first scan, its origin at the centroid of that scan. Errors
+    accumulate: 'avsreplay model' builds a model with closed loops, and a registration to a model
+    does not drift. The voxel is a hundredth of the size.
 
     \f
     Raises:
@@ -255,6 +313,8 @@ def odometry_command(
             pose, after_s = odometry.add(scan.points, scan.times_s)
             poses.append((scan.t_ns + round(1e9 * after_s), pose))
     if not poses:
-        raise UsageError(f"no scan has {LEAST_POINTS} points", where=str(log), hint="check the crop and --topic")
+        raise UsageError(
+            f"no scan has {LEAST_POINTS} points", where=str(log), hint="check the crop and --topic"
+        )
     click.echo(f"{output}: {write_tum(output, poses)} poses", err=output == STDOUT)
     report_losses(source)

@@ -1,4 +1,7 @@
-"""``avsreplay observability``: the observability Gramian of a log for three sets of estimated parameters."""
+"""``avsreplay observability``.
+
+The observability Gramian of a log for three sets of estimated parameters.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
     from avsreplay.estimate.initialise import PoseFix
     from avsreplay.estimate.reference import Reference
     from avsreplay.geometry import Array
-    from avsreplay.monitor import Gramian
+    from avsreplay.monitor.gramian import Gramian
     from avsreplay.records import Belief, State
     from avsreplay.rows import Row
     from avsreplay.run import ReplayedScan, Run
@@ -44,10 +47,22 @@ is a combination that the poses do not separate."""
 
 @click.command("observability", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("log", type=PATH)
-@click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
-@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="Change one setting; may be repeated.")
+@click.option(
+    "--init",
+    metavar="log|truth|auto|POSE",
+    help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.",
+)
+@click.option(
+    "--set",
+    "assignments",
+    multiple=True,
+    metavar="A.B=C",
+    help="Change one setting; may be repeated.",
+)
 @source_options
-@click.option("--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Rows of the table.")
+@click.option(
+    "--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Rows of the table."
+)
 @click.option(
     "--weakest",
     type=click.IntRange(0, 20),
@@ -98,12 +113,14 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     rows = list(run.rows([listen]))
     reference = poses.reference()
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
-    start = run.estimator.frame.state_into(_in_axes_of(beliefs[inside[-1].t_ns], reference), reference.epoch_ns)
+    start = run.estimator.frame.state_into(
+        _in_axes_of(beliefs[inside[-1].t_ns], reference), reference.epoch_ns
+    )
     lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF
-    from avsreplay.monitor import unobserved
-    from avsreplay.monitor import weakest as least
+    from avsreplay.monitor.gramian import unobserved
+    from avsreplay.monitor.gramian import weakest as least
 
     return {
         "log": Path(run.job.source).name,
@@ -115,7 +132,9 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
 
 
 def _in_axes_of(belief: Belief, reference: Reference) -> State:
-    """The reference motion at its epoch, with the principal axes in the order nearest to that of an estimate."""
+    """The reference motion at its epoch, with the principal axes in the order nearest to that of an
+    estimate.
+    """
     from avsreplay.estimate.chart import nearest_permutation
     from avsreplay.estimate.dynamics import propagate_state
 
@@ -126,9 +145,11 @@ def _in_axes_of(belief: Belief, reference: Reference) -> State:
 def _summed(
     rows: list[Row], x: State, fixes: dict[int, PoseFix], one_sigma: Array
 ) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
-    """A record per scan along the motion that begins with ``x`` at the first of them, and the Gramians at the end."""
+    """A record per scan along the motion that begins with ``x`` at the first of them, and the
+    Gramians at the end.
+    """
     from avsreplay.estimate.measurement import in_camera, prior_1s, step_of_sets
-    from avsreplay.monitor import gramian, measure, observe
+    from avsreplay.monitor.gramian import gramian, measure, observe
 
     t_ns = rows[0].t_ns
     folds = {name: gramian(scale) for name, scale in prior_1s(one_sigma, x.sigma).items()}
@@ -159,15 +180,22 @@ def _print(found: dict[str, Any]) -> None:
     title = f"Observability Gramian {motion}: rank, log10 of its condition raw and scaled"
     heads = [head for name in HEADS.values() for head in (f"{name}\nrank", "\nraw", "\nscaled")]
     rows = tuple(
-        (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name]))) for line in found["lines"]
+        (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name])))
+        for line in found["lines"]
     )
     console = make_console(plain_width=WIDTH)
-    note = "ogm_rank and ogm_log10_cond of 'run' are along the motion fitted to the poses up to that scan"
+    note = (
+        "ogm_rank and ogm_log10_cond of 'run' are along the motion fitted to the poses up to that"
+        " scan"
+    )
     print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
     for name, head in HEADS.items():
         lacking, weak = found["unobserved"][name], found["weakest"][name]
         if lacking:
-            print_line(console, f"{head}, {counted(len(lacking), 'direction')} not observed: " + "; ".join(lacking))
+            print_line(
+                console,
+                f"{head}, {counted(len(lacking), 'direction')} not observed: " + "; ".join(lacking),
+            )
         if weak:
             print_line(console, f"{head}, least observed: " + "; ".join(weak))
 

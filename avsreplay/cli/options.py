@@ -1,4 +1,7 @@
-"""Shared parts of the commands: options, sources, results, progress on stderr, and interruption between scans."""
+"""Shared parts of the commands.
+
+Options, sources, results, progress on stderr, and interruption between scans.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ class Numbers(click.ParamType[tuple[float, ...]]):
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
         """A tuple of floats; anything else is a usage error."""
         if isinstance(value, tuple):
             return value
@@ -49,7 +54,9 @@ class Numbers(click.ParamType[tuple[float, ...]]):
 
 
 class StartMode(click.ParamType[str | float]):
-    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the first scan)."""
+    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the
+    first scan).
+    """
 
     name = "mode|seconds"
 
@@ -124,7 +131,9 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         given["clock"] = ClockChoice(given["clock"])
     if "grasp" in given and given.get("model") == Path("auto"):
         hint = "build the model first with 'avsreplay model', which has the same option"
-        raise UsageError("the frame of a model is not known before it is built", where="--grasp", hint=hint)
+        raise UsageError(
+            "the frame of a model is not known before it is built", where="--grasp", hint=hint
+        )
     if "model_unit" in given:
         given["model_unit"] = Unit(given["model_unit"])
     try:
@@ -152,12 +161,19 @@ def report_losses(source: Source, damaged: int | None = None) -> None:
 
     if text := lost_text(source.losses, source.damaged, len(source), damaged):
         uncovered = not source.losses and UNKNOWN_SENSOR in text
-        hint = "see --truth-gap, or choose a part with --start and --end" if uncovered else "see 'avsreplay doctor'"
+        hint = (
+            "see --truth-gap, or choose a part with --start and --end"
+            if uncovered
+            else "see 'avsreplay doctor'"
+        )
         raise DataLost(text, where=str(source.path), hint=hint)
 
 
 def read_result(path: Path) -> Result:
-    """Read and verify a saved result; warn on stderr if it could not be verified or its log was damaged."""
+    """Read and verify a saved result.
+
+    Warn on stderr if it could not be verified or its log was damaged.
+    """
     from avsreplay.report.result import load_result
 
     result = load_result(path)
@@ -182,10 +198,14 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
     if str(log) != "-":
         yield log, GrowingLog(log) if follow else None
         return
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # Windows: the file is still open
+    with tempfile.TemporaryDirectory(
+        ignore_cleanup_errors=True
+    ) as folder:  # Windows: the file is still open
         if sys.stdin is None:
             raise UnreadableInput(
-                "it is closed", where="standard input", hint="give a file, or a pipe: ... | avsreplay run -"
+                "it is closed",
+                where="standard input",
+                hint="give a file, or a pipe: ... | avsreplay run -",
             )
         path = Path(folder) / "stdin"
         try:
@@ -193,12 +213,17 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
         except AvsError as error:
             error.where = (error.where or "").replace(str(path), "standard input") or None
             if path.is_file() and not path.stat().st_size and "broke off" not in error.what:
-                error.what, error.hint = "no data", "see the message of the program that writes to the pipe"
+                error.what, error.hint = (
+                    "no data",
+                    "see the message of the program that writes to the pipe",
+                )
             raise
 
 
 def given_paths(*others: str) -> list[Path]:
-    """Return all paths that the current command was given, except the values of the parameters ``others``."""
+    """Return all paths that the current command was given, except the values of the parameters
+    ``others``.
+    """
     context = click.get_current_context()
     found: list[Path] = []
     for param in context.command.params:
@@ -209,11 +234,12 @@ def given_paths(*others: str) -> list[Path]:
 
 
 def check_outputs(*names: str, overwrite: bool = True) -> None:
-    """Raise an error for outputs of the current command that cannot be written, before any work is done.
+    """Raise an error for outputs of the current command that cannot be written, before any work is
+    done.
 
     Args:
-        names: parameters of the command that are files to write. None of them may be an input, which is every other
-            parameter that is a path, or the file of another output.
+        names: parameters of the command that are files to write. None of them may be an input,
+            which is every other parameter that is a path, or the file of another output.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -243,7 +269,9 @@ def check_suffix(path: Path, *suffixes: str) -> None:
 def check_binary_output(output: Path) -> None:
     """Raise UsageError if ``output`` is "-" and standard output is a terminal."""
     if str(output) == "-" and sys.stdout.isatty():
-        raise UsageError("a log is binary", where="-o -", hint="redirect the output to a file or a pipe")
+        raise UsageError(
+            "a log is binary", where="-o -", hint="redirect the output to a file or a pipe"
+        )
 
 
 T = TypeVar("T")
@@ -251,12 +279,21 @@ PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield the items and show the progress on stderr; ``total`` 0 means that their number is unknown."""
+    """Yield the items and show the progress on stderr.
+
+    ``total`` 0 means that their number is unknown.
+    """
     if not sys.stderr.isatty():
         yield from _with_lines(items, total, what)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
@@ -272,7 +309,11 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
             said = now
             of = f" of {total}" if total else ""
             left = f", about {(now - begun) * (total - count) / count:.0f} s left" if total else ""
-            print(f"avsreplay: {what}: {count}{of} after {now - begun:.0f} s{left}", file=sys.stderr, flush=True)  # noqa: T201
+            print(  # noqa: T201 (progress of a long operation)
+                f"avsreplay: {what}: {count}{of} after {now - begun:.0f} s{left}",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 @contextmanager

@@ -13,13 +13,15 @@ from avsreplay.cli.options import Numbers, check_outputs
 if TYPE_CHECKING:
     from avsreplay.cli.plan_output import Answer, PossibleChange
     from avsreplay.outcome import Plan
-    from avsreplay.plan import Limits, PlanParams
     from avsreplay.plan.arm import Arm
+    from avsreplay.plan.rendezvous import PlanParams
+    from avsreplay.plan.robot import Limits
     from avsreplay.replan import Replanning
     from avsreplay.saved_result import Saved
 
-PLAN, LIMITS = "avsreplay.plan:PlanParams", "avsreplay.plan:Limits"
-# settings changed one at a time where no plan is found, with the factors of their values, and later instants [s]
+PLAN, LIMITS = "avsreplay.plan.rendezvous:PlanParams", "avsreplay.plan.limits:Limits"
+# settings changed one at a time where no plan is found, with the factors of their values, and later
+# instants, in seconds
 CHANGES = (
     ("robot.angular_accel_radps2", (2.0, 8.0, 64.0)),
     ("limits.clearance_sigmas", (2.0 / 3.0, 1.0 / 3.0, 0.0)),
@@ -61,7 +63,9 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 
 @click.command("plan", epilog=EPILOG)
 @click.argument("result", type=click.Path(path_type=Path))
-@click.option("--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence.")
+@click.option(
+    "--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence."
+)
 @setting_option("--a-max", "a_max_mps2", type=float, owner=PLAN)
 @setting_option("--horizon", "horizon_s", type=float, owner=PLAN)
 @setting_option("--latency", "latency_s", type=float, owner=PLAN)
@@ -85,25 +89,43 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
     help="Change a setting of plan, limits, robot or supervisor.",
 )
 @click.option(
-    "--samples", type=click.IntRange(1), default=64, show_default=True, help="Number of draws from the belief."
+    "--samples",
+    type=click.IntRange(1),
+    default=64,
+    show_default=True,
+    help="Number of draws from the belief.",
 )
 @click.option(
     "--flights",
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Number of simulated flights with replanning, thrust errors and delay, to targets drawn from the belief.",
+    help=(
+        "Number of simulated flights with replanning, thrust errors and delay, to targets drawn"
+        " from the belief."
+    ),
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws."
+)
 @click.option(
     "--every",
     "every_s",
     type=float,
     help="Interval of the plans compared with ground truth [s]; default: 2, with limits 10.",
 )
-@click.option("--extent", "extent_m", type=float, help="Extent of the target [m], if the result does not contain it.")
-@click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
-@click.option("--animate", type=click.Path(path_type=Path), help="Write a page with the flight in 3D as HTML.")
+@click.option(
+    "--extent",
+    "extent_m",
+    type=float,
+    help="Extent of the target [m], if the result does not contain it.",
+)
+@click.option(
+    "--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV."
+)
+@click.option(
+    "--animate", type=click.Path(path_type=Path), help="Write a page with the flight in 3D as HTML."
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def plan_command(
@@ -124,11 +146,11 @@ def plan_command(
 ) -> None:
     """Plan the capture from RESULT, a directory written by 'avsreplay run -o'.
 
-    The saved beliefs are used and nothing is replayed. The output contains the plan, its distribution over the belief
-    and, if the log has ground truth, the errors of plans made at regular intervals and a simulated approach.
-    \f
-    Raises:
-        UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput: RESULT cannot be read.
+    The saved beliefs are used and nothing is replayed. The output contains the plan, its
+    distribution over the belief and, if the log has ground truth, the errors of plans made at
+    regular intervals and a simulated approach. \f Raises:
+        UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput:
+            RESULT cannot be read.
     """  # noqa: D301
     from dataclasses import replace
 
@@ -140,7 +162,9 @@ def plan_command(
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 1e-6 <= value <= 1e6:
-            raise UsageError(f"{value:g} is not in the range 1e-6 to 1e6", where=name, hint="correct the option")
+            raise UsageError(
+                f"{value:g} is not in the range 1e-6 to 1e6", where=name, hint="correct the option"
+            )
     check_outputs("export", "animate", overwrite=overwrite)
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
@@ -152,7 +176,9 @@ def plan_command(
     made = _usable(lambda: planning.plan_at(index))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    flown = _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
+    flown = (
+        _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
+    )
     joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
@@ -179,8 +205,12 @@ def _usable(action: Any) -> Any:
         context, name = click.get_current_context(), getattr(error, "name", "")
         if context.params.get(name) is not None:  # the option that the user gave
             option = next(param.opts[0] for param in context.command.params if param.name == name)
-            raise UsageError(str(error).replace(name, option, 1), hint="correct the option") from None
-        raise UsageError(str(error), hint="correct the option, or the setting in run.json") from None
+            raise UsageError(
+                str(error).replace(name, option, 1), hint="correct the option"
+            ) from None
+        raise UsageError(
+            str(error), hint="correct the option, or the setting in run.json"
+        ) from None
 
 
 def _planning(saved: Saved, flags: dict[str, Any], arm: Arm | None) -> Replanning:
@@ -195,7 +225,7 @@ def _given(saved: Saved, flags: dict[str, Any]) -> tuple[PlanParams, Limits]:
     """Return the settings of the result with the options of the command, which take precedence."""
     from dataclasses import fields, replace
 
-    from avsreplay.plan import PlanParams
+    from avsreplay.plan.rendezvous import PlanParams
 
     given = {name: value for name, value in flags.items() if value is not None}
     of_plan = {f.name for f in fields(PlanParams)}
@@ -203,7 +233,9 @@ def _given(saved: Saved, flags: dict[str, Any]) -> tuple[PlanParams, Limits]:
     return params, replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan})
 
 
-def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: int) -> list[PossibleChange]:
+def _changes(
+    planning: Replanning, saved: Saved, flags: dict[str, Any], index: int
+) -> list[PossibleChange]:
     """Return single changes with which a plan is found: of settings, then of the instant."""
     from dataclasses import replace
 
@@ -222,7 +254,9 @@ def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: i
             value, number = _scaled(before, factor)
             given: dict[str, Any] = {name: number} if table == "robot" else {}
             robot = replace(planning.robot, **given)
-            changed = replace(with_settings(saved, () if table == "robot" else (f"{key}={value}",)), robot=robot)
+            changed = replace(
+                with_settings(saved, () if table == "robot" else (f"{key}={value}",)), robot=robot
+            )
             others = {k: v for k, v in flags.items() if k != name}
             try:
                 made = _planning(changed, others, planning.arm).plan_at(index)
@@ -234,15 +268,24 @@ def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: i
                 break
     for later_s in LATER_S:
         at_s = saved.rows[index].t_s + later_s
-        for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][:1]:
+        for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][
+            :1
+        ]:
             made = planning.plan_at(later)
             if made.found:
-                return [*out, PossibleChange("--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made)]
+                return [
+                    *out,
+                    PossibleChange(
+                        "--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made
+                    ),
+                ]
     return out
 
 
 def _scaled(value: Any, factor: float) -> tuple[str, Any]:
-    """Return a number, or each number of a tuple, times a factor with two digits, as a text and as a value."""
+    """Return a number, or each number of a tuple, times a factor with two digits, as a text and as
+    a value.
+    """
     if isinstance(value, tuple):
         texts = [f"{factor * x:.2g}" for x in value]
         return f"[{','.join(texts)}]", tuple(float(text) for text in texts)
@@ -256,11 +299,16 @@ def _export(planning: Replanning, made: Plan, path: Path) -> None:
     from avsreplay.files import output_text
 
     if not made.found:
-        raise UsageError("there is no plan to export", where=str(path), hint=f"its status is {made.status.value}")
+        raise UsageError(
+            "there is no plan to export", where=str(path), hint=f"its status is {made.status.value}"
+        )
     flown = planning.path(made)
     times = np.append(np.arange(0.0, made.t_go_s, 0.1), made.t_go_s)
     values = np.column_stack([times, *flown.at(times), flown.thrust(times)])
-    names = ["t_s", *(f"{q}{c}_{u}" for q, u in (("r", "m"), ("v", "mps"), ("u", "mps2")) for c in "xyz")]
+    names = [
+        "t_s",
+        *(f"{q}{c}_{u}" for q, u in (("r", "m"), ("v", "mps"), ("u", "mps2")) for c in "xyz"),
+    ]
     with output_text(path) as stream:
         lines = [",".join(names), *(",".join(repr(float(v)) for v in row) for row in values)]
         stream.write("\n".join(lines) + "\n")
@@ -275,10 +323,14 @@ def _animate(answer: Answer, index: int, path: Path) -> str:
 
     planning, made = answer.planning, answer.made
     if not made.found:
-        raise UsageError("there is no plan to show", where=str(path), hint=f"its status is {made.status.value}")
+        raise UsageError(
+            "there is no plan to show", where=str(path), hint=f"its status is {made.status.value}"
+        )
     facts = plan_facts(planning, answer.at_s, made)
     title = f"{planning.saved.name}: flight planned at {answer.at_s:.2f} s"
-    page = build_flight_page(title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts)
+    page = build_flight_page(
+        title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts
+    )
     with output_text(path) as stream:
         stream.write(page)
     return f"{path} ({len(page) / 1e6:.2f} MB)"

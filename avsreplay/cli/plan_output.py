@@ -8,8 +8,9 @@ from avsreplay.errors import value_class
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
-    from avsreplay.plan import Execution, Flights, Miss, Spread
+    from avsreplay.plan.flights import Execution, Flights, Miss
     from avsreplay.plan.joint_path import JointPath
+    from avsreplay.plan.uncertainty import Spread
     from avsreplay.replan import Replanning
     from avsreplay.report.table import Table
 
@@ -88,13 +89,15 @@ def document(answer: Answer) -> str:
             {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
             for at_s, p, m in answer.hindsight
         ],
-        "execution": None
-        if execution is None
-        else {
-            "outcome": outcome,
-            "miss": settings.dump(execution.miss) if execution.miss else None,
-            "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
-        },
+        "execution": (
+            None
+            if execution is None
+            else {
+                "outcome": outcome,
+                "miss": settings.dump(execution.miss) if execution.miss else None,
+                "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
+            }
+        ),
     }
     return json.dumps(_without_nan(document), indent=1, allow_nan=False) + "\n"
 
@@ -136,9 +139,17 @@ def print_answer(answer: Answer) -> None:
     for found in (answer.joints, answer.spread, answer.flown):
         facts += found.described() if found else []
     if not answer.made.found:
-        if (start := answer.planning.start_margin(answer.planning.saved.index_at(answer.at_s))) < 0.0:
+        if (
+            start := answer.planning.start_margin(answer.planning.saved.index_at(answer.at_s))
+        ) < 0.0:
             facts.append(
-                ("start", f"violates a limit by {-start:.2f}: inside the target or its clearance, or too fast")
+                (
+                    "start",
+                    (
+                        f"violates a limit by {-start:.2f}: inside the target or its clearance, or"
+                        " too fast"
+                    ),
+                )
             )
         facts.append(("what prevents it", prevented(answer.changes)))
         facts.append(("spread over belief", "not computed, because there is no plan"))
@@ -153,7 +164,10 @@ def print_answer(answer: Answer) -> None:
 def prevented(changes: list[PossibleChange]) -> str:
     """Return in one sentence which settings prevent a plan and with which changes one is found."""
     if not changes:
-        return "not found: no change of a single limit, of the robot or of --at that was tried gives a plan"
+        return (
+            "not found: no change of a single limit, of the robot or of --at that was tried gives a"
+            " plan"
+        )
     names = [c.setting for c in changes if c.setting != "--at"] or ["the estimate at this instant"]
     together = f"{' and '.join(names)} together" if len(names) > 1 else names[0]
     found = " or ".join(f"{c.option} (at {c.capture_s:.2f} s)" for c in changes)
@@ -166,7 +180,10 @@ def plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str,
     if made.found:
         facts += [
             ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),
-            ("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s"),
+            (
+                "terminal errors",
+                f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s",
+            ),
             ("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2"),
         ]
     if abs(made.attitude_s) < float("inf"):
@@ -176,9 +193,16 @@ def plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str,
     basis = "certified without the limits" if planning.limits.any else "certified"
     facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
     if made.binding:
-        facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
+        facts.append(
+            (
+                "smallest margin",
+                f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m",
+            )
+        )
     if abs(made.abort_margin_m) < float("inf"):
-        facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
+        facts.append(
+            ("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant")
+        )
     return facts
 
 
@@ -190,7 +214,9 @@ _DELAYED = {
 
 _TURN = {
     "none_found": "none found: no turn of the gripper to the fixture; a capture may exist",
-    "infeasible_within_horizon": "proven impossible: the gripper cannot reach the fixture's angular rate in time",
+    "infeasible_within_horizon": (
+        "proven impossible: the gripper cannot reach the fixture's angular rate in time"
+    ),
 }
 
 
@@ -202,7 +228,9 @@ def _status(made: Plan) -> str:
     words = {
         "optimal": f"optimal{gap}",
         "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
-        "none_found": f"none found{' for this arm' if made.delayed_by == 'arm' else ''}; a capture may exist",
+        "none_found": (
+            f"none found{' for this arm' if made.delayed_by == 'arm' else ''}; a capture may exist"
+        ),
         "infeasible_within_horizon": "proven impossible within the horizon",
     }
     return words.get(made.status.value, made.status.value)
@@ -227,7 +255,15 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     left_out = len(hindsight) - len(rows)
     return Table(
         "Plans against ground truth at their planned end",
-        ("made at\n[s]", "status", "capture\n[s]", "time to\ngo [s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
+        (
+            "made at\n[s]",
+            "status",
+            "capture\n[s]",
+            "time to\ngo [s]",
+            "miss\n[mm]",
+            "speed\n[mm/s]",
+            "angle\n[deg]",
+        ),
         rows,
         align="rlr",
         note=f"{left_out} further plans end after the log or were not found" if left_out else "",
@@ -238,14 +274,25 @@ def _execution_table(execution: Execution) -> Table:
     from avsreplay.report.table import Table
 
     rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
-    return Table("Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
+    return Table(
+        "Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl"
+    )
 
 
 def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
     outcome = execution.outcome(planning.tolerance)
-    lines = [f"outcome: {outcome}" if execution.miss is not None else f"action at the end of the log: {outcome}"]
+    lines = [
+        (
+            f"outcome: {outcome}"
+            if execution.miss is not None
+            else f"action at the end of the log: {outcome}"
+        )
+    ]
     if execution.miss is not None:
         m = execution.miss
-        error = f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
+        error = (
+            f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s,"
+            f" {m.angle_deg:.3f} deg"
+        )
         lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
     return lines

@@ -1,4 +1,7 @@
-"""``avsreplay record`` writes a log; ``export`` and ``report`` write a saved result in other formats and as a page."""
+"""``avsreplay record`` writes a log.
+
+``export`` and ``report`` write a saved result in other formats and as a page.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
     from avsreplay.record import Recorded
     from avsreplay.records import Scan
-    from avsreplay.simulate import RecordedFault
+    from avsreplay.simulate.recorded_faults import RecordedFault
 
 EPILOG = """\b
 Examples:
@@ -51,8 +54,10 @@ class _Fault(click.ParamType["RecordedFault"]):
 
     name = "kind:start:duration[:strength]"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> RecordedFault:
-        from avsreplay.simulate import RecordedFault
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> RecordedFault:
+        from avsreplay.simulate.recorded_faults import RecordedFault
 
         try:
             return RecordedFault.parse(str(value))
@@ -62,13 +67,23 @@ class _Fault(click.ParamType["RecordedFault"]):
 
 @click.command("record", cls=SectionedCommand, epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output.")
-@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of a simulation or of the faults.")
 @click.option(
-    "--fault", "faults", type=_Fault(), multiple=True, help="Inject a fault [s after the first scan]; repeatable."
+    "-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output."
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of a simulation or of the faults."
+)
+@click.option(
+    "--fault",
+    "faults",
+    type=_Fault(),
+    multiple=True,
+    help="Inject a fault [s after the first scan]; repeatable.",
 )
 @source_options
-@click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
+@click.option(
+    "--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def record_command(
@@ -85,10 +100,10 @@ def record_command(
 ) -> None:
     """Write a log: simulate a scenario, or convert recorded scans.
 
-    SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
-    built-in scenario is simulated; --duration shortens it. The log holds the model, the scenario and the truth,
-    so that 'avsreplay run' needs no option. Faults may be injected into any of these; each is labelled in the log, and
-    the same seed gives the same bytes.
+    SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP;
+    without it the built-in scenario is simulated; --duration shortens it. The log holds the model,
+    the scenario and the truth, so that 'avsreplay run' needs no option. Faults may be injected into
+    any of these; each is labelled in the log, and the same seed gives the same bytes.
 
     \f
     Raises:
@@ -109,7 +124,9 @@ def record_command(
     check_binary_output(output)
     check_outputs("output", overwrite=overwrite)
     check_suffix(output, ".mcap")
-    done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
+    done = record(
+        source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress
+    )
     text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
     click.echo(text, err=str(output) == "-")
     if done.lost:
@@ -123,7 +140,10 @@ def _reading(flags: dict[str, Any]) -> SourceOptions | None:
 
 def _sentence(done: Recorded) -> str:
     lines = [
-        f"{done.path}: {done.scans} scans, {done.span_s:.1f} s, {done.points} points, {done.bytes} bytes",
+        (
+            f"{done.path}: {done.scans} scans, {done.span_s:.1f} s, {done.points} points,"
+            f" {done.bytes} bytes"
+        ),
         f"model: {done.model or 'none'}" + (f", seed {done.seed}" if done.seed is not None else ""),
     ]
     lines += [
@@ -156,21 +176,29 @@ FORMATS = {  # endings that a file may have; all but .txt select the format
 def _format_of(output: Path, kind: str | None) -> str:
     """The format of an export: as requested, or that of the name of the file.
 
-    Raises UsageError if the name states no format and none is requested, or another one than the requested one.
+    Raises UsageError if the name states no format and none is requested, or another one than the
+    requested one.
     """
     if kind is None:
         ending = output.suffix.lower().replace(".txt", "")
         kind = next((name for name, endings in FORMATS.items() if ending in endings), None)
     if kind is None:
         known = ", ".join(FORMATS)
-        raise UsageError("the name states no format", where=str(output), hint=f"add --to, one of {known}")
+        raise UsageError(
+            "the name states no format", where=str(output), hint=f"add --to, one of {known}"
+        )
     check_suffix(output, *FORMATS[kind])
     return kind
 
 
 @click.command("export", epilog=EXPORT_EPILOG)
 @click.argument("result", type=PATH)
-@click.option("--to", "kind", type=click.Choice(list(FORMATS)), help="Format of the file; that of its name by default.")
+@click.option(
+    "--to",
+    "kind",
+    type=click.Choice(list(FORMATS)),
+    help="Format of the file; that of its name by default.",
+)
 @click.option(
     "--poses",
     type=click.Choice(["estimate", "registration", "truth"]),
@@ -180,15 +208,19 @@ def _format_of(output: Path, kind: str | None) -> str:
 )
 @click.option("-o", "--output", type=PATH, required=True, help="The file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def export_command(result: Path, kind: str | None, poses: str, output: Path, overwrite: bool) -> None:
-    """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full precision.
+def export_command(
+    result: Path, kind: str | None, poses: str, output: Path, overwrite: bool
+) -> None:
+    """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full
+    precision.
 
-    CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
+    CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold
+    poses of {C} in {A}.
 
     \f
     Raises:
-        UsageError: the output cannot be written, its name states no or another format, or the result has no poses of
-            the requested kind.
+        UsageError: the output cannot be written, its name states no or another format, or the
+            result has no poses of the requested kind.
         UnreadableInput: RESULT cannot be read.
         MissingBackend: pyarrow is needed and not installed.
     """  # noqa: D301
@@ -206,7 +238,9 @@ def export_command(result: Path, kind: str | None, poses: str, output: Path, ove
     ]
     count = sum(pose is not None for pose in by_row)
     if not count:
-        raise UsageError(f"the result has no {poses} poses", where=str(result), hint="choose others with --poses")
+        raise UsageError(
+            f"the result has no {poses} poses", where=str(result), hint="choose others with --poses"
+        )
     if kind == "tum":
         stamped = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
         click.echo(f"{output}: {export.write_tum(output, stamped)} poses", err=quiet)
@@ -229,14 +263,19 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 @click.command("report", epilog=REPORT_EPILOG)
 @click.argument("result", type=PATH)
-@click.option("-o", "--output", type=PATH, help="Write the page to this file; report.html in RESULT by default.")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    help="Write the page to this file; report.html in RESULT by default.",
+)
 @click.option("--title", help="Title of the page; the name of RESULT by default.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 def report_command(result: Path, output: Path | None, title: str | None, overwrite: bool) -> None:
     """Build one self-contained HTML page of RESULT, a directory written by 'avsreplay run -o'.
 
-    The page needs no network and opens from disk: linked charts over time, a 3D view with a time slider, tables, and
-    the effective configuration.
+    The page needs no network and opens from disk: linked charts over time, a 3D view with a time
+    slider, tables, and the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
     check_output(page, overwrite=overwrite, inputs=[result])
@@ -262,7 +301,11 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
 
     found = read_result(result)
     if not found.rows:
-        raise UnreadableInput("holds no row", where=str(result), hint="name the result of a run with at least one scan")
+        raise UnreadableInput(
+            "holds no row",
+            where=str(result),
+            hint="name the result of a run with at least one scan",
+        )
     page = build_page(
         found.rows,
         found.summary,

@@ -1,4 +1,7 @@
-"""``avsreplay run``: replays a log, prints tables, writes a result directory, compares with a golden file."""
+"""``avsreplay run``.
+
+Replays a log, prints tables, writes a result directory, compares with a golden file.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +33,8 @@ if TYPE_CHECKING:
 
     from avsreplay.log import GrowingLog
     from avsreplay.model_size import Advice
-    from avsreplay.report import Summary
     from avsreplay.report.golden import GoldenResult
+    from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
     from avsreplay.result_dir import ResultDirectory, ResultWriter
     from avsreplay.rows import Row
@@ -56,33 +59,63 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--start", "starts", type=StartMode(), multiple=True, help="Initialisation (cold, near, paper) or start time [s]."
+    "--start",
+    "starts",
+    type=StartMode(),
+    multiple=True,
+    help="Initialisation (cold, near, paper) or start time [s].",
 )
-@click.option("--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md).")
+@click.option(
+    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
+)
 @source_options
 @pose_options
-@click.option("--golden", type=PATH, help="Compare the rows with this golden file; exit code 1 if they differ.")
+@click.option(
+    "--golden",
+    type=PATH,
+    help="Compare the rows with this golden file; exit code 1 if they differ.",
+)
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
-@click.option("-o", "--output", type=PATH, help="Write rows, trajectories, beliefs and settings to this directory.")
-@click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    help="Write rows, trajectories, beliefs and settings to this directory.",
+)
+@click.option(
+    "--report",
+    "page",
+    is_flag=True,
+    help="Add the HTML page, report.html, to the result directory.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
-@click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
-@click.option("--follow", is_flag=True, help="LOG is still being written: replay each scan as soon as it is complete.")
+@click.option(
+    "--resume", is_flag=True, help="Continue the interrupted run in the result directory."
+)
+@click.option(
+    "--follow",
+    is_flag=True,
+    help="LOG is still being written: replay each scan as soon as it is complete.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--require", "least", type=GRADES, help="Exit with code 1 if the verdict is worse.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
-@click.option("--rerun", "to_rerun", metavar="FILE.rrd|view|connect", help="Show the run in Rerun (extra 'rerun').")
+@click.option(
+    "--rerun",
+    "to_rerun",
+    metavar="FILE.rrd|view|connect",
+    help="Show the run in Rerun (extra 'rerun').",
+)
 def run_command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option; for any
-    other log 'avsreplay info LOG --model FILE' names the options that it needs. If LOG is -, an MCAP file is read from
-    standard input, and each scan is replayed as soon as it is complete; --follow does the same with a file that is
-    still being written. The results are those of a replay of the complete log.
-    \f
-    Raises:
+    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs
+    no option; for any other log 'avsreplay info LOG --model FILE' names the options that it needs.
+    If LOG is -, an MCAP file is read from standard input, and each scan is replayed as soon as it
+    is complete; --follow does the same with a file that is still being written. The results are
+    those of a replay of the complete log. \f Raises:
         UsageError: options contradict each other.
     """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
@@ -91,16 +124,24 @@ def run_command(log: Path, **flags: Any) -> None:
     wanted.check()
     again = wanted.overwrite or wanted.resume
     inputs = given_paths("output", "update_golden")
-    target = ResultDirectory(wanted.output, overwrite=again, inputs=inputs) if wanted.output else None
+    target = (
+        ResultDirectory(wanted.output, overwrite=again, inputs=inputs) if wanted.output else None
+    )
     with log_file(log, follow=wanted.follow) as (path, growing):
         job = _job(path, flags)
         streamed = growing is not None and job.options.model != Path("auto") and not wanted.resume
         if wanted.follow and not streamed:
-            raise UsageError("--follow excludes --resume and --model auto", hint="leave out --follow")
+            raise UsageError(
+                "--follow excludes --resume and --model auto", hint="leave out --follow"
+            )
         try:
             _whole(replace(job, growing=growing if streamed else None), target, wanted)
         except Outdated:
-            click.echo("avsreplay: later records change times or true poses: the log is replayed once more", err=True)
+            click.echo(
+                "avsreplay: later records change times or true poses: the log is replayed once"
+                " more",
+                err=True,
+            )
             _whole(job, target, wanted)
 
 
@@ -140,15 +181,21 @@ class Wanted:
     least: str | None
 
     def check(self) -> None:
-        """Raise UsageError if two options contradict each other, UnreadableInput for an unusable golden file."""
+        """Raise UsageError if two options contradict each other, UnreadableInput for an unusable
+        golden file.
+        """
         from avsreplay.report.golden import read_golden
 
         if self.golden and self.update_golden:
-            raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
+            raise UsageError(
+                "--golden and --update-golden exclude each other", hint="give one of them"
+            )
         if self.page and self.output is None:
             raise UsageError("--report needs a result directory", hint="add -o DIR")
         if self.resume and self.output is None:
-            raise UsageError("--resume needs the result directory of the interrupted run", hint="add -o DIR")
+            raise UsageError(
+                "--resume needs the result directory of the interrupted run", hint="add -o DIR"
+            )
         check_outputs("update_golden")
         if self.golden:
             read_golden(self.golden)
@@ -167,11 +214,16 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
         assignments = PAPER + assignments
     assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
     flags["start_s"] = next((start for start in reversed(starts) if isinstance(start, float)), None)
-    return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)
+    return Job(
+        source=log, options=read_options(flags), config_file=config_file, assignments=assignments
+    )
 
 
 def _checked(run: Run) -> list[Advice]:
-    """Check the log before the replay: findings are printed on stderr, and are reasons of the verdict."""
+    """Check the log before the replay.
+
+    Findings are printed on stderr, and are reasons of the verdict.
+    """
     from avsreplay.preflight import preflight
 
     checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
@@ -196,8 +248,13 @@ class _Finished:
     scans_per_s: float
 
 
-def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wanted: Wanted) -> _Finished:
-    """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
+def _replayed(
+    run: Run, advice: list[Advice], target: ResultDirectory | None, wanted: Wanted
+) -> _Finished:
+    """Replay the log; ``target`` receives all results.
+
+    An interrupt ends the replay and keeps what there is.
+    """
     from avsreplay.cli.options import tracked
     from avsreplay.report.verdict import verdict_of
     from avsreplay.result_dir import ResultWriter
@@ -215,7 +272,9 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
             run.fit_reference(tracked)
         growing = run.job.growing
         live = growing is not None and not wanted.as_json
-        interrupted = _collect(run.rows(listeners, None if live else tracked), rows, growing, live=live)
+        interrupted = _collect(
+            run.rows(listeners, None if live else tracked), rows, growing, live=live
+        )
         if growing and not interrupted and growing.outdated():
             raise Outdated
         changed = run.rescore(rows) if growing else []
@@ -228,8 +287,12 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         summary = run.summary()
         record = _record(run, summary)
         record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
-        grade = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
-        record["preflight"] += [{"grade": grade, "text": note} for note in _model_notes(run, advice)]
+        grade = (
+            "check" if summary.healthy else "fail"
+        )  # a wrong model explains why no scan was used
+        record["preflight"] += [
+            {"grade": grade, "text": note} for note in _model_notes(run, advice)
+        ]
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target and not growing else ""
@@ -237,12 +300,14 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
             click.echo(f"avsreplay: {text}", err=True)
         if keeper:
             keeper.finish(rows, record, resumable=interrupted and not growing)
-    return _Finished(rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds)
+    return _Finished(
+        rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
+    )
 
 
 def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
     """The rows of the interrupted run, whose state the open run continues from."""
-    from avsreplay.cli import versions
+    from avsreplay.cli.main import versions
 
     rows = keeper.resume({**run.facts(), "versions": versions()})
     click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
@@ -250,8 +315,14 @@ def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows unless size or background explain them; also said on stderr."""
-    if any(a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail") for a in advice):
+    """Return the findings on the model from the rows unless size or background explain them.
+
+    Also said on stderr.
+    """
+    if any(
+        a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail")
+        for a in advice
+    ):
         return ()
     notes, remark = run.model_check.notes(), run.model_check.remark()
     for note in (*notes, remark) if remark else notes:
@@ -259,16 +330,21 @@ def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
     return notes
 
 
-def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False) -> bool:
+def _collect(
+    found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False
+) -> bool:
     """Take all rows; True if the user interrupted the replay after at least one row.
 
-    An interrupt takes effect between two scans, so that all results hold the same scans; a second one at once. With
-    ``live`` a line is printed for each row.
+    An interrupt takes effect between two scans, so that all results hold the same scans; a second
+    one at once. With ``live`` a line is printed for each row.
     """
     from avsreplay.cli.options import interruptible, say_live
 
     try:
-        with closing(found), interruptible(rows, growing.stop if growing else lambda: None) as stopped:
+        with (
+            closing(found),
+            interruptible(rows, growing.stop if growing else lambda: None) as stopped,
+        ):
             for row in found:
                 if live:
                     say_live(row)
@@ -283,7 +359,7 @@ def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None 
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
-    from avsreplay.cli import versions
+    from avsreplay.cli.main import versions
     from avsreplay.report.compare import changed_settings
     from avsreplay.report.result import facts_record
     from avsreplay.settings import dump
@@ -293,7 +369,13 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
     changed = changed_settings(run.job.options, run.config)
     limits = dump(run.config.faults.resolved(run.surface.extent))
-    return {**run.facts(), "limits": limits, "changed_settings": changed, "facts": facts, "versions": versions()}
+    return {
+        **run.facts(),
+        "limits": limits,
+        "changed_settings": changed,
+        "facts": facts,
+        "versions": versions(),
+    }
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:
@@ -343,5 +425,8 @@ def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: 
     from avsreplay.report.table import make_console, print_line, print_table
 
     console = make_console(sys.stderr if to_stderr else sys.stdout)
-    print_line(console, "settings that differ from their defaults: " + ("; ".join(verdict.changed) or "none"))
+    print_line(
+        console,
+        "settings that differ from their defaults: " + ("; ".join(verdict.changed) or "none"),
+    )
     print_table(console, golden_table(result))

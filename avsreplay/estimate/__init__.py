@@ -1,4 +1,7 @@
-"""State estimation: the noise-adaptive constrained Kalman filter and the maximum-likelihood batch fit."""
+"""State estimation.
+
+The noise-adaptive constrained Kalman filter and the maximum-likelihood batch fit.
+"""
 
 try:
     import avsreplay.estimate._motion  # noqa: F401

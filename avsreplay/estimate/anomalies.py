@@ -1,10 +1,12 @@
-"""Treatment of large innovations: the scan is deferred, and a decision is made from the scans that follow.
+"""Treatment of large innovations: the scan is deferred, and a decision is made from the scans that
+follow.
 
-A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the accepted scans, or whose pose jumps, is
-doubtful. It does not change the estimate. After three to five doubtful scans ``hypotheses`` decides. Free motion: the
-scans are used after all. Manoeuvre: rate and velocity are fitted anew from its instant on, with inertia, axes and
-centre of mass kept. Sensor bias: the estimate coasts while the offset lasts. Before the estimate has converged, the
-poses before a jump may be the biased ones: it is then initialised again from the later poses, if these agree.
+A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the accepted scans, or
+whose pose jumps, is doubtful. It does not change the estimate. After three to five doubtful scans
+``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and velocity are
+fitted anew from its instant on, with inertia, axes and centre of mass kept. Sensor bias: the
+estimate coasts while the offset lasts. Before the estimate has converged, the poses before a jump
+may be the biased ones: it is then initialised again from the later poses, if these agree.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VARRHO, VEL, W, definite_product, rotation
 from avsreplay.estimate.hypotheses import OVER_FREE, Ranked, certain, explain, linear
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
-from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.measurement import (
+    GATE,
+    gate_of,
+    innovation_vector,
+    measured_pose,
+    measurement_jacobian,
+)
 from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.noise import cholesky_root, lasting, risen
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
@@ -44,14 +52,28 @@ from avsreplay.estimate.scan_window import (
     window_of,
 )
 from avsreplay.estimate.sensor_bias import begun, compared, continued, squared
-from avsreplay.estimate.track import Epoch, SensorBias, Track, confirmed, nis_scale, ready, with_history, with_nis
+from avsreplay.estimate.track import (
+    Epoch,
+    SensorBias,
+    Track,
+    confirmed,
+    nis_scale,
+    ready,
+    with_history,
+    with_nis,
+)
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 
 _FEWEST, _MOST = 3, 5  # least and most doubtful scans at a decision
-_RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
-_LEAST_RISE = 2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
+_RMS_STEP, _LEAST_SPREAD = (
+    4.0,
+    0.02,
+)  # step of the log rms residual, over its spread, that shows which poses are biased
+_LEAST_RISE = (
+    2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
+)
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 _STEPS = (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS)
@@ -68,10 +90,13 @@ class AnomalyTest:
         params: settings, auto values filled in.
         extent_m: the target's bounding diagonal [m].
         batch: converts healthy scans to the poses of a fit.
-        replay: predicts, forms the innovation of a stored scan and updates with it; returns the scan as it was used.
+        replay: predicts, forms the innovation of a stored scan and updates with it; returns the
+            scan as it was used.
     """
 
-    def __init__(self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Replay) -> None:
+    def __init__(
+        self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Replay
+    ) -> None:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
         self._extent_m = extent_m
@@ -80,11 +105,18 @@ class AnomalyTest:
     def step(
         self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]
     ) -> tuple[Track, Verdict]:
-        """The track after a measured scan, and the verdict on it. ``update`` applies the scan to a track."""
+        """The track after a measured scan, and the verdict on it.
+
+        ``update`` applies the scan to a track.
+        """
         if not self.enabled or verdict.reason not in _TESTED:
-            return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
+            return (
+                self._accepted(track, epoch, update) if verdict.gamma else update(track)
+            ), verdict
         if track.bias is not None:
-            bias = continued(track.bias, epoch, lambda *scans: self._windowed(track, *scans), self._priors)
+            bias = continued(
+                track.bias, epoch, lambda *scans: self._windowed(track, *scans), self._priors
+            )
             if bias is not None:
                 return self._still_biased(track.changed(belief=epoch.prediction.belief), bias)
             track = track.changed(bias=None)
@@ -92,7 +124,11 @@ class AnomalyTest:
         large = verdict.reason is Reason.POSE_JUMP
         if not (ready(track) and track.recent):
             large = large or (ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track))
-            return self._undecidable(doubtful) if large else (self._accepted(track, epoch, update), verdict)
+            return (
+                self._undecidable(doubtful)
+                if large
+                else (self._accepted(track, epoch, update), verdict)
+            )
         large = large or epoch.innovation.chi2 > GATE * nis_scale(track)
         if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
@@ -103,23 +139,30 @@ class AnomalyTest:
         free = next(e for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free.chi2, free.dof, window))
         noisier = best is Hypothesis.NOISIER and certain(ranked)
-        if not (large or changed or (track.doubtful and (noisier or best is Hypothesis.SENSOR_BIAS))):
+        if not (
+            large or changed or (track.doubtful and (noisier or best is Hypothesis.SENSOR_BIAS))
+        ):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
 
     def with_possible_change(self, track: Track) -> Track:
         """The track with the possible change of the velocities within its accepted scans."""
         recent = track.recent if self.enabled and ready(track) else ()
-        probability, P = possible_change(recent, nis_scale(track), self._priors, self.params.change_probability)
+        probability, P = possible_change(
+            recent, nis_scale(track), self._priors, self.params.change_probability
+        )
         return track.changed(change_probability=probability, change_P=P)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad.
 
-        The hypotheses are linear about the prediction from the first recent scan. This one must be from an estimate
-        that is based on enough poses: before, its errors are too large for the linearisation.
+        The hypotheses are linear about the prediction from the first recent scan. This one must be
+        from an estimate that is based on enough poses: before, its errors are too large for the
+        linearisation.
         """
-        after = update(track.changed(doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
+        after = update(
+            track.changed(doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False)
+        )
         after = with_nis(after, track, epoch.innovation.chi2)
         after = after.changed(window=lasting(after.window, epoch.innovation))
         return after.changed(recent=latest((*track.recent, epoch))) if ready(track) else after
@@ -127,8 +170,12 @@ class AnomalyTest:
     def _explained(self, track: Track, window: tuple[Epoch, ...], first: int) -> Ranked:
         allowed = *self.batch.noise_levels(track), self.batch.orbit, track.levels.excluded
         used, ranked = explain(window, first, self._priors, *allowed)
-        least = math.sqrt(_LEAST_RISE * nis_scale(track))  # noise that the accepted poses have as well is no rise
-        return used, [e for e in ranked if e.hypothesis is not Hypothesis.NOISIER or e.size.max() > least]
+        least = math.sqrt(
+            _LEAST_RISE * nis_scale(track)
+        )  # noise that the accepted poses have as well is no rise
+        return used, [
+            e for e in ranked if e.hypothesis is not Hypothesis.NOISIER or e.size.max() > least
+        ]
 
     def _windowed(self, track: Track, scans: tuple[Epoch, ...], accepted: int) -> Window:
         start, orbit = scans[0].track.belief, self.batch.orbit
@@ -136,7 +183,9 @@ class AnomalyTest:
         return window_of(scans, accepted, start, *self.batch.noise_levels(track), arc)
 
     def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Verdict]:
-        """The track after one more scan of a sensor error, unless a manoeuvre explains its scans better."""
+        """The track after one more scan of a sensor error, unless a manoeuvre explains its scans
+        better.
+        """
         bias, found = compared(bias, lambda window, first: self._explained(track, window, first))
         window, best = found or ((), None)
         if best is not None and scans_after(window, best) >= FEWEST_TO_FIT:
@@ -145,12 +194,17 @@ class AnomalyTest:
         return track.changed(bias=bias), Verdict(0, Reason.SENSOR_BIAS)
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
-        """Too few scans were accepted for the hypotheses to be compared: the doubtful ones may agree by themselves."""
+        """Too few scans were accepted for the hypotheses to be compared.
+
+        The doubtful ones may agree by themselves.
+        """
         if len(track.doubtful) < _FEWEST:
             return track, Verdict(0, Reason.DOUBTFUL)
         return self._by_agreement(track)
 
-    def _decided(self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]) -> tuple[Track, Verdict]:
+    def _decided(
+        self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]
+    ) -> tuple[Track, Verdict]:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
         best, explained = ranked[0], ranked[0].explains
@@ -173,25 +227,33 @@ class AnomalyTest:
         return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
 
     def _allowing(self, track: Track, found: Explanation) -> Track:
-        """The track before the doubtful scans with the disturbances or the noise that explain them."""
+        """The track before the doubtful scans with the disturbances or the noise that explain
+        them.
+        """
         before = with_history(track.doubtful[0].track, track).changed(recent=track.recent)
         if found.hypothesis is Hypothesis.NOISIER:
             return before.changed(window=risen(before.window, found.size))
         return self._disturbed(before, found) if found.hypothesis in _DISTURBANCES else before
 
     def _disturbed(self, track: Track, found: Explanation) -> Track:
-        """The track with levels of the disturbances that explain the scans, until they are estimated from all poses."""
+        """The track with levels of the disturbances that explain the scans, until they are
+        estimated from all poses.
+        """
         rate, velocity = float(found.size[0]), float(found.size[3])
         torque, force = self.batch.noise_levels(track)
-        levels = replace(track.levels, torque=max(torque, rate / SPHERE), force=max(force, velocity))
+        levels = replace(
+            track.levels, torque=max(torque, rate / SPHERE), force=max(force, velocity)
+        )
         return track.changed(levels=replace(levels, count=max(levels.count, 1)))
 
     def _bias_began(self, track: Track) -> bool:
-        """Return whether a step in the pose is the beginning of a sensor error; it may as well be the end of one.
+        """Return whether a step in the pose is the beginning of a sensor error; it may as well be
+        the end of one.
 
-        A range error deforms the scan, so the rms residual steps with it where the scan is registered. Otherwise the
-        poses that have been consistent for longer than sensor errors usually last are taken as correct. A pose that the
-        estimate before a new start predicted ends the error that caused the new start.
+        A range error deforms the scan, so the rms residual steps with it where the scan is
+        registered. Otherwise the poses that have been consistent for longer than sensor errors
+        usually last are taken as correct. A pose that the estimate before a new start predicted
+        ends the error that caused the new start.
         """
         if self._previous_agrees(track):
             return False
@@ -215,10 +277,15 @@ class AnomalyTest:
             return with_history(track, track).changed(bias=bias)
         then = window[best.onset].track
         belief, _ = self.batch.propagated(track, then.belief, last.prediction.belief.t_ns)
-        return with_history(then, track).changed(belief=belief, recent=window[: best.onset], bias=bias)
+        return with_history(then, track).changed(
+            belief=belief, recent=window[: best.onset], bias=bias
+        )
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
-        """The track initialised anew from the doubtful poses if they agree with one another; else they are bad."""
+        """The track initialised anew from the doubtful poses if they agree with one another.
+
+        Else they are bad.
+        """
         old = track.previous
         if old is not None and self._previous_agrees(track):
             anew: Track | None = self._used(with_history(old, track), track.doubtful)
@@ -230,7 +297,9 @@ class AnomalyTest:
                 anew = self._started(track, track.doubtful[-_FEWEST:], levels)
         if anew is not None:
             return anew.changed(reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
-        return with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
+        return with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :]), Verdict(
+            0, Reason.POSE_JUMP
+        )
 
     def _with_rejected(self, track: Track) -> Track:
         """The track with the doubtful poses in its list of rejected ones."""
@@ -240,7 +309,9 @@ class AnomalyTest:
         return track.changed(rejected=(*track.rejected, *fixes)[-MOST_DISTURBED:])
 
     def _disturbances(self, track: Track) -> NoiseLevels:
-        """Levels of disturbances that the last poses show, such as those of a part on a cable, used or not."""
+        """Levels of disturbances that the last poses show, such as those of a part on a cable, used
+        or not.
+        """
         for poses in ((*track.fixes, *track.rejected)[-MOST_DISTURBED:], track.rejected):
             found = disturbance_levels(poses, self._extent_m)
             if found is not None:
@@ -248,9 +319,14 @@ class AnomalyTest:
         return NO_LEVELS
 
     def _previous_agrees(self, track: Track) -> bool:
-        """Return whether the estimate before the last new start predicted the doubtful poses to within its errors."""
+        """Return whether the estimate before the last new start predicted the doubtful poses to
+        within its errors.
+        """
         old = track.previous
-        if old is None or (track.doubtful[-1].prediction.belief.t_ns - old.belief.t_ns) * 1e-9 > _KEPT_S:
+        if (
+            old is None
+            or (track.doubtful[-1].prediction.belief.t_ns - old.belief.t_ns) * 1e-9 > _KEPT_S
+        ):
             return False
         for epoch in track.doubtful:
             prior, seen = epoch.prediction.belief, epoch.innovation
@@ -272,11 +348,18 @@ class AnomalyTest:
         return out.changed(recent=latest((*track.recent, *used)))
 
     def _reported(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
-        """The track with the manoeuvre in its list; a later report of the same one replaces the first."""
+        """The track with the manoeuvre in its list.
+
+        A later report of the same one replaces the first.
+        """
         at_ns = window[0].track.belief.t_ns + round(best.after_s * 1e9)
-        now_ns = track.manoeuvres[-1].detected_ns if track.pending else window[-1].prediction.belief.t_ns
+        now_ns = (
+            track.manoeuvres[-1].detected_ns if track.pending else window[-1].prediction.belief.t_ns
+        )
         (then, _), P = self.batch.propagated(track, window[0].track.belief, at_ns), best.P.copy()
-        turn = rotation(then.x.q_ab) @ skew(best.size[:3])  # the linear effect of the rate has the mean of varrho
+        turn = rotation(then.x.q_ab) @ skew(
+            best.size[:3]
+        )  # the linear effect of the rate has the mean of varrho
         P[3:, 3:] += turn @ then.P[VARRHO, VARRHO] @ turn.T
         found = Manoeuvre(at_ns, best.after_1s_s, best.size[3:], best.size[:3], P, now_ns)
         return track.changed(manoeuvres=(*confirmed(track), found), pending=True)
@@ -293,13 +376,17 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
-        anew = track.changed(since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
+        anew = track.changed(
+            since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None
+        )
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
             return self._used(anew.changed(belief=at, mode="filter", fixes=(), older=()), after)
         chart = to_chart(at.x)
         prior = Prior(
             chart,
-            definite_product(np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64)),
+            definite_product(
+                np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64)
+            ),
         )
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
@@ -308,7 +395,9 @@ class AnomalyTest:
         anew = anew.changed(fixes=fixes, older=older, prior=prior, prior_ns=t_ns)
         return anew.changed(belief=result.belief, mode=mode, batch=result)
 
-    def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
+    def _fitted(
+        self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int
+    ) -> BatchResult:
         """Fit of the poses after a manoeuvre with the prior at its instant."""
         poses = poses_of(fixes, t_ns)
         inflation = np.ones(2) if track.inflation is None else track.inflation
@@ -321,17 +410,23 @@ class AnomalyTest:
         problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
         components = whole(final_mixture(found, problem, latest, noise, now_ns, after_s))
         plain = np.array([window[3], window[0]])
-        return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
+        return BatchResult(
+            t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components
+        )
 
     def _initialised_anew(self, track: Track, levels: NoiseLevels) -> Track | None:
-        """A new track from the doubtful poses alone, all or the last of them, that agree through free motion."""
+        """A new track from the doubtful poses alone, all or the last of them, that agree through
+        free motion.
+        """
         for first in range(len(track.doubtful) + 1 - _FEWEST):
             anew = self._from_poses(track, track.doubtful[first:], levels)
             if anew is not None:
                 return anew
         return None
 
-    def _from_poses(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels) -> Track | None:
+    def _from_poses(
+        self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels
+    ) -> Track | None:
         """A new track from some poses; None where they contradict one another."""
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
         poses, start = poses_of(fixes), to_chart(rough_state(fixes))
@@ -344,6 +439,10 @@ class AnomalyTest:
         prior = epochs[0].prediction.belief
         begin = Belief(prior.t_ns, prior.x, prior.P)
         out = self._used(Track(begin, "start", started_ns=prior.t_ns, levels=levels), epochs)
-        old = track.changed(recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
+        old = (
+            track.changed(recent=(), doubtful=(), previous=None, bias=None)
+            if ready(track)
+            else None
+        )
         out = with_history(out, track).changed(drift=track.drift, previous=old)
         return out.changed(sigma_hits=track.sigma_hits, r_floors=track.r_floors)

@@ -1,15 +1,18 @@
-"""Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the manifold.
+"""Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the
+manifold.
 
-Until the body has turned a few times, the minimum lies in a curved and narrow valley of the cost. A step therefore
-contains its second-order part (geodesic acceleration: Transtrum and Sethna, arXiv:1201.5885).
+Until the body has turned a few times, the minimum lies in a curved and narrow valley of the cost. A
+step therefore contains its second-order part (geodesic acceleration: Transtrum and Sethna,
+arXiv:1201.5885).
 
-The motion is taken as deterministic; the residuals d = [theta; v] are expressed in {C}, where their noise is given.
-Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior, given or
-weak, keeps directions finite that the poses do not determine yet. The likelihood is that of an M-estimator. A pose
-above the 99.99 % point of chi-square with 6 degrees of freedom gets Huber's weight in the first descent and Cauchy's in
-the last; other poses keep the weight 1, which is efficient for Gaussian noise. Two factors on the poses' noise,
-attitude and position, may be estimated from the residuals. The covariance is inflated by the integrated autocorrelation
-of the residuals, because those of registration are correlated.
+The motion is taken as deterministic; the residuals d = [theta; v] are expressed in {C}, where their
+noise is given. Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia
+physical without a bound. A prior, given or weak, keeps directions finite that the poses do not
+determine yet. The likelihood is that of an M-estimator. A pose above the 99.99 % point of
+chi-square with 6 degrees of freedom gets Huber's weight in the first descent and Cauchy's in the
+last; other poses keep the weight 1, which is efficient for Gaussian noise. Two factors on the
+poses' noise, attitude and position, may be estimated from the residuals. The covariance is inflated
+by the integrated autocorrelation of the residuals, because those of registration are correlated.
 """
 
 from __future__ import annotations
@@ -35,7 +38,9 @@ from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
-_MOST_WORK = 2 * BUDGET  # linearised poses of a descent, or pieces of their rotation, from which it is continued later
+_MOST_WORK = (
+    2 * BUDGET
+)  # linearised poses of a descent, or pieces of their rotation, from which it is continued later
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +49,27 @@ class FitParams(Settings):
 
     max_steps: int = setting(40, "Largest number of Levenberg-Marquardt steps.", low=1)
     gain_tol: float = setting(
-        1e-3, "The iteration ends when a step reduces half the chi-square by less than this.", low=0.0
+        1e-3,
+        "The iteration ends when a step reduces half the chi-square by less than this.",
+        low=0.0,
     )
     rescale: bool = setting(True, "Estimate the two noise factors from the residuals.")
     least_inflation: float = setting(
-        1.0, "Smallest factor by which the correlation of pose errors in time inflates their covariance.", above=0.0
+        1.0,
+        "Smallest factor by which the correlation of pose errors in time inflates their"
+        " covariance.",
+        above=0.0,
     )
     try_directions: int = setting(
-        5, "Number of directions, least observable first, in which the profile likelihood is tested.", low=0
+        5,
+        "Number of directions, least observable first, in which the profile likelihood is tested.",
+        low=0,
     )
     bend_max: float = setting(
-        2.0, "Ratio of the cost at 2 sigma to that of a Gaussian from which a direction is non-Gaussian.", above=0.0
+        2.0,
+        "Ratio of the cost at 2 sigma to that of a Gaussian from which a direction is"
+        " non-Gaussian.",
+        above=0.0,
     )
 
 
@@ -63,12 +78,16 @@ class Poses:
     """Healthy poses T_ac, oldest first.
 
     Attributes:
-        times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
+        times_s: (n,) since the fit's epoch [s].
+        q: (n, 4) q_ac.
+        t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
-        counts: (n,) number of poses that each of them stands for; None where they are measured poses.
-        shares: (n,) part of C that poses seen from nearly the same direction have in common; None for 0.
-        within: squared whitened differences of poses from their normal points, of attitude and position, and their
-            degrees of freedom; None where there are none.
+        counts: (n,) number of poses that each of them stands for; None where they are measured
+            poses.
+        shares: (n,) part of C that poses seen from nearly the same direction have in common; None
+            for 0.
+        within: squared whitened differences of poses from their normal points, of attitude and
+            position, and their degrees of freedom; None where there are none.
         arc: the orbit from the epoch on; None for free motion.
         root: (n, 6, 6) lower triangular with root C root' = 1.
         info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
@@ -94,7 +113,10 @@ class Poses:
         return len(self.times_s)
 
     def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
-        """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where ``problem`` is linearised."""
+        """(n, 6) d = [theta.
+
+        V] in {C} of these poses at a chart, by default where ``problem`` is linearised.
+        """
         if problem.poses is self and chart is None:
             return problem.core.d
         own = problem if problem.poses is self else Problem(self, problem.prior, problem.factors)
@@ -103,7 +125,14 @@ class Poses:
     def some(self, which: slice | NDArray[np.bool_]) -> Poses:
         """Some of measured poses."""
         shares = None if self.shares is None else self.shares[which]
-        return Poses(self.times_s[which], self.q[which], self.t[which], self.C[which], shares=shares, arc=self.arc)
+        return Poses(
+            self.times_s[which],
+            self.q[which],
+            self.t[which],
+            self.C[which],
+            shares=shares,
+            arc=self.arc,
+        )
 
     def moved(self, q: Array, t: Array) -> Poses:
         """Other poses with the same instants and errors."""
@@ -115,12 +144,19 @@ class Poses:
     def latest(self, count: int, epoch_s: float) -> Poses:
         """The last ``count`` poses, with times from ``epoch_s``."""
         arc = None if self.arc is None else self.arc.shifted(epoch_s)
-        return Poses(self.times_s[-count:] - epoch_s, self.q[-count:], self.t[-count:], self.C[-count:], arc=arc)
+        return Poses(
+            self.times_s[-count:] - epoch_s,
+            self.q[-count:],
+            self.t[-count:],
+            self.C[-count:],
+            arc=arc,
+        )
 
 
 @value_class
 class Prior:
-    """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart coordinates.
+    """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart
+    coordinates.
 
     Attributes:
         info: (20, 20) inverse of P.
@@ -144,11 +180,16 @@ class BatchFit:
     """The result of a fit.
 
     Attributes:
-        chart: initial values at the epoch.  P_chart: (20, 20) their covariance.
+        chart: initial values at the epoch.
+        P_chart: (20, 20) their covariance.
         half_chi2: cost, half the weighted chi-square including the prior, at ``effective``.
-        d: (n, 6) residuals in {C} [rad, m].  weights: (n,) in (0, 1].  factors: (2,) of attitude and position noise.
-        inflation: (2,) 1 + 2 sum of the residuals' autocorrelations: the factor on the variance of the poses.
-        steps: taken.  converged: the stopping rule was met within the allowed steps.
+        d: (n, 6) residuals in {C} [rad, m].
+        weights: (n,) in (0, 1].
+        factors: (2,) of attitude and position noise.
+        inflation: (2,) 1 + 2 sum of the residuals' autocorrelations: the factor on the variance of
+            the poses.
+        steps: taken.
+        converged: the stopping rule was met within the allowed steps.
     """
 
     chart: Chart
@@ -175,18 +216,26 @@ class BatchFit:
 
     @property
     def effective(self) -> Array:
-        """(2,) noise factors of the covariance: those of white noise that carries the same information."""
+        """(2,) noise factors of the covariance.
+
+        Those of white noise that carries the same information.
+        """
         return np.asarray(self.factors * np.sqrt(self.inflation))
 
     @property
     def rms(self) -> tuple[float, float]:
         """Root mean square residual: attitude [rad] and position [m]."""
-        return float(np.sqrt(np.mean(self.d[:, :3] ** 2) * 3)), float(np.sqrt(np.mean(self.d[:, 3:] ** 2) * 3))
+        return float(np.sqrt(np.mean(self.d[:, :3] ** 2) * 3)), float(
+            np.sqrt(np.mean(self.d[:, 3:] ** 2) * 3)
+        )
 
 
 @value_class
 class Pin:
-    """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``: it fixes one direction."""
+    """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``.
+
+    It fixes one direction.
+    """
 
     centre: Chart
     row: Array
@@ -201,22 +250,31 @@ class Pin:
 class Problem:
     """The cost over the initial values at given noise factors, its linearisation and its minimum.
 
-    The loops over the poses are those of the extension (``kernel/fit.cpp``): propagation, transition matrix,
-    measurement Jacobian in the error states at the epoch, M-estimator weights, normal equations in chart steps.
+    The loops over the poses are those of the extension (``kernel/fit.cpp``): propagation,
+    transition matrix, measurement Jacobian in the error states at the epoch, M-estimator weights,
+    normal equations in chart steps.
 
     Args:
         poses: the measurements.
         prior: Gaussian prior of the initial values.
         factors: (2,) on the standard deviations of attitude and position.
         start: the chart of the first linearisation.
-        slack: factor on the squared residual from which a pose is an outlier, where disturbances add to it.
+        slack: factor on the squared residual from which a pose is an outlier, where disturbances
+            add to it.
     """
 
     def __init__(
-        self, poses: Poses, prior: Prior, factors: Array, start: Chart | None = None, slack: float = 1.0
+        self,
+        poses: Poses,
+        prior: Prior,
+        factors: Array,
+        start: Chart | None = None,
+        slack: float = 1.0,
     ) -> None:
         self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
-        core = _motion.Problem(poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info)
+        core = _motion.Problem(
+            poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info
+        )
         self.core = core
         follow_orbit(core, poses)
         self.reweigh(factors)
@@ -224,7 +282,9 @@ class Problem:
             core.linearise(start.flat)
 
     def reweigh(self, factors: Array, redescend: bool = True) -> None:
-        """Use other noise factors, or Huber's weights in place of Cauchy's, with the same linearisation."""
+        """Use other noise factors, or Huber's weights in place of Cauchy's, with the same
+        linearisation.
+        """
         self.factors = factors
         self.core.noise((float(factors[0]), float(factors[1])), redescend, self._slack)
 
@@ -237,7 +297,9 @@ class Problem:
         return self.core.residuals(chart.flat)[1]
 
     def descended(self, most: int, gain_tol: float) -> Parts[tuple[int, bool]]:
-        """Descend to the minimum, in parts, and return the number of steps and whether the stopping rule was met."""
+        """Descend to the minimum, in parts, and return the number of steps and whether the stopping
+        rule was met.
+        """
         turned = float(np.linalg.norm(self.chart.w_c)) * float(np.ptp(self.poses.times_s))
         part = max(1, int(_MOST_WORK / max(len(self.poses), turned / SUBSTEP_RAD)))
         steps, done = self.core.descend(min(part, most), gain_tol)
@@ -247,11 +309,14 @@ class Problem:
             steps += more
         return steps, done
 
-    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> Parts[tuple[Chart, Array, int]]:
+    def pinned(
+        self, start: Chart, params: FitParams, pin: Pin, most: int
+    ) -> Parts[tuple[Chart, Array, int]]:
         """The fit from ``start`` with one direction fixed, in parts.
 
         Returns:
-            Its chart, its covariance (20, 20) in the chart, and the number of steps, at most ``most``.
+            Its chart, its covariance (20, 20) in the chart, and the number of steps, at most
+            ``most``.
         """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
@@ -272,7 +337,9 @@ class Problem:
 
 
 def follow_orbit(core: _motion.Problem, poses: Poses) -> None:
-    """Move the centre of mass along the orbit of the poses, if they have one, in place of free motion."""
+    """Move the centre of mass along the orbit of the poses, if they have one, in place of free
+    motion.
+    """
     if poses.arc is not None:
         moved = poses.arc.transitions(poses.times_s)
         core.paths(np.stack([moved[:, :3, :3], moved[:, :3, 3:]], axis=1))
@@ -292,17 +359,21 @@ def fit(
     robust_start: bool = False,
     slack: float = 1.0,
 ) -> Parts[BatchFit]:
-    """Fit from ``start``, in parts. The noise factors begin at ``factors``; they are refined for ``params.rescale``.
+    """Fit from ``start``, in parts. The noise factors begin at ``factors``; they are refined for
+    ``params.rescale``.
 
-    The residuals' correlation can be estimated only once there are many; ``params.least_inflation`` bounds it.
+    The residuals' correlation can be estimated only once there are many; ``params.least_inflation``
+    bounds it.
 
     Args:
         poses: the measurements, or their normal points.
         start: initial values of the descent.
         prior: Gaussian prior of the initial values.
         params: settings of the fit.
-        factors: (2,) noise factors of a fit that ended at ``start``. None begins at 1, with Huber's weights.
-        every: the poses that ``poses`` are normal points of; the noise is estimated from their residuals.
+        factors: (2,) noise factors of a fit that ended at ``start``. None begins at 1, with Huber's
+            weights.
+        every: the poses that ``poses`` are normal points of; the noise is estimated from their
+            residuals.
         robust_start: begin with Huber's weights although ``factors`` are given.
         slack: as in ``Problem``.
 
@@ -329,22 +400,44 @@ def fit(
             problem.reweigh(plain * np.sqrt(inflation))
             more, done = yield from problem.descended(params.max_steps, params.gain_tol)
             steps += more
-    core.linearise(core.chart)  # the last steps kept the Jacobian; the covariance needs that of the minimum
-    return BatchFit(problem.chart, problem.covariance, core.cost, core.d, core.weights, plain, inflation, steps, done)
+    core.linearise(
+        core.chart
+    )  # the last steps kept the Jacobian; the covariance needs that of the minimum
+    return BatchFit(
+        problem.chart,
+        problem.covariance,
+        core.cost,
+        core.d,
+        core.weights,
+        plain,
+        inflation,
+        steps,
+        done,
+    )
 
 
 def _noise_of(problem: Problem, every: Poses) -> tuple[Array, Array]:
-    """Noise factors (2,) and inflation (2,), of attitude and position, from the residuals of all poses.
+    """Noise factors (2,) and inflation (2,), of attitude and position, from the residuals of all
+    poses.
 
-    The squared factor is the mean of d' C^-1 d plus J P J', the part that the fit absorbed; the inflation is 1 + 2 sum
-    of the residuals' autocorrelations.
+    The squared factor is the mean of d' C^-1 d plus J P J', the part that the fit absorbed; the
+    inflation is 1 + 2 sum of the residuals' autocorrelations.
     """
     d = every.residuals(problem)
     white = (every.root @ (d / np.repeat(problem.factors, 3))[:, :, None])[:, :, 0]
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
     sizes = np.einsum(
-        "n,nbi,nbij,nbj->b", weights, d.reshape(-1, 2, 3), every.info, d.reshape(-1, 2, 3), optimize=False
+        "n,nbi,nbij,nbj->b",
+        weights,
+        d.reshape(-1, 2, 3),
+        every.info,
+        d.reshape(-1, 2, 3),
+        optimize=False,
     )
-    factors = np.sqrt((sizes + problem.core.absorbed(problem.covariance)) / (3.0 * float(weights.sum())))
+    factors = np.sqrt(
+        (sizes + problem.core.absorbed(problem.covariance)) / (3.0 * float(weights.sum()))
+    )
     white *= np.sqrt(weights)[:, None]
-    return factors, np.array([integrated_autocorrelation(white[:, :3]), integrated_autocorrelation(white[:, 3:])])
+    return factors, np.array(
+        [integrated_autocorrelation(white[:, :3]), integrated_autocorrelation(white[:, 3:])]
+    )

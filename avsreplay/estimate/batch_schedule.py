@@ -1,9 +1,11 @@
-"""When the batch fit runs: it provides the estimate at the start, and replaces a filter that it contradicts.
+"""When the batch fit runs: it provides the estimate at the start, and replaces a filter that it
+contradicts.
 
-The innovations of single steps cannot show every error. One or two biased scans that passed the fault rule move the
-parameters of a converged filter by many of its own sigma, and the next innovations look normal. A fit to the last poses
-gives such scans a low weight and does not share the error. Where the two differ by more than the covariance of the fit
-allows, the fit replaces the filter's estimate.
+The innovations of single steps cannot show every error. One or two biased scans that passed the
+fault rule move the parameters of a converged filter by many of its own sigma, and the next
+innovations look normal. A fit to the last poses gives such scans a low weight and does not share
+the error. Where the two differ by more than the covariance of the fit allows, the fit replaces the
+filter's estimate.
 """
 
 from __future__ import annotations
@@ -52,9 +54,11 @@ MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does no
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
-_RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
+# largest age of a given start over the fit's memory; until then disturbances change it little
+_RECENT = 0.1
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
-_LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
+# a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
+_LEAST_TORQUE = 1e-6
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _GAP = 2  # intervals between poses after which a mixture is propagated by its components
 _instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
@@ -66,12 +70,17 @@ class BatchSchedule:
     Args:
         params: settings, auto values filled in.
         noise: the measurement noise model.
-        start: the given belief, None where there is none. It is left out once the poses contradict it.
+        start: the given belief, None where there is none. It is left out once the poses contradict
+            it.
         orbit: the relative orbit of the target; None for free motion.
     """
 
     def __init__(
-        self, params: EstimatorParams, noise: Noise, start: Belief | None, orbit: RelativeOrbit | None = None
+        self,
+        params: EstimatorParams,
+        noise: Noise,
+        start: Belief | None,
+        orbit: RelativeOrbit | None = None,
     ) -> None:
         self.params, self.noise, self.start, self.orbit = params, noise, start, orbit
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
@@ -79,12 +88,19 @@ class BatchSchedule:
         self._given_levels = params.disturbances
 
     def initialised(
-        self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool, spread: bool = False
+        self,
+        track: Track,
+        prediction: Prediction,
+        innovation: Innovation,
+        converged: bool,
+        spread: bool = False,
     ) -> Track:
-        """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
+        """The track after a healthy pose while the fit is in use: a new fit if enough poses have
+        come since the last.
 
-        Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every component of the
-        mixture is updated by itself. ``spread``: a fit to many poses is left to ``advanced``.
+        Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every
+        component of the mixture is updated by itself. ``spread``: a fit to many poses is left to
+        ``advanced``.
         """
         fixes, older = self._with(track, prediction, innovation)
         track = track.changed(fixes=fixes, older=older, R=innovation.R, since=track.since + 1)
@@ -94,27 +110,46 @@ class BatchSchedule:
         if last is None or self._due(track, last):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
-                return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
+                return self.fitted(
+                    forgot, converged, track, whole(self.fit(track, prediction.belief, forgot))
+                )
             if not track.fitting:
-                job = Computation(ComputationKind.FIT, (track, prediction.belief, forgot), (forgot, converged))
+                job = Computation(
+                    ComputationKind.FIT, (track, prediction.belief, forgot), (forgot, converged)
+                )
                 track = track.changed(fitting=job)
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return track.changed(belief=belief)
-        fix, factors, noise = track.fixes[-1], last.factors * np.sqrt(last.inflation), self.noise_levels(track)
+        fix, factors, noise = (
+            track.fixes[-1],
+            last.factors * np.sqrt(last.inflation),
+            self.noise_levels(track),
+        )
         root = _motion.roots(fix.C[None])[0][0]
-        mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
-        C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # components may lie further apart
+        mixture = carried(
+            last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit
+        )
+        C = fix.C * np.outer(
+            np.repeat(factors, 3), np.repeat(factors, 3)
+        )  # components may lie further apart
         mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
         belief, t_ns = moments(mixture), prediction.belief.t_ns
         belief = belief if belief.t_ns == t_ns else self.propagated(track, belief, t_ns)[0]
         return track.changed(belief=belief, batch=replace(last, components=mixture))
 
     def fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
-        """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an earlier pose."""
+        """The fit to all poses of a track, in parts. ``forgot``.
+
+        The last fit began with an earlier pose.
+        """
         start = self.chart_at(belief, track.fixes[0].t_ns) if forgot else None
         levels, given = self._levels(track), self._given(track)
-        return (yield from batch_estimate(track.fixes, self.params, self._rules, levels, track.batch, start, given))
+        return (
+            yield from batch_estimate(
+                track.fixes, self.params, self._rules, levels, track.batch, start, given
+            )
+        )
 
     def fitted(self, forgot: bool, converged: bool, track: Track, result: BatchResult) -> Track:
         """The track with a fit, which is corrected by the poses that came since it began."""
@@ -122,20 +157,30 @@ class BatchSchedule:
         result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
         rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
         track = track.changed(reinitialised=track.reinitialised + rejected)
-        remembers = forgot and track.levels.slack > 1.0  # the filter keeps information of poses left out of fits
+        remembers = (
+            forgot and track.levels.slack > 1.0
+        )  # the filter keeps information of poses left out of fits
         return self.adopted(track, result, result.gaussian and (converged or remembers))
 
     def _at_present(self, track: Track, result: BatchResult) -> BatchResult:
         """The result of a fit, corrected by the later poses of a track."""
         later = track.fixes[bisect_right(track.fixes, result.components[0].t_ns, key=_scan) :]
-        return replace(with_later_poses(result, later, self.noise_levels(track)), count=pose_count(track.fixes))
+        return replace(
+            with_later_poses(result, later, self.noise_levels(track)), count=pose_count(track.fixes)
+        )
 
     def _growth(self, last: BatchResult) -> float:
-        """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
+        """The share by which the poses grow until the next fit.
+
+        A Gaussian likelihood is propagated well in between.
+        """
         return CHECK_GROWTH if last.gaussian else self.params.refit_growth
 
     def _due(self, track: Track, last: BatchResult) -> bool:
-        """Return whether the last fit no longer represents the likelihood: by the poses since then, or by its drift."""
+        """Return whether the last fit no longer represents the likelihood.
+
+        By the poses since then, or by its drift.
+        """
         enough = track.since >= max(1.0, self._growth(last) * last.count)
         return enough or worn(last.components) or _bent(last, track.belief)
 
@@ -144,16 +189,22 @@ class BatchSchedule:
         prior = prediction.belief
         dt_ns = prior.t_ns - track.belief.t_ns
         mean = 0.0 if track.batch is None else track.batch.share
-        inflation = self.noise.inflation(track.inflation, mean, prior.x.w_b, dt_ns, innovation.share)
+        inflation = self.noise.inflation(
+            track.inflation, mean, prior.x.w_b, dt_ns, innovation.share
+        )
         if self.params.by_gain and track.batch is None:
-            belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
+            belief, hits = constrained_update(
+                prior, prediction.H, innovation, self.params.sigma_margin, inflation
+            )
         else:
             belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
         fixes, older = self._with(track, prediction, innovation) if self.checked_poses else ((), ())
         return track.changed(
             belief=belief,
             mode="filter",
-            window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
+            window=self.noise.updated(
+                prediction.window, prior.x, prediction.H, innovation, belief, inflation
+            ),
             sigma_hits=track.sigma_hits + hits,
             r_floors=track.r_floors + self.noise.floors(innovation.R),
             R=innovation.R,
@@ -173,7 +224,10 @@ class BatchSchedule:
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
-        begin, given = self.chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
+        begin, given = (
+            self.chart_at(track.belief, epoch_ns),
+            None if rejected else self._given(track),
+        )
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
         poses = track.fixes, self.params, self._rules, self._levels(track), last, begin, given
         finish = (last is not None,)
@@ -182,17 +236,20 @@ class BatchSchedule:
         return self.checked(*finish, track, whole(batch_estimate(*poses)))
 
     def checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
-        """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the filter.
+        """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the
+        filter.
 
-        A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.
-        The noise window stays, since the noise of the last scans may differ from the level of all poses; with many
-        outliers its residuals are errors of the estimate.
+        A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves
+        contradict the filter. The noise window stays, since the noise of the last scans may differ
+        from the level of all poses; with many outliers its residuals are errors of the estimate.
         """
         many_outliers, linear = track.window.many_outliers, result.components[0].share == 1.0
         result = self._at_present(track, result)
         sound = result.gaussian and _better_than_measured(result.belief, track.R)
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
-            adopted = self.adopted(track, result, result.gaussian).changed(reinitialised=track.reinitialised + 1)
+            adopted = self.adopted(track, result, result.gaussian).changed(
+                reinitialised=track.reinitialised + 1
+            )
             return adopted if many_outliers else adopted.changed(window=track.window)
         if sound and whole_memory and linear:
             return self.adopted(track, result, to_filter=True).changed(window=track.window)
@@ -201,17 +258,24 @@ class BatchSchedule:
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
 
-        Those of a drift apply if larger, where it is not part of the motion of the belief. White noise of root density
-        q changes the rate by q sqrt(T) within T, a constant acceleration a by a T; the two are equal over ``_DRIFT_S``.
-        The torque acts on the rate through B(sigma), which is 3 for a sphere.
+        Those of a drift apply if larger, where it is not part of the motion of the belief. White
+        noise of root density q changes the rate by q sqrt(T) within T, a constant acceleration a by
+        a T; the two are equal over ``_DRIFT_S``. The torque acts on the rate through B(sigma),
+        which is 3 for a sphere.
         """
         driven = isinstance(track.belief, DrivenBelief)
         found, drift = [track.levels.torque, track.levels.force], None if driven else track.drift
         if track.levels.count == 0:  # not yet estimated
             found[0] = _LEAST_TORQUE
-        sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
+        sizes = (
+            (0.0, 0.0)
+            if drift is None
+            else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
+        )
         for k, (fixed, size) in enumerate(zip(self._given_levels, sizes, strict=True)):
-            found[k] = max(found[k] if fixed is None else fixed, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
+            found[k] = max(
+                found[k] if fixed is None else fixed, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k]
+            )
         return found[0], found[1]
 
     def _levels(self, track: Track) -> NoiseLevels:
@@ -230,7 +294,10 @@ class BatchSchedule:
         return chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
 
     def _given(self, track: Track) -> Prior | None:
-        """The track's prior, propagated to the first pose; None where disturbances or time have made it useless."""
+        """The track's prior, propagated to the first pose.
+
+        None where disturbances or time have made it useless.
+        """
         t_ns = track.fixes[0].t_ns
         if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns(track):
             return None
@@ -249,18 +316,34 @@ class BatchSchedule:
     def _with(
         self, track: Track, prediction: Prediction, innovation: Innovation
     ) -> tuple[tuple[PoseFix, ...], tuple[PoseFix, ...]]:
-        """Poses within the fit's memory, with this one, and older ones; of many the first half is joined in pairs."""
-        oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
-        refines = track.drift is not None and track.mode == "filter"  # the test for a drift needs all of them
+        """Poses within the fit's memory, with this one, and older ones.
+
+        Of many the first half is joined in pairs.
+        """
+        oldest = bisect_left(
+            track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant
+        )
+        refines = (
+            track.drift is not None and track.mode == "filter"
+        )  # the test for a drift needs all of them
         first = 0 if refines else oldest
         fixes, older = track.fixes[first:], (*track.older, *track.fixes[:first])[-MOST_FIXES:]
         if len(fixes) >= MOST_FIXES:
-            half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
-            fixes = joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
+            half, factors = (
+                MOST_FIXES // 2,
+                np.array([track.window.factors[3], track.window.factors[0]]),
+            )
+            fixes = (
+                joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors)
+                + fixes[half:]
+            )
         return (*fixes, self.fix(prediction, innovation)), older
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
-        """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved back by it."""
+        """The healthy pose at its own instant.
+
+        A scan deskewed by the prior's motion is moved back by it.
+        """
         x, lag_ns = prediction.belief.x, round(prediction.lag_s * 1e9)
         pose = measured_pose(x, innovation.alpha)
         C = in_fixture(self.noise.base(innovation.R, prediction.window), pose.q, x.q_bc)
@@ -269,23 +352,36 @@ class BatchSchedule:
         if lag_ns:
             pose = propagate_state(x, lag_ns * 1e-9)[0].T_ac @ x.T_ac.inverse() @ pose
         share, weight = innovation.share, innovation.weight
-        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, share, 1, self.orbit, weight)
+        return PoseFix(
+            prediction.belief.t_ns + lag_ns, pose, C, lag_ns, share, 1, self.orbit, weight
+        )
 
     def propagated(self, track: Track, belief: Belief, t_ns: int) -> tuple[Belief, Array]:
-        """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
+        """A belief at another instant with the disturbances of a track, and the transition matrix
+        (20, 20).
+        """
         return propagated(belief, t_ns, *self.noise_levels(track), self.orbit)
 
     def predicted(self, track: Track, t_ns: int) -> tuple[Belief, Array]:
-        """The belief of a track at a later instant, and the transition matrix (20, 20) about its mean.
+        """The belief of a track at a later instant, and the transition matrix (20, 20) about its
+        mean.
 
-        After a gap a mixture has moved as each of its components has, which a propagation about the mean does not show.
+        After a gap a mixture has moved as each of its components has, which a propagation about the
+        mean does not show.
         """
         belief, Phi = self.propagated(track, track.belief, t_ns)
         last, times = track.batch, [fix.t_ns for fix in track.fixes[-2:]]
-        mixed = track.mode == "fit" and last is not None and len(last.components) > 1 and len(times) == 2
+        mixed = (
+            track.mode == "fit"
+            and last is not None
+            and len(last.components) > 1
+            and len(times) == 2
+        )
         if last is None or not mixed or t_ns - times[1] <= _GAP * (times[1] - times[0]):
             return belief, Phi
-        mixture = without_pose(last.components, t_ns, belief.x.T_ac, self.noise_levels(track), self.orbit)
+        mixture = without_pose(
+            last.components, t_ns, belief.x.T_ac, self.noise_levels(track), self.orbit
+        )
         return moments(mixture), Phi
 
     def chart_at(self, belief: Belief, t_ns: int) -> Chart:
@@ -295,16 +391,22 @@ class BatchSchedule:
 
 
 def _better_than_measured(belief: Belief, R: Array) -> bool:
-    """Return whether the pose is known at least as well as from a single measurement with the noise R (6, 6)."""
+    """Return whether the pose is known at least as well as from a single measurement with the noise
+    R (6, 6).
+    """
     H = measurement_jacobian(belief.x)
     S = H @ belief.P @ H.T
-    return all(float(np.trace(S[b, b])) <= float(np.trace(R[b, b])) for b in (slice(0, 3), slice(3, 6)))
+    return all(
+        float(np.trace(S[b, b])) <= float(np.trace(R[b, b])) for b in (slice(0, 3), slice(3, 6))
+    )
 
 
 def _bent(last: BatchResult, belief: Belief) -> bool:
-    """Return whether the poses since a fit have moved the inertia by more than its 1 sigma along a curved likelihood.
+    """Return whether the poses since a fit have moved the inertia by more than its 1 sigma along a
+    curved likelihood.
 
-    One component stands for such a likelihood where no profile fit was found. It holds near the fit only.
+    One component stands for such a likelihood where no profile fit was found. It holds near the fit
+    only.
     """
     if last.gaussian or len(last.components) > 1:
         return False
@@ -313,7 +415,8 @@ def _bent(last: BatchResult, belief: Belief) -> bool:
 
 
 def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]) -> BatchResult:
-    """The result of a fit, in no direction less precise at its last pose ``fix`` than that pose (``not_worse``).
+    """The result of a fit, in no direction less precise at its last pose ``fix`` than that pose
+    (``not_worse``).
 
     Args:
         result: the fit's result.
@@ -329,8 +432,11 @@ def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]
     return replace(result, belief=belief, components=mixture)
 
 
-def with_later_poses(result: BatchResult, fixes: Sequence[PoseFix], noise: tuple[float, float]) -> BatchResult:
-    """The result of a fit, corrected by poses that came after those of the fit (``mixture.carried``).
+def with_later_poses(
+    result: BatchResult, fixes: Sequence[PoseFix], noise: tuple[float, float]
+) -> BatchResult:
+    """The result of a fit, corrected by poses that came after those of the fit
+    (``mixture.carried``).
 
     Args:
         result: the fit's result.

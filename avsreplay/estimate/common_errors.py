@@ -1,14 +1,19 @@
-"""Errors that all measured poses have in common, which no innovation shows and later poses do not reduce.
+"""Errors that all measured poses have in common, which no innovation shows and later poses do not
+reduce.
 
-- The position along the line of sight: the same offset of all poses is the same motion elsewhere.
-- A constant motion d of the model in {C}: it only renames the fixture. Its covariance is a share of the systematic part
-  of the covariances of the registered poses, which comes from errors of the model and of the ranges.
-- A wrong size. Scans of a target that is 1 + delta times as large as the model are explained by that size, or by ranges
-  that are too long by the same factor; the poses are then too far away by delta times the distance.
+- The position along the line of sight: the same offset of all poses is the same motion elsewhere. -
+A constant motion d of the model in {C}: it only renames the fixture. Its covariance is a share of
+the systematic part
+  of the covariances of the registered poses, which comes from errors of the model and of the
+  ranges.
+- A wrong size. Scans of a target that is 1 + delta times as large as the model are explained by
+  that size, or by ranges that are too long by the same factor; the poses are then too far away by
+  delta times the distance.
 
-The systematic part of one scan is an estimate of variances that are not negative, and the noise of points near edges
-is a part of it. Its share in the covariance is therefore 0.1 to 0.25 in scans without such errors, and up to 0.45 with
-noise of 0.004 of the extent (``tests/benchmarks/model_errors.py``). Only a larger mean share over a run counts.
+The systematic part of one scan is an estimate of variances that are not negative, and the noise of
+points near edges is a part of it. Its share in the covariance is therefore 0.1 to 0.25 in scans
+without such errors, and up to 0.45 with noise of 0.004 of the extent
+(``tests/benchmarks/model_errors.py``). Only a larger mean share over a run counts.
 """
 
 from __future__ import annotations
@@ -25,13 +30,24 @@ from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment
 
-_LINE_OF_SIGHT = 0.5  # variance of an error that all views have in common over that of the common errors
+_LINE_OF_SIGHT = (
+    0.5  # variance of an error that all views have in common over that of the common errors
+)
 _ALL_VIEWS = 0.5  # the same for the systematic part of the covariance of a pose
-_FROM_NOISE, _ALL_SYSTEMATIC = 0.3, 0.5  # mean share up to which it does not count, and from which it counts in full
+_FROM_NOISE, _ALL_SYSTEMATIC = (
+    0.3,
+    0.5,
+)  # mean share up to which it does not count, and from which it counts in full
 _RANGES = 0.5  # probability that the ranges of the sensor, and not the model, have the wrong size
-_SIZE_OF_NOISE = 500.0  # error of size that noise causes, over (rms / extent)^2: 30 to 500 on five meshes
+_SIZE_OF_NOISE = (
+    500.0  # error of size that noise causes, over (rms / extent)^2: 30 to 500 on five meshes
+)
 _SIZE_1S = 1e-3  # standard error of the size from one scan that is added to the stated one
-_LEAST_SCANS, _ALIKE, _SIGMAS = 12, 4.0, 4.0  # scans that show errors; neighbours that count as one; significance
+_LEAST_SCANS, _ALIKE, _SIGMAS = (
+    12,
+    4.0,
+    4.0,
+)  # scans that show errors; neighbours that count as one; significance
 _NO_MATRIX = frozen(np.zeros((6, 6)))
 
 
@@ -42,7 +58,8 @@ class ModelErrors:
     Attributes:
         scans, share: number of covariances, and sum of the shares of their systematic parts.
         systematic: (6, 6) sum of the systematic parts, of d in {C}.
-        sizes: sums of weight, weight times error of size, weight times its square, and (rms / extent)^2; their number.
+        sizes: sums of weight, weight times error of size, weight times its square, and (rms /
+            extent)^2; their number.
         sensor: (3,) position of the sensor in {A} at the last scan [m].
         kept: the sums are kept; the paper's method has none.
     """
@@ -54,7 +71,9 @@ class ModelErrors:
     sensor: tuple[float, float, float] = (0.0, 0.0, 0.0)
     kept: bool = True
 
-    def with_scan(self, alignment: Alignment | None, extent_m: float, sensor: Pose | None) -> ModelErrors:
+    def with_scan(
+        self, alignment: Alignment | None, extent_m: float, sensor: Pose | None
+    ) -> ModelErrors:
         """Return the sums with one more scan.
 
         Args:
@@ -69,9 +88,13 @@ class ModelErrors:
             return replace(self, sensor=(x, y, z))
         part, share = alignment.systematic, systematic_share(alignment)
         sizes = self._with_size(alignment.size, alignment.rms_m / extent_m)
-        return ModelErrors(self.scans + 1, self.share + share, self.systematic + part, sizes, (x, y, z))
+        return ModelErrors(
+            self.scans + 1, self.share + share, self.systematic + part, sizes, (x, y, z)
+        )
 
-    def _with_size(self, size: tuple[float, float] | None, noise: float) -> tuple[float, float, float, float, int]:
+    def _with_size(
+        self, size: tuple[float, float] | None, noise: float
+    ) -> tuple[float, float, float, float, int]:
         if size is None or not math.isfinite(size[1]):
             return self.sizes
         delta, sigma = size
@@ -81,13 +104,18 @@ class ModelErrors:
 
     @property
     def size_error(self) -> float:
-        """The error of size that noise does not explain: the root of what its square exceeds; 0 for too few scans."""
+        """The error of size that noise does not explain: the root of what its square exceeds.
+
+        0 for too few scans.
+        """
         weight, first, second, squares, n = self.sizes
         if n < _LEAST_SCANS:
             return 0.0
         mean = first / weight
         variance = _ALIKE * max(second / weight - mean * mean, 0.0) / n
-        return math.sqrt(max(mean * mean - _SIGMAS**2 * variance - (_SIZE_OF_NOISE * squares / n) ** 2, 0.0))
+        return math.sqrt(
+            max(mean * mean - _SIGMAS**2 * variance - (_SIZE_OF_NOISE * squares / n) ** 2, 0.0)
+        )
 
     @property
     def counted(self) -> float:
@@ -99,7 +127,10 @@ class ModelErrors:
 
     @property
     def motions(self) -> Array:
-        """Motions d (6, k) of {C}, each with a 1 sigma, that all poses may have in common; (6, 0) for none."""
+        """Motions d (6, k) of {C}, each with a 1 sigma, that all poses may have in common.
+
+        (6, 0) for none.
+        """
         if not (counted := self.counted):
             return np.zeros((6, 0))
         values, axes = np.linalg.eigh(self.systematic / self.scans)
@@ -110,18 +141,23 @@ NO_MODEL_ERRORS = ModelErrors()
 
 
 def systematic_share(alignment: Alignment) -> float:
-    """Return the share of systematic errors in the covariance of a pose, from 0 to 1; 0 where there is none."""
+    """Return the share of systematic errors in the covariance of a pose, from 0 to 1.
+
+    0 where there is none.
+    """
     if alignment.covariance is None or alignment.systematic is None:
         return 0.0
     return _motion.trace_of_ratio(alignment.systematic, alignment.covariance) / 6.0
 
 
 def line_of_sight_1s(r_a: Array, common_m2: Array, errors: ModelErrors) -> Array:
-    """Return the 1 sigma (3,) in {A} [m] of the error of the position along the line of sight that all poses have.
+    """Return the 1 sigma (3,) in {A} [m] of the error of the position along the line of sight that
+    all poses have.
 
     Args:
         r_a: (3,) position of the target in {A} [m].
-        common_m2: (3, 3) covariance of the error of a measured position in {A} that near views have in common [m^2].
+        common_m2: (3, 3) covariance of the error of a measured position in {A} that near views have
+            in common [m^2].
         errors: of the model and of the ranges.
     """
     away = r_a - np.array(errors.sensor)
@@ -134,7 +170,9 @@ def line_of_sight_1s(r_a: Array, common_m2: Array, errors: ModelErrors) -> Array
 
 
 def motion_covariance(d: Array, q_bc: Array) -> Array:
-    """Return the covariance (20, 20) of the state for independent motions d (6, k) of {C}, each with 1 sigma."""
+    """Return the covariance (20, 20) of the state for independent motions d (6, k) of {C}, each
+    with 1 sigma.
+    """
     R_bc, E = geometry.matrix(q_bc), np.zeros((20, d.shape[1]))
     E[VARRHO], E[DMU] = R_bc @ d[3:], 0.5 * R_bc @ d[:3]
     return np.asarray(E @ E.T)

@@ -1,13 +1,16 @@
-"""The density of a random disturbance: its likelihood, and the one density that stands for all of them.
+"""The density of a random disturbance: its likelihood, and the one density that stands for all of
+them.
 
-The whitened residuals of the poses are linear in the initial values y and in impulses u of the disturbance between the
-poses, with u ~ N(0, q^2). The likelihood of every root density q is a closed form in the eigenvectors of the
-information on u; so are the mean and the covariance of the present rate or velocity, given q.
+The whitened residuals of the poses are linear in the initial values y and in impulses u of the
+disturbance between the poses, with u ~ N(0, q^2). The likelihood of every root density q is a
+closed form in the eigenvectors of the information on u; so are the mean and the covariance of the
+present rate or velocity, given q.
 
-The estimator uses one density. The distribution over all densities has a larger covariance than the likely density
-alone wherever the poses do not determine q: a density of small probability under which the velocity has moved far
-counts as much as its square. The density in use is therefore the one about whose mean and with whose covariance the
-expected NEES of the present velocity is 1 (law of total covariance).
+The estimator uses one density. The distribution over all densities has a larger covariance than the
+likely density alone wherever the poses do not determine q: a density of small probability under
+which the velocity has moved far counts as much as its square. The density in use is therefore the
+one about whose mean and with whose covariance the expected NEES of the present velocity is 1 (law
+of total covariance).
 """
 
 from __future__ import annotations
@@ -20,16 +23,22 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.geometry import Array
 
-DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
+DENSITIES = np.logspace(
+    -8.0, 0.0, 65
+)  # root densities of a disturbance that are compared with none
 _EXCLUDED = math.log(0.01)  # log likelihood ratio to none below which a density is excluded
-_TOGETHER = 0.9  # prior probability that torque and force are both random where one is, and neither where one is not
+# prior probability that torque and force are both random where one is, and neither where one is not
+_TOGETHER = 0.9
 _SQUARES = np.append(0.0, DENSITIES**2)
 _FEW_ROWS = 36  # rows up to which a triangular matrix is inverted
 
 
 @value_class
 class Residuals:
-    """Whitened residuals e (n,) and their Jacobian J (n, m); information (m, m) and offset (m,) of the prior."""
+    """Whitened residuals e (n,) and their Jacobian J (n, m).
+
+    Information (m, m) and offset (m,) of the prior.
+    """
 
     e: Array
     J: Array
@@ -39,7 +48,10 @@ class Residuals:
 
 @value_class
 class Present:
-    """The present rate or velocity: its derivatives by the m initial values (3, m) and by the k impulses (3, k)."""
+    """The present rate or velocity.
+
+    Its derivatives by the m initial values (3, m) and by the k impulses (3, k).
+    """
 
     by_initial: Array
     by_impulses: Array
@@ -51,10 +63,11 @@ class Marginal:
 
     Attributes:
         none: log likelihood of no impulses, without its constant.
-        values: (k,) eigenvalues of the information on the impulses.  vectors: (k, k) its eigenvectors.
+        values: (k,) eigenvalues of the information on the impulses.
+        vectors: (k, k) its eigenvectors.
         along: (k,) the gradient of the log likelihood along them.
-        R, cross: (m, m) root of the information on the initial values, and (m, k) its product with their derivatives
-            by the impulses.
+        R, cross: (m, m) root of the information on the initial values, and (m, k) its product with
+            their derivatives by the impulses.
     """
 
     none: float
@@ -73,12 +86,17 @@ class Marginal:
 
     @property
     def evidence(self) -> float:
-        """Log likelihood of a disturbance, all decades of whose root density are equally likely, over none."""
+        """Log likelihood of a disturbance, all decades of whose root density are equally likely,
+        over none.
+        """
         return float(np.logaddexp.reduce(self.log_odds)) - math.log(len(DENSITIES))
 
     @property
     def excluded(self) -> float:
-        """The least root density that is excluded together with all larger ones; inf where none is."""
+        """The least root density that is excluded together with all larger ones.
+
+        Inf where none is.
+        """
         possible = np.flatnonzero(self.log_odds > _EXCLUDED)
         first = int(possible[-1]) + 1 if possible.size else 0
         return float(DENSITIES[first]) if first < len(DENSITIES) else math.inf
@@ -101,15 +119,22 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     e = np.concatenate([white[:, -1], prior @ data.off])
     left, cross = e - Q @ (Q.T @ e), Q.T @ columns
     chi2 = float(left @ left)
-    none = -0.5 * chi2 - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
+    none = -0.5 * chi2 - float(
+        np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum()
+    )
     values, vectors = np.linalg.eigh(columns.T @ columns - cross.T @ cross)
     values = np.maximum(values, 0.0)
     most = np.sqrt(chi2 * values)  # the bound of Cauchy and Schwarz, which rounding can exceed
-    return Marginal(none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross)
+    return Marginal(
+        none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross
+    )
 
 
 def _divided(L: Array, B: Array) -> Array:
-    """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves: numpy has the general solution only."""
+    """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves.
+
+    Numpy has the general solution only.
+    """
     if len(L) <= _FEW_ROWS:
         return np.asarray(_motion.lower_inverse(np.ascontiguousarray(L)) @ B)
     half = len(L) // 2
@@ -120,15 +145,16 @@ def _divided(L: Array, B: Array) -> Array:
 def probability_beside(evidence: float) -> float:
     """Prior probability of a random torque or force given the ``evidence`` of the other one.
 
-    A force whose line of action misses the mass centre turns the body, so that the two come together. Each by itself
-    has the probability 0.5.
+    A force whose line of action misses the mass centre turns the body, so that the two come
+    together. Each by itself has the probability 0.5.
     """
     other = 1.0 / (1.0 + math.exp(-min(max(evidence, -700.0), 700.0)))
     return _TOGETHER * other + (1.0 - _TOGETHER) * (1.0 - other)
 
 
 def density_in_use(found: Marginal, present: Present, probability: float = 0.5) -> float:
-    """Root density for which the expected NEES of the present velocity is 1 under the posterior of all densities.
+    """Root density for which the expected NEES of the present velocity is 1 under the posterior of
+    all densities.
 
     Zero where no disturbance is certain; between two candidates the density is interpolated.
 
@@ -137,7 +163,9 @@ def density_in_use(found: Marginal, present: Present, probability: float = 0.5) 
         present: the rate or velocity at the last pose.
         probability: prior probability that there is a disturbance.
     """
-    log = np.append(math.log1p(-probability), found.log_odds + math.log(probability / len(DENSITIES)))
+    log = np.append(
+        math.log1p(-probability), found.log_odds + math.log(probability / len(DENSITIES))
+    )
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     by_initial = np.zeros((3, len(found.R)))  # zero for unknowns besides the initial values
@@ -151,7 +179,9 @@ def density_in_use(found: Marginal, present: Present, probability: float = 0.5) 
     cross = mean[:, :, None] * (weights @ mean)
     about = total - cross - cross.swapaxes(1, 2) + mean[:, :, None] * mean[:, None, :]
     excess = np.trace(np.linalg.solve(P, about), axis1=1, axis2=2) / 3.0 - 1.0
-    largest = math.sqrt(float(weights @ _SQUARES))  # a variance grows at most with the square of the density
+    largest = math.sqrt(
+        float(weights @ _SQUARES)
+    )  # a variance grows at most with the square of the density
     enough = np.flatnonzero(excess <= 0.0)
     if not enough.size:
         return largest

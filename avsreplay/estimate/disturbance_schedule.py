@@ -1,4 +1,6 @@
-"""When the noise levels are estimated and a constant torque is tested for, and the work that is spread over scans."""
+"""When the noise levels are estimated and a constant torque is tested for, and the work that is
+spread over scans.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,25 @@ from typing import Any
 import numpy as np
 
 from avsreplay.errors import value_class
-from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_SPREAD, MOST_FIXES, BatchSchedule
+from avsreplay.estimate.batch_schedule import (
+    CHECK_GROWTH,
+    FEWEST_TO_SPREAD,
+    MOST_FIXES,
+    BatchSchedule,
+)
 from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
 from avsreplay.estimate.driven_fit import levels_of
 from avsreplay.estimate.driven_motion import DrivenMotion, driven_motion
-from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, improved_levels, pose_count, poses_of
+from avsreplay.estimate.initialise import (
+    BatchResult,
+    PoseFix,
+    batch_estimate,
+    improved_levels,
+    pose_count,
+    poses_of,
+)
 from avsreplay.estimate.measurement import (
     chart_update,
     in_camera,
@@ -37,21 +51,34 @@ from avsreplay.geometry import Array
 from avsreplay.records import Drift
 from avsreplay.settings import given
 
-FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
+FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = (
+    40,
+    10,
+    0.1,
+)  # poses for a test of drift, and between two tests
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
-_DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
-_EARLY = 2.0  # age of the poses over that at the report of a drift, until which it is tested for as often as before
-_LEAST_EXCESS = 1e-6  # least variance of a belief over that of a pose, less 1, for which the pose is used
+_DRIFT_OF_SPEED = (
+    5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
+)
+# age of the poses over that at the report of a drift, until which it is tested for as often as
+# before
+_EARLY = 2.0
+_LEAST_EXCESS = (
+    1e-6  # least variance of a belief over that of a pose, less 1, for which the pose is used
+)
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 _NOT_BY_CHANCE = {3: 21.1, 6: 27.9}  # 99.99 % point of chi-square with so many degrees of freedom
-_LEAST_NIS = 1.6  # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
+# chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
+_LEAST_NIS = 1.6
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
 @value_class
 class _Driven:
-    """A drift, the noise levels with it, and the motion of each hypothesis with its weight, none where one is bent."""
+    """A drift, the noise levels with it, and the motion of each hypothesis with its weight, none
+    where one is bent.
+    """
 
     found: DriftFound
     levels: NoiseLevels
@@ -67,7 +94,9 @@ class DisturbanceSchedule:
 
     def __init__(self, batch: BatchSchedule) -> None:
         self.batch, self.params = batch, batch.params
-        self._jobs: dict[ComputationKind, tuple[Callable[..., Parts[Any]], Callable[..., Track]]] = {
+        self._jobs: dict[
+            ComputationKind, tuple[Callable[..., Parts[Any]], Callable[..., Track]]
+        ] = {
             ComputationKind.FIT: (batch.fit, batch.fitted),
             ComputationKind.CHECK: (batch_estimate, batch.checked),
             ComputationKind.LEVELS: (improved_levels, self._levelled),
@@ -76,7 +105,8 @@ class DisturbanceSchedule:
         self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(batch.params.start_vel_1s_mps))
 
     def advanced(self, track: Track, tested: bool) -> Track:
-        """The track after a healthy scan with the work of one scan: noise levels, or a fit and a test in turn.
+        """The track after a healthy scan with the work of one scan: noise levels, or a fit and a
+        test in turn.
 
         Where the levels are too small, every pose makes another fit due: they are estimated before.
 
@@ -85,32 +115,45 @@ class DisturbanceSchedule:
             tested: a test may begin.
         """
         if tested:
-            track = self._begun(track.changed(untested=track.untested + 1, unlevelled=track.unlevelled + 1))
+            track = self._begun(
+                track.changed(untested=track.untested + 1, unlevelled=track.unlevelled + 1)
+            )
         job, other = track.fitting, track.testing
-        if other is not None and (job is None or other.kind is ComputationKind.LEVELS or track.unlevelled % 2):
+        if other is not None and (
+            job is None or other.kind is ComputationKind.LEVELS or track.unlevelled % 2
+        ):
             job = other
         if job is None:
             return track
         begin, finish = self._jobs[job.kind]
         work = job.work.continued(partial(begin, *job.begin))
         after = None if work.done else replace(job, work=work)
-        track = track.changed(testing=after) if job is track.testing else track.changed(fitting=after)
+        track = (
+            track.changed(testing=after) if job is track.testing else track.changed(fitting=after)
+        )
         return finish(*job.finish, track, work.result) if work.done else track
 
     def _begun(self, track: Track) -> Track:
-        """The track with a test of the noise levels, else of a drift, if one is due and none is under way.
+        """The track with a test of the noise levels, else of a drift, if one is due and none is
+        under way.
 
-        A drift is tested for each time the poses have grown enough, with all poses: those that have left the fit as
-        well, because the random disturbances that shorten it are the other explanation. From its first detection on it
-        is part of the motion that the filter predicts. The value that is reported is that of the last fit to all poses:
-        where inertia and torque explain each other, the filter's covariance becomes too small between fits.
+        A drift is tested for each time the poses have grown enough, with all poses: those that have
+        left the fit as well, because the random disturbances that shorten it are the other
+        explanation. From its first detection on it is part of the motion that the filter predicts.
+        The value that is reported is that of the last fit to all poses: where inertia and torque
+        explain each other, the filter's covariance becomes too small between fits.
         """
         count, last, known = pose_count(track.fixes), track.batch, track.drift
         if not self.batch.checked_poses or last is None or track.testing is not None:
             return track
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        # Disturbances that are too large shorten the fit to fewer poses than are needed to estimate them again.
-        fixes = track.fixes if count >= FEWEST or not _overestimated(track) else _all_poses(track).fixes[-FEWEST:]
+        # Disturbances that are too large shorten the fit to fewer poses than are needed to estimate
+        # them again.
+        fixes = (
+            track.fixes
+            if count >= FEWEST or not _overestimated(track)
+            else _all_poses(track).fixes[-FEWEST:]
+        )
         if pose_count(fixes) >= FEWEST and known is None and late > (0 if track.since else _LATEST):
             start = self._start(track, last, fixes[0].t_ns)
             poses = fixes, last, start, self.params, track.levels, _positions(track, start)
@@ -121,8 +164,13 @@ class DisturbanceSchedule:
             return track
         every = _all_poses(track) if known is None else track
         count, epoch_ns = pose_count(every.fixes), every.fixes[0].t_ns
-        early = known is None or track.belief.t_ns - epoch_ns < _EARLY * (known.detected_ns - epoch_ns)
-        if count < FEWEST_WITH_DRIFT or track.untested <= (DRIFT_GROWTH if early else CHECK_GROWTH) * count:
+        early = known is None or track.belief.t_ns - epoch_ns < _EARLY * (
+            known.detected_ns - epoch_ns
+        )
+        if (
+            count < FEWEST_WITH_DRIFT
+            or track.untested <= (DRIFT_GROWTH if early else CHECK_GROWTH) * count
+        ):
             return track
         begun = None
         if known is not None:
@@ -130,21 +178,29 @@ class DisturbanceSchedule:
                 return track.changed(untested=0)
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
         start = self._start(track, last, epoch_ns)
-        job = Computation(ComputationKind.DRIFT, (every, start, begun), (epoch_ns, every.fixes[-1].t_ns))
+        job = Computation(
+            ComputationKind.DRIFT, (every, start, begun), (epoch_ns, every.fixes[-1].t_ns)
+        )
         return track.changed(testing=job, untested=0)
 
     def _start(self, track: Track, last: BatchResult, epoch_ns: int) -> Chart:
         """Initial values at an instant: those of the last fit, or of the belief propagated back."""
-        return last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
+        return (
+            last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
+        )
 
     def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
         """The track with new noise levels."""
         used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
         more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
-        since = pose_count(track.fixes) if more else track.since  # estimated without these disturbances: fit again
+        since = (
+            pose_count(track.fixes) if more else track.since
+        )  # estimated without these disturbances: fit again
         return track.changed(levels=levels, since=since)
 
-    def _tested(self, track: Track, start: Chart, begun: tuple[float, Array] | None) -> Parts[_Driven | None]:
+    def _tested(
+        self, track: Track, start: Chart, begun: tuple[float, Array] | None
+    ) -> Parts[_Driven | None]:
         """The test for a drift, in parts. ``begun``: onset and size of one that is known."""
         factors = np.array([track.window.factors[3], track.window.factors[0]])
         try:
@@ -153,13 +209,23 @@ class DisturbanceSchedule:
             )
             if found is None:
                 return None
-            claimed, best, widths = self.params.adapt is Adaptation.OFF, found.hypotheses[0], found.widths
+            claimed, best, widths = (
+                self.params.adapt is Adaptation.OFF,
+                found.hypotheses[0],
+                found.widths,
+            )
             forced = bool(best.fitted.u[3:].any())  # a constant force would count as a random one
             seen = None if forced else _positions(track, best.fitted.chart)
-            first = replace(track.levels, torque=0.0, force=0.0)  # the acceleration may have caused these disturbances
+            first = replace(
+                track.levels, torque=0.0, force=0.0
+            )  # the acceleration may have caused these disturbances
             before = first if begun is None else track.levels
-            levels = yield from levels_of(best.fitted, before, widths, claimed, self.params.disturbances, seen)
-            if begun is None and levels.established:  # with random disturbances beside it, these may explain everything
+            levels = yield from levels_of(
+                best.fitted, before, widths, claimed, self.params.disturbances, seen
+            )
+            if (
+                begun is None and levels.established
+            ):  # with random disturbances beside it, these may explain everything
                 return None
             motions = []
             for h in found.hypotheses:
@@ -168,17 +234,27 @@ class DisturbanceSchedule:
                     return _Driven(found, levels, [])
                 motions.append((h.weight, motion))
             return _Driven(found, levels, motions)
-        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
+        except (
+            np.linalg.LinAlgError
+        ):  # an unstable spin over so long a time that its motion cannot be inverted
             return None
 
     def _driven(self, epoch_ns: int, until_ns: int, track: Track, driven: _Driven | None) -> Track:
-        """The track with the estimate of a fit with a constant torque or force, and the poses since it began."""
+        """The track with the estimate of a fit with a constant torque or force, and the poses since
+        it began.
+        """
         last, now_ns, known = track.batch, track.belief.t_ns, track.drift
         if driven is None or last is None:
             return track
         if not driven.motions:
-            return track if known is None else track.changed(levels=replace(driven.levels, count=track.levels.count))
-        fitted = driven_moments([(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions])
+            return (
+                track
+                if known is None
+                else track.changed(levels=replace(driven.levels, count=track.levels.count))
+            )
+        fitted = driven_moments(
+            [(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions]
+        )
         if known is None and not _significant(fitted):
             return track
         track = track if known is not None else _all_poses(track, epoch_ns)
@@ -192,36 +268,56 @@ class DisturbanceSchedule:
                 return track
             parts.append((weight, belief))
         inflation, plain = driven.motions[0][1].inflation, driven.levels.factors(last.share)
-        moved = no_worse_than_pose(driven_moments(parts), track.fixes[-1], plain * np.sqrt(inflation))
+        moved = no_worse_than_pose(
+            driven_moments(parts), track.fixes[-1], plain * np.sqrt(inflation)
+        )
         onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), driven.found.onset_1s_s
         if onset_ns == epoch_ns:  # it may have acted before the first of these poses
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
-            onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
+            onset_ns, spread = (
+                onset_ns - since_ns,
+                math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0)),
+            )
         detected_ns = now_ns if known is None else known.detected_ns
         drift = Drift(onset_ns, spread, fitted.u[3:], fitted.u[:3], fitted.P_u, detected_ns)
-        result = BatchResult(epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian)
-        result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
+        result = BatchResult(
+            epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian
+        )
+        result = replace(
+            result,
+            prior_rejected=last.prior_rejected,
+            share=last.share,
+            position_m2=last.position_m2,
+        )
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
 
 
 def _overestimated(track: Track) -> bool:
-    """Return whether the last accepted scans agree with their predictions much better than the covariance claims."""
+    """Return whether the last accepted scans agree with their predictions much better than the
+    covariance claims.
+    """
     return len(track.nis) >= FEWEST and median(track.nis[-FEWEST:]) < _LEAST_NIS
 
 
 def _significant(fitted: DrivenBelief) -> bool:
-    """Return whether the acceleration is none by chance only, with the random disturbances that are found beside it."""
+    """Return whether the acceleration is none by chance only, with the random disturbances that are
+    found beside it.
+    """
     open_ = np.flatnonzero(fitted.u)
     u, P = fitted.u[open_], fitted.P_u[np.ix_(open_, open_)]
-    return bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > _NOT_BY_CHANCE[len(open_)]
+    return (
+        bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > _NOT_BY_CHANCE[len(open_)]
+    )
 
 
 def _all_poses(track: Track, since_ns: int = 0) -> Track:
     """The track with a fit to all poses since an instant and since the last manoeuvre."""
     last_ns = max([since_ns, *(m.t_ns for m in track.manoeuvres)])
     begin = bisect_left(track.older, last_ns, key=_instant)
-    return track.changed(fixes=(*track.older[begin:], *track.fixes)[-MOST_FIXES:], older=track.older[:begin])
+    return track.changed(
+        fixes=(*track.older[begin:], *track.fixes)[-MOST_FIXES:], older=track.older[:begin]
+    )
 
 
 def _instant(fix: PoseFix) -> int:
@@ -229,16 +325,21 @@ def _instant(fix: PoseFix) -> int:
 
 
 def _positions(track: Track, chart: Chart) -> PositionRows | None:
-    """The positions of all poses, where some have left the fit because of disturbances or a manoeuvre since."""
+    """The positions of all poses, where some have left the fit because of disturbances or a
+    manoeuvre since.
+    """
     if not track.older or track.fixes[0].orbit is not None:
         return None
     every = (*track.older, *track.fixes)
     weights, epoch_ns = np.array([f.weight for f in every]), every[0].t_ns
-    return position_rows(poses_of(every), weights, chart.arm_c, _POSITIONS, epoch_ns, track.manoeuvres)
+    return position_rows(
+        poses_of(every), weights, chart.arm_c, _POSITIONS, epoch_ns, track.manoeuvres
+    )
 
 
 def no_worse_than_pose(belief: DrivenBelief, fix: PoseFix, factors: Array) -> DrivenBelief:
-    """The belief, in no direction less precise at its pose than the last pose ``fix``, as by ``mixture.not_worse``.
+    """The belief, in no direction less precise at its pose than the last pose ``fix``, as by
+    ``mixture.not_worse``.
 
     ``factors`` (2,) are on the standard deviations of attitude and position.
     """

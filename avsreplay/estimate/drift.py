@@ -1,10 +1,12 @@
-"""A persistent torque or force on the target: found in the residuals of the batch fit, with its onset and its size.
+"""A persistent torque or force on the target: found in the residuals of the batch fit, with its
+onset and its size.
 
-A constant angular acceleration in {C} and a constant acceleration in {A}, both from an unknown instant on, are linear
-unknowns about the trajectory of the fit. A unit acceleration since tau has the same effect at t as the error states
-B(t) - B(tau) at the epoch, where B(t) is the integral of Phi(s, 0)^-1 G ds. The residuals of the poses depend on them
-as on the initial values. With a Gaussian prior on the size the evidence against free motion is in closed form, as in
-``hypotheses``. The noise of the poses is that of the residuals with the drift removed, correlation included.
+A constant angular acceleration in {C} and a constant acceleration in {A}, both from an unknown
+instant on, are linear unknowns about the trajectory of the fit. A unit acceleration since tau has
+the same effect at t as the error states B(t) - B(tau) at the epoch, where B(t) is the integral of
+Phi(s, 0)^-1 G ds. The residuals of the poses depend on them as on the initial values. With a
+Gaussian prior on the size the evidence against free motion is in closed form, as in ``hypotheses``.
+The noise of the poses is that of the residuals with the drift removed, correlation included.
 """
 
 from __future__ import annotations
@@ -41,14 +43,18 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 
-_ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and around the most likely one
+_ONSETS, _FINER = (
+    12,
+    9,
+)  # number of onsets tried, the first at the epoch, and around the most likely one
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
-_CONSTANT = (
-    2.5  # log odds over one step of the velocity and random disturbances: 3 less 0.5, the likeliest's gain (Wilks)
-)
+# log odds over one step of the velocity and random disturbances: 3 less 0.5, the likeliest's gain by Wilks' theorem
+_CONSTANT = 2.5
 _ROUNDS = 3  # largest number of joint fits with another onset or kind
-_LEAST_GAIN = 0.5  # decrease of the cost (half chi-square) above which another linearisation follows
+_LEAST_GAIN = (
+    0.5  # decrease of the cost (half chi-square) above which another linearisation follows
+)
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
@@ -72,12 +78,15 @@ def find_drift(
 
     Args:
         fixes: healthy poses, oldest first.
-        start: initial values at the first pose, where the fit begins: that of free motion, or of the ``known`` drift.
+        start: initial values at the first pose, where the fit begins: that of free motion, or of
+            the ``known`` drift.
         params: settings, auto values filled in.
         factors: (2,) noise factors of attitude and position of the poses.
         scale: prior 1 sigma of the angular acceleration [rad/s2] and of the acceleration [m/s2].
-        levels: noise levels; random disturbances explain the poses as well, and better unless they are constant.
-        known: onset [s] and size u (6,) of a drift that was found in fewer poses and is to be refined.
+        levels: noise levels; random disturbances explain the poses as well, and better unless they
+            are constant.
+        known: onset [s] and size u (6,) of a drift that was found in fewer poses and is to be
+            refined.
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
@@ -99,10 +108,15 @@ def find_drift(
         nearer = yield from fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
         free = min(free, nearer, key=lambda f: f.cost)
         yield _size(free)
-        if _odds(best, frame, free) < _FOUND or best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT:
+        if (
+            _odds(best, frame, free) < _FOUND
+            or best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT
+        ):
             return None
         constant = yield from _constant(frame, free, levels, best, widths)
-        if not constant or not (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))):
+        if not constant or not (
+            yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))
+        ):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
     later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)
@@ -110,7 +124,9 @@ def find_drift(
         return DriftFound((later,), best.width * widths, within.spread_s)
     always, _, _ = yield from _improved(poses, prior, factors, widths, frame, only=np.zeros(1))
     noise = _remaining_noise(frame, frame.columns(best.onset_s).reshape(-1, 6), best)
-    odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(within.width_s / float(poses.times_s[-1]))
+    odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(
+        within.width_s / float(poses.times_s[-1])
+    )
     share = 1.0 / (1.0 + math.exp(min(odds, 700.0)))
     both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
     likely = tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT)
@@ -119,7 +135,9 @@ def find_drift(
 
 @value_class
 class DrivenHypothesis:
-    """The fit with a drift since some instant, its probability, and the 1 sigma of the instant [s], 0 for the epoch."""
+    """The fit with a drift since some instant, its probability, and the 1 sigma of the instant [s],
+    0 for the epoch.
+    """
 
     fitted: DrivenFit
     weight: float
@@ -132,7 +150,8 @@ class DriftFound:
 
     Attributes:
         hypotheses: on its onset, the most likely first.
-        widths: (6,) prior 1 sigma of its size.  onset_1s_s: 1 sigma of the onset over all instants that were tried [s].
+        widths: (6,) prior 1 sigma of its size.
+        onset_1s_s: 1 sigma of the onset over all instants that were tried [s].
     """
 
     hypotheses: tuple[DrivenHypothesis, ...]
@@ -142,10 +161,11 @@ class DriftFound:
 
 @value_class
 class _Found:
-    """Log odds of a drift since ``onset_s``, its most likely size u (6,), the fit's step y, and its most likely prior.
+    """Log odds of a drift since ``onset_s``, its most likely size u (6,), the fit's step y, and its
+    most likely prior.
 
-    ``width`` is the 1 sigma of that prior over the given one, ``noise`` the factor on the variance of the poses, and
-    ``gain`` the decrease of the cost in the log odds.
+    ``width`` is the 1 sigma of that prior over the given one, ``noise`` the factor on the variance
+    of the poses, and ``gain`` the decrease of the cost in the log odds.
     """
 
     log_odds: float
@@ -165,24 +185,35 @@ def _improved(
     begin: DrivenFit,
     only: Array | None = None,
 ) -> Parts[tuple[DrivenFit, list[_Found], Array]]:
-    """The best joint fit with any onset and kind of acceleration, and the drifts from each onset (n,) on about it.
+    """The best joint fit with any onset and kind of acceleration, and the drifts from each onset
+    (n,) on about it.
 
-    About each fit the most likely onset and kind of the linearised problem are those of the next one. ``only``: the
-    onsets that are tried.
+    About each fit the most likely onset and kind of the linearised problem are those of the next
+    one. ``only``: the onsets that are tried.
     """
     frame = begin
     for k in range(_ROUNDS + 1):
-        onsets = _onsets(frame.points.times_s, frame.onset_s if k else None) if only is None else only
+        onsets = (
+            _onsets(frame.points.times_s, frame.onset_s if k else None) if only is None else only
+        )
         found = _compared(frame, onsets, widths)
         best = max(found, key=lambda f: f.log_odds)
-        same = frame.along and best.onset_s == frame.onset_s and bool(np.array_equal(best.u != 0.0, frame.u != 0.0))
+        same = (
+            frame.along
+            and best.onset_s == frame.onset_s
+            and bool(np.array_equal(best.u != 0.0, frame.u != 0.0))
+        )
         if best.log_odds < _FOUND or same or k == _ROUNDS:
             break
         open_ = np.where(best.u != 0.0, widths, 0.0)
         start = np.where(best.u != 0.0, frame.u, 0.0)
-        closer = yield from fit_jointly(poses, frame.chart, prior, factors, best.onset_s, start, open_)
+        closer = yield from fit_jointly(
+            poses, frame.chart, prior, factors, best.onset_s, start, open_
+        )
         yield _size(closer)
-        if closer.cost > frame.cost - _LEAST_GAIN and (only is None or k):  # the first of given onsets may be worse
+        if closer.cost > frame.cost - _LEAST_GAIN and (
+            only is None or k
+        ):  # the first of given onsets may be worse
             break
         frame = closer
     return frame, found, onsets
@@ -193,8 +224,8 @@ def _from_sphere(
 ) -> Parts[DrivenFit]:
     """The joint fit of a torque since the first pose that begins with a sphere at a constant rate.
 
-    In the fit of free motion a wrong inertia explains a part of the torque. A descent from there may end in a local
-    minimum.
+    In the fit of free motion a wrong inertia explains a part of the torque. A descent from there
+    may end in a local minimum.
     """
     start, torque = to_chart(rough_state(fixes)), np.append(widths[:3], np.zeros(3))
     return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
@@ -205,15 +236,20 @@ def _size(fitted: DrivenFit) -> int:
     return 12 * len(fitted.points) + len(fitted.poses)
 
 
-def _constant(frame: DrivenFit, free: DrivenFit, levels: NoiseLevels, best: _Found, widths: Array) -> Parts[bool]:
+def _constant(
+    frame: DrivenFit, free: DrivenFit, levels: NoiseLevels, best: _Found, widths: Array
+) -> Parts[bool]:
     """Return whether a constant disturbance alone explains the poses better than random ones do."""
     random = yield from _evidence(free, levels, best, None)
     constant = yield from _evidence(frame, levels, best, widths)
     return constant - random >= _CONSTANT
 
 
-def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None) -> Parts[float]:
-    """Log likelihood of the poses with a constant disturbance, or with random ones of the same kind.
+def _evidence(
+    frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None
+) -> Parts[float]:
+    """Log likelihood of the poses with a constant disturbance, or with random ones of the same
+    kind.
 
     ``widths`` is the prior of the constant one; None for random ones.
     """
@@ -230,9 +266,11 @@ def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Arra
 
 
 def _odds(best: _Found, frame: DrivenFit, free: DrivenFit) -> float:
-    """Log odds of a drift by Laplace's approximation about the minimum with it and that of free motion.
+    """Log odds of a drift by Laplace's approximation about the minimum with it and that of free
+    motion.
 
-    A linear problem about one of them does not reach the other. The odds are at most the decrease of the cost.
+    A linear problem about one of them does not reach the other. The odds are at most the decrease
+    of the cost.
     """
     decrease = free.cost - frame.cost
     return min(best.log_odds - best.gain + decrease / best.noise, decrease)
@@ -277,7 +315,9 @@ def _onsets(times_s: Array, near_s: float | None = None) -> Array:
 
 
 def _compared(frame: DrivenFit, onsets: Array, widths: Array) -> list[_Found]:
-    """The most likely drift from each onset on, with the claimed noise, then with that of the residuals without it."""
+    """The most likely drift from each onset on, with the claimed noise, then with that of the
+    residuals without it.
+    """
     n, times = len(frame.points), frame.points.times_s
     B = frame.equivalents(np.concatenate([times, onsets]))
     here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
@@ -292,25 +332,38 @@ def _compared(frame: DrivenFit, onsets: Array, widths: Array) -> list[_Found]:
 
 def _products(frame: DrivenFit, columns: Array) -> tuple[Array, ...]:
     back = np.swapaxes(columns, 1, 2)
-    return frame.J.T @ frame.J, frame.J.T @ frame.e, frame.J.T @ columns, back @ columns, back @ frame.e
+    return (
+        frame.J.T @ frame.J,
+        frame.J.T @ frame.e,
+        frame.J.T @ columns,
+        back @ columns,
+        back @ frame.e,
+    )
 
 
 def _step_odds(frame: DrivenFit, params: EstimatorParams, noise: float) -> float:
-    """Log odds over free motion of the most likely single change of the velocities: it may explain the poses better."""
+    """Log odds over free motion of the most likely single change of the velocities.
+
+    It may explain the poses better.
+    """
     times, widths = frame.points.times_s, _SMALL * np.repeat(params.change_1s, 3)
     instants = 0.5 * (times[1:] + times[:-1])
-    found = _explained(frame, _products(frame, step_columns(frame, instants)), instants, widths, noise)
+    found = _explained(
+        frame, _products(frame, step_columns(frame, instants)), instants, widths, noise
+    )
     return max(f.log_odds for f in found)
 
 
 def _explained(
     linear: DrivenFit, products: tuple[Array, ...], onsets: Array, widths: Array, inflation: float
 ) -> list[_Found]:
-    """The drift since each onset: the kind with the greatest evidence. ``inflation`` is on the variance of the poses.
+    """The drift since each onset: the kind with the greatest evidence. ``inflation`` is on the
+    variance of the poses.
 
     Args:
         linear: residuals e and their Jacobian J.
-        products: J' J, J' e, J' D (k, 20, 6), D' D (k, 6, 6), D' e (k, 6); D: effects of a drift since each onset.
+        products: J' J, J' e, J' D (k, 20, 6), D' D (k, 6, 6), D' e (k, 6); D: effects of a drift
+            since each onset.
         onsets: (k,) [s].
         widths: (6,) prior 1 sigma of torque and force.
         inflation: factor on the variance of the poses for errors that are correlated in time.
@@ -322,7 +375,9 @@ def _explained(
     tried, odds = [], []
     for (kind, prior_odds), width in product(zip(_KINDS, _PER_KIND, strict=True), _WIDTHS):
         scaled = width * widths[kind]
-        own = np.linalg.inv(precision[:, kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled)))
+        own = np.linalg.inv(
+            precision[:, kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled))
+        )
         b = rhs[:, kind] * scaled
         v = (own @ b[:, :, None])[:, :, 0]
         gain = 0.5 * (v * b).sum(axis=1)
@@ -334,12 +389,16 @@ def _explained(
         u = np.zeros(6)
         u[kind] = size[k]
         y = -solve @ (g + cross[k] @ u)
-        found.append(_Found(float(odds[best][k]), float(onsets[k]), u, y, width, inflation, float(gain[k])))
+        found.append(
+            _Found(float(odds[best][k]), float(onsets[k]), u, y, width, inflation, float(gain[k]))
+        )
     return found
 
 
 def _remaining_noise(linear: DrivenFit, columns: Array, best: _Found) -> float:
-    """Variance of the white residuals with the drift removed, times their integrated autocorrelation."""
+    """Variance of the white residuals with the drift removed, times their integrated
+    autocorrelation.
+    """
     left = (linear.e + linear.J @ best.y + columns @ best.u).reshape(-1, 6)
     dof = max(left.size - 26, 6)
     blocks = [integrated_autocorrelation(left[:, k : k + 3]) for k in (0, 3)]

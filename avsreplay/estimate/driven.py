@@ -1,9 +1,11 @@
-"""A constant torque and a constant force as a part of the motion: its prediction, correction and forecast.
+"""A constant torque and a constant force as a part of the motion: its prediction, correction and
+forecast.
 
-The torque gives a constant angular acceleration of the body, in {C} because the fixture is known and the principal axes
-are not, and the force one of the centre of mass in {A}. The six are constant unknowns beside the 20 states. Their
-covariance with the states is propagated, so that the prediction contains their uncertainty and each pose corrects them
-(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 4).
+The torque gives a constant angular acceleration of the body, in {C} because the fixture is known
+and the principal axes are not, and the force one of the centre of mass in {A}. The six are constant
+unknowns beside the 20 states. Their covariance with the states is propagated, so that the
+prediction contains their uncertainty and each pose corrects them (Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 2001, section 4).
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ class DrivenBelief(Belief):
     """A belief about a body on which a constant torque or force acts.
 
     Attributes:
-        u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}.  P_u: (6, 6) its covariance.
+        u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}.
+        P_u: (6, 6) its covariance.
         cross: (20, 6) covariance of the error states with that of u.
     """
 
@@ -66,9 +69,11 @@ class DrivenHistory:
     """The motion with a constant acceleration at n instants.
 
     Attributes:
-        q: (n, 4) attitude q_ab.  w: (n, 3) rate in {B} [rad/s].
+        q: (n, 4) attitude q_ab.
+        w: (n, 3) rate in {B} [rad/s].
         r, v: (n, 3) centre of mass [m] and its velocity [m/s].
-        Phi: (n, 20, 20) derivative of the error states by those at the start.  by_u: (n, 20, 6) by the acceleration.
+        Phi: (n, 20, 20) derivative of the error states by those at the start.
+        by_u: (n, 20, 6) by the acceleration.
     """
 
     q: Array
@@ -103,7 +108,9 @@ def propagated(
     h, x, u = seconds_to(belief, t_ns), belief.x, belief.u
     arc = None if orbit is None else orbit.at(belief.t_ns)
     step = flow(x.w_b, x.sigma, h, torque, drive_of(x, u))
-    Phi, by_u = (M[0] for M in _derivatives(x, u, np.array([h]), [transition(step, x.sigma, h, arc)]))
+    Phi, by_u = (
+        M[0] for M in _derivatives(x, u, np.array([h]), [transition(step, x.sigma, h, arc)])
+    )
     P = _covariance(belief, Phi, by_u)
     if h > 0.0:
         P += process_noise(step.Q[None], np.array([h]), force)[0]
@@ -115,20 +122,26 @@ def propagated(
 def driven_steps(
     belief: Belief, times_s: Array, torque: float, arc: OrbitArc | None
 ) -> tuple[list[State], Array, Array, Array]:
-    """The motion of a belief to ``times_s`` (n,) [s], with the disturbance torque of this root density.
+    """The motion of a belief to ``times_s`` (n,) [s], with the disturbance torque of this root
+    density.
 
     Returns:
-        The states, Phi (n, 20, 20), the derivative (n, 20, 6) by a constant acceleration, 0 where the belief has none,
-        and the covariance (n, 6, 6) that the torque adds to (dq_v, w).
+        The states, Phi (n, 20, 20), the derivative (n, 20, 6) by a constant acceleration, 0 where
+        the belief has none, and the covariance (n, 6, 6) that the torque adds to (dq_v, w).
     """
     x, u = belief.x, belief.u if isinstance(belief, DrivenBelief) else None
     q, w, S, Q = flows(x.w_b, x.sigma, times_s, torque, drive_in(belief))
     q_ab, (centre, velocity) = np.array(hamilton(x.q_ab, q.T)).T, translated(x, times_s, arc)
     fixed = np.tile(x.flat[13:], (len(times_s), 1))
     if u is not None:
-        centre, velocity = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
+        centre, velocity = (
+            centre + 0.5 * times_s[:, None] ** 2 * u[3:],
+            velocity + times_s[:, None] * u[3:],
+        )
     states = [State.of(flat) for flat in np.hstack([q_ab, w, centre, velocity, fixed])]
-    Phi = _transitions(np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2), times_s, arc)
+    Phi = _transitions(
+        np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2), times_s, arc
+    )
     if u is None:
         return states, Phi, np.zeros((len(times_s), DIM, 6)), Q
     return states, *_derivatives(x, u, times_s, Phi), Q
@@ -146,13 +159,19 @@ def _transitions(S: Array, times_s: Array, arc: OrbitArc | None) -> Array:
     return Phi
 
 
-def driven_history(x: State, u: Array | None, times_s: Array, arc: OrbitArc | None) -> DrivenHistory:
-    """The motion from ``x`` with a constant acceleration u (6,), or free motion, to ``times_s`` (n,) [s], ascending."""
+def driven_history(
+    x: State, u: Array | None, times_s: Array, arc: OrbitArc | None
+) -> DrivenHistory:
+    """The motion from ``x`` with a constant acceleration u (6,), or free motion, to ``times_s``
+    (n,) [s], ascending.
+    """
     path = rotation_history(x, times_s, NO_DRIVE if u is None else drive_of(x, u))
     centre, velocity = translated(x, times_s, arc)
     Phi = _transitions(path.S, times_s, arc)
     if u is None:
-        return DrivenHistory(path.q, path.w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6)))
+        return DrivenHistory(
+            path.q, path.w, centre, velocity, Phi, np.zeros((len(times_s), DIM, 6))
+        )
     pushed = centre + 0.5 * times_s[:, None] ** 2 * u[3:], velocity + times_s[:, None] * u[3:]
     return DrivenHistory(path.q, path.w, *pushed, *_derivatives(x, u, times_s, Phi))
 
@@ -168,8 +187,11 @@ def _covariance(belief: DrivenBelief, Phi: Array, by_u: Array) -> Array:
     return np.asarray(Phi @ belief.P @ Phi.T + across + across.T + by_u @ belief.P_u @ by_u.T)
 
 
-def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array] | Array) -> tuple[Array, Array]:
-    """Phi (n, 20, 20), completed by the effect of mu, and the derivative (n, 20, 6) of the states by u.
+def _derivatives(
+    x: State, u: Array, times_s: Array, Phi: list[Array] | Array
+) -> tuple[Array, Array]:
+    """Phi (n, 20, 20), completed by the effect of mu, and the derivative (n, 20, 6) of the states
+    by u.
 
     u is given in {C} and acts in {B}: R(mu) u, with R(dmu mu) = (1 + 2 [dmu x]) R(mu).
 
@@ -209,19 +231,25 @@ def corrected(prior: DrivenBelief, then: Belief, H: Array, S: Array, alpha: Arra
 
 
 def driven_moments(parts: Sequence[tuple[float, DrivenBelief]]) -> DrivenBelief:
-    """Mean and covariance of a mixture of beliefs at one instant, given by weight and belief, the heaviest first."""
+    """Mean and covariance of a mixture of beliefs at one instant, given by weight and belief, the
+    heaviest first.
+    """
     first, here = parts[0][1], to_chart(parts[0][1].x)
     if len(parts) == 1:
         return first
     T, P, mean = to_errors(here), np.zeros((DIM + 6, DIM + 6)), np.zeros(DIM + 6)
-    off = [np.concatenate([T @ to_chart(each.x).minus(here), each.u - first.u]) for _, each in parts]
+    off = [
+        np.concatenate([T @ to_chart(each.x).minus(here), each.u - first.u]) for _, each in parts
+    ]
     for (weight, _), d in zip(parts, off, strict=True):
         mean += weight * d
     for (weight, each), d in zip(parts, off, strict=True):
         own = np.block([[each.P, each.cross], [each.cross.T, each.P_u]])
         P += weight * (own + np.outer(d - mean, d - mean))
     x = to_state(here.moved(np.asarray(np.linalg.solve(T, mean[:DIM]), dtype=np.float64)))
-    return DrivenBelief(first.t_ns, x, P[:DIM, :DIM], first.u + mean[DIM:], P[DIM:, DIM:], P[:DIM, DIM:])
+    return DrivenBelief(
+        first.t_ns, x, P[:DIM, :DIM], first.u + mean[DIM:], P[DIM:, DIM:], P[:DIM, DIM:]
+    )
 
 
 def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:
@@ -241,12 +269,15 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     J = grasp_jacobian(rotations, np.array([x.w_b for x in states]), belief.x.c_b)
     variances, noise = np.empty((len(times_s), 9)), process_noise(Q, times_s, force)
     for k in range(len(times_s)):
-        variances[k] = np.diagonal(J[k] @ (_covariance(belief, Phi[k], by_u[k]) + noise[k]) @ J[k].T)
+        variances[k] = np.diagonal(
+            J[k] @ (_covariance(belief, Phi[k], by_u[k]) + noise[k]) @ J[k].T
+        )
     return forecast_of(times_s, variances.reshape(-1, 3, 3).sum(axis=2))
 
 
 def impulses(x: State, times_s: Array, drive: Triple = NO_DRIVE) -> Array:
-    """Errors (n, 6, 3) of (dq_v, w) at 0 that equal a unit of rate in {B} at each of ``times_s`` (n,) [s].
+    """Errors (n, 6, 3) of (dq_v, w) at 0 that equal a unit of rate in {B} at each of ``times_s``
+    (n,) [s].
 
     ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
@@ -259,7 +290,9 @@ def impulses(x: State, times_s: Array, drive: Triple = NO_DRIVE) -> Array:
     return found
 
 
-def drift_equivalents(x: State, times_s: Array, onset_s: float = 0.0, drive: Triple = NO_DRIVE) -> Array:
+def drift_equivalents(
+    x: State, times_s: Array, onset_s: float = 0.0, drive: Triple = NO_DRIVE
+) -> Array:
     """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
 
     Args:
@@ -269,7 +302,8 @@ def drift_equivalents(x: State, times_s: Array, onset_s: float = 0.0, drive: Tri
         drive: that acceleration in {B} [rad/s2].
 
     Returns:
-        B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the acceleration in {A}.
+        B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the
+        acceleration in {A}.
     """
     last = float(times_s.max())
     count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _STEP_RAD))
@@ -305,18 +339,29 @@ def followed(
         arc: the orbit; None for free motion.
 
     Returns:
-        The motion at these instants, and its derivatives (n, 20, 27) by chart steps, acceleration and onset.
+        The motion at these instants, and its derivatives (n, 20, 27) by chart steps, acceleration
+        and onset.
     """
-    first, T, x = int(np.searchsorted(times_s, onset_s, side="right")), to_errors(chart), to_state(chart)
+    first, T, x = (
+        int(np.searchsorted(times_s, onset_s, side="right")),
+        to_errors(chart),
+        to_state(chart),
+    )
     D = np.zeros((len(times_s), DIM, DIM + 7))
     free = driven_history(x, None, np.append(times_s[:first], onset_s), arc)
     D[:first, :, :DIM], until = free.Phi[:-1] @ T, free.Phi[-1] @ T
     if first == len(times_s):
         return free, D
     at = replace(x, q_ab=free.q[-1], w_b=free.w[-1], r_a=free.r[-1], v_a=free.v[-1])
-    late = driven_history(at, u, times_s[first:] - onset_s, None if arc is None else arc.shifted(onset_s))
+    late = driven_history(
+        at, u, times_s[first:] - onset_s, None if arc is None else arc.shifted(onset_s)
+    )
     missed = np.zeros(DIM)  # per second by which the onset is later
     missed[W], missed[VEL] = -np.array(drive_of(at, u)), -u[3:]
-    D[first:, :, :DIM], D[first:, :, DIM:-1], D[first:, :, -1] = late.Phi @ until, late.by_u, late.Phi @ missed
+    D[first:, :, :DIM], D[first:, :, DIM:-1], D[first:, :, -1] = (
+        late.Phi @ until,
+        late.by_u,
+        late.Phi @ missed,
+    )
     parts = zip(*((p.q, p.w, p.r, p.v, p.Phi, p.by_u) for p in (free, late)), strict=True)
     return DrivenHistory(*(np.concatenate([a[:-1], b]) for a, b in parts)), D

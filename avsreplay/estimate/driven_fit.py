@@ -1,7 +1,9 @@
-"""Free motion that fits all poses with a constant torque or force removed, and what depends on it linearly.
+"""Free motion that fits all poses with a constant torque or force removed, and what depends on it
+linearly.
 
-The acceleration is removed from the poses, and free motion (``batch``) is fitted to the poses as they would be without
-it. About this fit the problem is linear in the initial values, the acceleration and its onset.
+The acceleration is removed from the poses, and free motion (``batch``) is fitted to the poses as
+they would be without it. About this fit the problem is linear in the initial values, the
+acceleration and its onset.
 """
 
 from __future__ import annotations
@@ -19,7 +21,12 @@ from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents, drive_of
 from avsreplay.estimate.dynamics import translated
 from avsreplay.estimate.error_state import DIM, REACHED
-from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, pose_error_covariance
+from avsreplay.estimate.noise_levels import (
+    MOST_POINTS,
+    NoiseLevels,
+    estimate_levels,
+    pose_error_covariance,
+)
 from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -36,12 +43,18 @@ class DrivenFit:
     Attributes:
         poses, points: with the effect of the acceleration removed, and normal points of them.
         about: initial values of the motion about which it is removed.
-        chart: of the fit.  problem: the cost of the points, linearised there.  cost: half chi-square of the fit.
-        onset_s: since the epoch [s].  u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}; zero for free motion.
-        e, J: white residuals (6n,), extrapolated to no acceleration, and their Jacobian (6n, 20) in the chart.
+        chart: of the fit.
+        problem: the cost of the points, linearised there.
+        cost: half chi-square of the fit.
+        onset_s: since the epoch [s].
+        u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}; zero for free motion.
+        e, J: white residuals (6n,), extrapolated to no acceleration, and their Jacobian (6n, 20) in
+            the chart.
         G: (n, 6, 12) Jacobian by attitude to velocity at the epoch.
-        info, off: information (20, 20) of the prior and its product with the offset from the prior's mean.
-        along: e, J and G are linearised about the motion with the acceleration; else about free motion.
+        info, off: information (20, 20) of the prior and its product with the offset from the
+            prior's mean.
+        along: e, J and G are linearised about the motion with the acceleration; else about free
+            motion.
     """
 
     poses: Poses
@@ -62,16 +75,26 @@ class DrivenFit:
     def equivalents(self, times_s: Array) -> Array:
         """``equivalents`` about the motion about which this is linearised."""
         return (
-            equivalents(self.chart, times_s, self.onset_s, self.u) if self.along else equivalents(self.chart, times_s)
+            equivalents(self.chart, times_s, self.onset_s, self.u)
+            if self.along
+            else equivalents(self.chart, times_s)
         )
 
     def columns(self, onset_s: float) -> Array:
         """White columns (n, 6, 6) of the residuals by an acceleration since an onset."""
-        return _columns(self.G, self.equivalents(np.append(self.points.times_s, onset_s)), self.points.times_s, onset_s)
+        return _columns(
+            self.G,
+            self.equivalents(np.append(self.points.times_s, onset_s)),
+            self.points.times_s,
+            onset_s,
+        )
 
 
-def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array) -> Parts[DrivenFit]:
-    """Fit all poses with a given acceleration, in parts. The fit need not converge where another one acts.
+def fit_driven(
+    poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array
+) -> Parts[DrivenFit]:
+    """Fit all poses with a given acceleration, in parts. The fit need not converge where another
+    one acts.
 
     Args:
         poses: the measurements.
@@ -91,22 +114,43 @@ def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s
         e = e - drift_columns(G, points.times_s, chart, onset_s) @ u
     info = prior.info
     off, J = info @ chart.minus(prior.mean), (H @ to_errors(chart)).reshape(e.size, -1)
-    return DrivenFit(poses, points, start, chart, problem, fitted.half_chi2, onset_s, u, e.reshape(-1), J, G, info, off)
+    return DrivenFit(
+        poses,
+        points,
+        start,
+        chart,
+        problem,
+        fitted.half_chi2,
+        onset_s,
+        u,
+        e.reshape(-1),
+        J,
+        G,
+        info,
+        off,
+    )
 
 
-def without_drift(poses: Poses, about: Chart, onset_s: float, u: Array, back: bool = False) -> Poses:
-    """The poses as they would be without the acceleration u (6,) since ``onset_s``, about the motion from ``about``.
+def without_drift(
+    poses: Poses, about: Chart, onset_s: float, u: Array, back: bool = False
+) -> Poses:
+    """The poses as they would be without the acceleration u (6,) since ``onset_s``, about the
+    motion from ``about``.
 
-    They have the same errors in {C}, relative to free motion, as the poses relative to that with u. ``back``: the
-    inverse.
+    They have the same errors in {C}, relative to free motion, as the poses relative to that with u.
+    ``back``: the inverse.
     """
     centre = translated(to_state(about), poses.times_s, poses.arc)[0]
     motions = about.flat, u, onset_s, poses.times_s, centre
     return poses.moved(*_motion.without_drift(*motions, poses.q, poses.t, back))
 
 
-def equivalents(chart: Chart, times_s: Array, onset_s: float = 0.0, u: Array = NO_ACCELERATION) -> Array:
-    """``drift_equivalents`` (n, 12, 6) of unit accelerations in {C} and in {A}, about a motion with u (6,)."""
+def equivalents(
+    chart: Chart, times_s: Array, onset_s: float = 0.0, u: Array = NO_ACCELERATION
+) -> Array:
+    """``drift_equivalents`` (n, 12, 6) of unit accelerations in {C} and in {A}, about a motion with
+    u (6,).
+    """
     x = to_state(chart)
     B = drift_equivalents(x, times_s, onset_s, drive_of(x, u))
     B[:, :, :3] = B[:, :, :3] @ geometry.matrix(x.q_bc)
@@ -114,7 +158,9 @@ def equivalents(chart: Chart, times_s: Array, onset_s: float = 0.0, u: Array = N
 
 
 def drift_columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Array:
-    """White columns (n, 6, 6) of the residuals by an acceleration since the onset, about free motion."""
+    """White columns (n, 6, 6) of the residuals by an acceleration since the onset, about free
+    motion.
+    """
     return _columns(G, equivalents(chart, np.append(times_s, onset_s)), times_s, onset_s)
 
 
@@ -123,22 +169,30 @@ def _columns(G: Array, B: Array, times_s: Array, onset_s: float) -> Array:
 
 
 def step_columns(fitted: DrivenFit, instants_s: Array) -> Array:
-    """White columns (k, 6n, 6) of the residuals by a change of rate and velocity at each instant (k,), about the fit.
+    """White columns (k, 6n, 6) of the residuals by a change of rate and velocity at each instant
+    (k,), about the fit.
 
-    Such a change is a large acceleration for a short time: its effect is the derivative of that of an acceleration
-    by its onset.
+    Such a change is a large acceleration for a short time: its effect is the derivative of that of
+    an acceleration by its onset.
     """
-    B, k = fitted.equivalents(np.concatenate([instants_s - _HALF_S, instants_s + _HALF_S])), len(instants_s)
+    B, k = (
+        fitted.equivalents(np.concatenate([instants_s - _HALF_S, instants_s + _HALF_S])),
+        len(instants_s),
+    )
     columns = fitted.G.reshape(-1, fitted.G.shape[2]) @ ((B[k:] - B[:k]) / (2.0 * _HALF_S))
-    return np.asarray(columns * (np.repeat(fitted.points.times_s, 6) > instants_s[:, None])[:, :, None])
+    return np.asarray(
+        columns * (np.repeat(fitted.points.times_s, 6) > instants_s[:, None])[:, :, None]
+    )
 
 
 def poor_fit(frame: DrivenFit, factors: Array, levels: NoiseLevels) -> bool:
-    """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 % confidence.
+    """Return whether the noise of the poses does not explain the residuals of a fit, with 99.9 %
+    confidence.
 
-    The noise is at least as claimed. Errors of near views are correlated, so that the squared residuals are not
-    chi-square. Their sum is approximated by the multiple of a chi-square value that has its mean and variance
-    (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by Wilson and Hilferty.
+    The noise is at least as claimed. Errors of near views are correlated, so that the squared
+    residuals are not chi-square. Their sum is approximated by the multiple of a chi-square value
+    that has its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946), the quantile by
+    Wilson and Hilferty.
     """
     white, common = ((max(1.0, a), max(1.0, b)) for a, b in (levels.white, levels.common))
     V = pose_error_covariance(frame.points, NoiseLevels(white, common), factors)
@@ -157,7 +211,8 @@ def levels_of(
     fixed: tuple[float | None, float | None],
     positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
-    """Noise levels from the residuals of the poses about the motion with the acceleration, in parts.
+    """Noise levels from the residuals of the poses about the motion with the acceleration, in
+    parts.
 
     Args:
         fitted: the fit.
@@ -171,13 +226,18 @@ def levels_of(
     points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS, scatter=True)
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
-    return (yield from estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions))
+    return (
+        yield from estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions)
+    )
 
 
 def drift_unknowns(
     fitted: DrivenFit, points: Poses, problem: Problem, widths: Array, kinds: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """The acceleration as unknowns of ``disturbed_likelihood``: columns at the prior 1 sigma ``widths``, and size."""
+    """The acceleration as unknowns of ``disturbed_likelihood``.
+
+    Columns at the prior 1 sigma ``widths``, and size.
+    """
     G = problem.core.rows()[1][:, :, :REACHED]
     columns = drift_columns(G, points.times_s, fitted.chart, fitted.onset_s) * widths
     return columns[:, :, kinds], (fitted.u / widths)[kinds]

@@ -1,7 +1,9 @@
-"""The motion with a constant torque or force that fits all poses, and the belief at the last of them.
+"""The motion with a constant torque or force that fits all poses, and the belief at the last of
+them.
 
-Initial values and acceleration are fitted together. One pass of a Kalman filter over the poses, with the disturbances
-between them, gives the joint mean and covariance of the initial values, the acceleration and its onset.
+Initial values and acceleration are fitted together. One pass of a Kalman filter over the poses,
+with the disturbances between them, gives the joint mean and covariance of the initial values, the
+acceleration and its onset.
 """
 
 from __future__ import annotations
@@ -28,23 +30,51 @@ from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
-_PASSES, _SMALL = 10, 0.1  # most linearisations; size of a step, in 1 sigma, after which none follows
-_NEAR = 0.5  # size of the first step, in 1 sigma, below which the joint fit is the mean: the likelihood is bent there
-_LAST_STEPS, _LAST_GAIN = 20, 0.004  # most steps of a descent from a motion that is near; least decrease: 0.1 sigma
-_JOINT_STEPS, _LEAST_GAIN = 60, 0.05  # most steps of a joint fit; decrease of its cost below which it ends
-_COARSE = 0.1  # the same as a share of the cost, while the normal points are those of a motion that is still far away
+_PASSES, _SMALL = (
+    10,
+    0.1,
+)  # most linearisations; size of a step, in 1 sigma, after which none follows
+# size of the first step, in 1 sigma, below which the joint fit is the mean: the likelihood is bent
+# there
+_NEAR = 0.5
+_LAST_STEPS, _LAST_GAIN = (
+    20,
+    0.004,
+)  # most steps of a descent from a motion that is near; least decrease: 0.1 sigma
+_JOINT_STEPS, _LEAST_GAIN = (
+    60,
+    0.05,
+)  # most steps of a joint fit; decrease of its cost below which it ends
+# the same as a share of the cost, while the normal points are those of a motion that is still far
+# away
+_COARSE = 0.1
 _DAMPING, _MOST_DAMPING = 1e-3, 1e8  # damping of Levenberg-Marquardt: first value, largest value
-_PIN, _PIN_STEPS, _LEAST_RISE = 0.1, 20, 1.0  # profile: 1 sigma of the pin, most steps, least increase (2 if Gaussian)
+_PIN, _PIN_STEPS, _LEAST_RISE = (
+    0.1,
+    20,
+    1.0,
+)  # profile: 1 sigma of the pin, most steps, least increase (2 if Gaussian)
 _JOINT_WORK = 4  # work of a step for each pose, in linearised poses
-_U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
+_U, _ONSET = (
+    slice(DIM, DIM + 6),
+    DIM + 6,
+)  # the acceleration and its onset after the 20 initial values
 
 
 def fit_jointly(
-    poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array, widths: Array
+    poses: Poses,
+    start: Chart,
+    prior: Prior,
+    factors: Array,
+    onset_s: float,
+    u: Array,
+    widths: Array,
 ) -> Parts[DrivenFit]:
-    """Fit initial values and acceleration together by Levenberg-Marquardt along the motion with both, in parts.
+    """Fit initial values and acceleration together by Levenberg-Marquardt along the motion with
+    both, in parts.
 
-    Where a wrong inertia makes up for a part of the acceleration, estimates of them in turn stop far from the minimum.
+    Where a wrong inertia makes up for a part of the acceleration, estimates of them in turn stop
+    far from the minimum.
 
     Args:
         poses: the measurements.
@@ -56,9 +86,16 @@ def fit_jointly(
         widths: (6,) prior 1 sigma of the acceleration, zero for a component that is zero.
     """
     chart, left = start, _JOINT_STEPS
-    for last in (False, False, True):  # the normal points are formed about a better motion each time
+    for last in (
+        False,
+        False,
+        True,
+    ):  # the normal points are formed about a better motion each time
         points = normal_points(without_drift(poses, chart, onset_s, u), chart, factors)
-        seen, last = without_drift(points, chart, onset_s, u, back=True), last or len(points) == len(poses)
+        seen, last = (
+            without_drift(points, chart, onset_s, u, back=True),
+            last or len(points) == len(poses),
+        )
         joint = _joint(seen, prior, factors, onset_s, widths)
         joint.linearise(chart.flat, u)
         yield _JOINT_WORK * len(seen)
@@ -73,11 +110,20 @@ def fit_jointly(
 
 
 def _joint(
-    seen: Poses, prior: Prior, factors: Array, onset_s: float, widths: Array, slack: float | None = None
+    seen: Poses,
+    prior: Prior,
+    factors: Array,
+    onset_s: float,
+    widths: Array,
+    slack: float | None = None,
 ) -> _motion.Driven:
-    """The cost of initial values and an acceleration, with Huber's weights, or Cauchy's where ``slack`` is given."""
+    """The cost of initial values and an acceleration, with Huber's weights, or Cauchy's where
+    ``slack`` is given.
+    """
     mean = prior.mean.flat
-    core = _motion.Driven(seen.times_s, seen.q, seen.t, seen.root, seen.info, mean, prior.info, onset_s, widths)
+    core = _motion.Driven(
+        seen.times_s, seen.q, seen.t, seen.root, seen.info, mean, prior.info, onset_s, widths
+    )
     follow_orbit(core, seen)
     core.noise((float(factors[0]), float(factors[1])), slack is not None, slack or 1.0)
     return core
@@ -101,9 +147,10 @@ def _linear_fit(
 def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     """Return whether the standard deviations of the acceleration are not too small, in parts.
 
-    The acceleration is moved by two standard deviations in the direction in which it is known least, and the initial
-    values are fitted again (profile likelihood). Half the chi-square increases by 2 for a Gaussian distribution. It
-    increases less where other accelerations fit as well.
+    The acceleration is moved by two standard deviations in the direction in which it is known
+    least, and the initial values are fitted again (profile likelihood). Half the chi-square
+    increases by 2 for a Gaussian distribution. It increases less where other accelerations fit as
+    well.
 
     Args:
         fitted: a joint fit.
@@ -118,7 +165,10 @@ def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     P = np.linalg.inv(joint.normal()[0][np.ix_(open_, open_)])
     values, axes = np.linalg.eigh(P[DIM:, DIM:])
     step, row = np.zeros(_ONSET), np.zeros(6)
-    step[open_], row[open_[DIM:] - DIM] = P[:, DIM:] @ axes[:, -1] / math.sqrt(values[-1]), axes[:, -1]
+    step[open_], row[open_[DIM:] - DIM] = (
+        P[:, DIM:] @ axes[:, -1] / math.sqrt(values[-1]),
+        axes[:, -1],
+    )
     row /= _PIN * math.sqrt(values[-1])
     for side in (-2.0, 2.0):
         joint.measure(row, side / _PIN + float(row @ fitted.u))
@@ -129,10 +179,14 @@ def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     return True
 
 
-def _descended(joint: _motion.Driven, count: int, most: int, share: float, least: float = _LEAST_GAIN) -> Parts[int]:
-    """Descend to the minimum of a cost of ``count`` poses, and return the number of steps, at most ``most``.
+def _descended(
+    joint: _motion.Driven, count: int, most: int, share: float, least: float = _LEAST_GAIN
+) -> Parts[int]:
+    """Descend to the minimum of a cost of ``count`` poses, and return the number of steps, at most
+    ``most``.
 
-    The descent ends where the linearised cost decreases by less than ``least`` and this share of the cost.
+    The descent ends where the linearised cost decreases by less than ``least`` and this share of
+    the cost.
     """
     damping, steps = _DAMPING, 0
     while steps < most and damping < _MOST_DAMPING and joint.left > max(least, share * joint.cost):
@@ -147,11 +201,14 @@ class DrivenMotion:
 
     Attributes:
         levels: noise levels.
-        chart, u, onset_s: initial values, acceleration (6,) and onset [s], about which the problem is linearised.
-        seen: the poses, or their normal points.  scale: (2,) on their standard deviations.
+        chart, u, onset_s: initial values, acceleration (6,) and onset [s], about which the problem
+            is linearised.
+        seen: the poses, or their normal points.
+        scale: (2,) on their standard deviations.
         prior: of the initial values.
         inflation: (2,) of the noise for correlated errors.
-        v, P: (27,) steps of initial values, acceleration and onset by these poses, and their covariance (27, 27).
+        v, P: (27,) steps of initial values, acceleration and onset by these poses, and their
+            covariance (27, 27).
     """
 
     levels: NoiseLevels
@@ -176,7 +233,11 @@ class DrivenMotion:
         v, P = self.v, self.P
         if later is not None:
             v, P = _smoothed(self, later, float(self.seen.times_s[-1]), v, P)
-        chart, u, onset_s = self.chart.moved(v[:DIM]), self.u + v[_U], max(0.0, self.onset_s + float(v[_ONSET]))
+        chart, u, onset_s = (
+            self.chart.moved(v[:DIM]),
+            self.u + v[_U],
+            max(0.0, self.onset_s + float(v[_ONSET])),
+        )
         path, D = followed(chart, u, onset_s, np.array([(now_ns - epoch_ns) * 1e-9]), self.seen.arc)
         x = replace(to_state(chart), q_ab=path.q[0], w_b=path.w[0], r_a=path.r[0], v_a=path.v[0])
         C = D[0] @ P @ D[0].T
@@ -188,7 +249,8 @@ def driven_motion(
 ) -> Parts[DrivenMotion | None]:
     """The motion of a fit with an acceleration, with disturbances and an unknown onset, in parts.
 
-    The result is None where the steps do not become small: the problem is not linear about the motion found.
+    The result is None where the steps do not become small: the problem is not linear about the
+        motion found.
 
     Args:
         fitted: the fit.
@@ -199,11 +261,16 @@ def driven_motion(
     points, chart, u, onset_s = fitted.points, fitted.chart, fitted.u, fitted.onset_s
     prior, plain = fitted.problem.prior, levels.factors(mean_share(points))
     inflation = sandwich(Problem(points, prior, plain, chart, levels.slack), points, levels)[1]
-    seen, scale = without_drift(points, fitted.about, onset_s, u, back=True), plain * np.sqrt(inflation)
+    seen, scale = (
+        without_drift(points, fitted.about, onset_s, u, back=True),
+        plain * np.sqrt(inflation),
+    )
     before = np.zeros((_ONSET + 1, _ONSET + 1))
     before[:DIM, :DIM], before[_ONSET, _ONSET] = prior.P, onset_1s_s**2
     before[_U, _U] = np.diag(np.where(u != 0.0, widths, 0.0) ** 2)
-    motion = DrivenMotion(levels, chart, u, onset_s, seen, prior, scale, inflation, np.zeros(_ONSET + 1), before)
+    motion = DrivenMotion(
+        levels, chart, u, onset_s, seen, prior, scale, inflation, np.zeros(_ONSET + 1), before
+    )
     joint = _joint(seen, prior, scale, onset_s, np.where(u != 0.0, widths, 0.0), 1.0)
     joint.linearise(chart.flat, u)
     yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
@@ -228,8 +295,11 @@ def _size(v: Array, P: Array) -> float:
     return float((np.abs(v[open_]) / np.sqrt(np.diagonal(P)[open_])).max())
 
 
-def _smoothed(motion: DrivenMotion, seen: Poses, since_s: float, v: Array, P: Array) -> tuple[Array, Array]:
-    """Steps v (27,) of initial values, acceleration and onset with covariance P, from those before the poses.
+def _smoothed(
+    motion: DrivenMotion, seen: Poses, since_s: float, v: Array, P: Array
+) -> tuple[Array, Array]:
+    """Steps v (27,) of initial values, acceleration and onset with covariance P, from those before
+    the poses.
 
     ``since_s``: instant of the pose before the first one.
     """

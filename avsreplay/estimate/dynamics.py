@@ -1,8 +1,10 @@
-"""Torque-free motion in the inertia ratios (eq:dot_omega, Eq:F, Eq:G): state, transition matrix, noise, forecast.
+"""Torque-free motion in the inertia ratios (eq:dot_omega, Eq:F, Eq:G): state, transition matrix,
+noise, forecast.
 
-Rate, attitude, their derivatives and their noise come from one Taylor series, in the extension ``_motion``. The
-attitude block of the state transition matrix Phi is A(q_rel)' exactly. The extension differentiates by three
-independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigma2).
+Rate, attitude, their derivatives and their noise come from one Taylor series, in the extension
+``_motion``. The attitude block of the state transition matrix Phi is A(q_rel)' exactly. The
+extension differentiates by three independent sigma; ``transition`` applies the chain rule for
+sigma3(sigma1, sigma2).
 """
 
 from __future__ import annotations
@@ -66,8 +68,10 @@ class Flow:
     """The rotational part of a step.
 
     Attributes:
-        w: (3,) rate at the end, in {B} [rad/s].  q: (4,) attitude of {B} at the end relative to {B} at the start.
-        S: (6, 9) derivative of (dq_v, w) at the end with respect to (dq_v, w, s1, s2, s3) at the start.
+        w: (3,) rate at the end, in {B} [rad/s].
+        q: (4,) attitude of {B} at the end relative to {B} at the start.
+        S: (6, 9) derivative of (dq_v, w) at the end with respect to (dq_v, w, s1, s2, s3) at the
+            start.
         Q: (6, 6) covariance that the disturbance torque adds to (dq_v, w).
     """
 
@@ -78,12 +82,14 @@ class Flow:
 
 
 def flow(w: Array, sigma: Array, h: float, torque: float = 0.0, drive: Triple = NO_DRIVE) -> Flow:
-    """Rotation over h seconds (either sign) from rate ``w`` (3,); ``torque``: root density of eps_tau [rad/s^1.5].
+    """Rotation over h seconds (either sign) from rate ``w`` (3,); ``torque``: root density of
+    eps_tau [rad/s^1.5].
 
     ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
     Raises:
-        ValueError: an inertia ratio beyond -1 to 1, a rate or time that is not finite, or more than a million radians.
+        ValueError: an inertia ratio beyond -1 to 1, a rate or time that is not finite, or more than
+            a million radians.
     """
     q, w, S, Q = flows(w, sigma, np.array((h,)), torque, drive)
     return Flow(w[0], q[0], S[0], Q[0])
@@ -92,12 +98,15 @@ def flow(w: Array, sigma: Array, h: float, torque: float = 0.0, drive: Triple = 
 def flows(
     w: Array, sigma: Array, times_s: Array, torque: float = 0.0, drive: Triple = NO_DRIVE
 ) -> tuple[Array, Array, Array, Array]:
-    """Return q (n, 4), w (n, 3), S (n, 6, 9) and Q (n, 6, 6) of ``flow`` to each of ``times_s`` (n,) [s] in turn.
+    """Return q (n, 4), w (n, 3), S (n, 6, 9) and Q (n, 6, 6) of ``flow`` to each of ``times_s``
+    (n,) [s] in turn.
 
     Raises:
         ValueError: as ``flow``.
     """
-    return _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s, drive)
+    return _motion.follow(
+        IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s, drive
+    )
 
 
 def ratios(sigma: Array) -> Triple:
@@ -106,7 +115,10 @@ def ratios(sigma: Array) -> Triple:
 
 
 def torque_density(sigma: Array, torque: float) -> Triple:
-    """Variance that the disturbance torque adds to the rate per second [rad2/s3]: the diagonal of torque^2 B B'."""
+    """Variance that the disturbance torque adds to the rate per second [rad2/s3].
+
+    The diagonal of torque^2 B B'.
+    """
     if torque == 0.0:
         return 0.0, 0.0, 0.0
     x, y, z = disturbance(sigma)
@@ -114,7 +126,10 @@ def torque_density(sigma: Array, torque: float) -> Triple:
 
 
 def transition(step: Flow, sigma: Array, h: float, arc: OrbitArc | None = None) -> Array:
-    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``; ``arc``: the orbit."""
+    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``.
+
+    ``arc``: the orbit.
+    """
     Phi = _I20.copy()
     Phi[:6, :6] = step.S[:, :6]
     Phi[:6, SIGMA] = step.S[:, 6:] @ sigma_join(sigma)
@@ -140,7 +155,10 @@ def process_noise(Q: Array, times_s: Array, force: float) -> Array:
 
 
 def translation(h: float, arc: OrbitArc | None = None) -> Array:
-    """(6, 6) position and velocity of the centre of mass h seconds later, by those now: free, or on an orbit."""
+    """(6, 6) position and velocity of the centre of mass h seconds later, by those now.
+
+    Free, or on an orbit.
+    """
     if arc is not None:
         return np.ascontiguousarray(arc.transitions(np.array([h]))[0])
     path = np.eye(6)
@@ -149,7 +167,10 @@ def translation(h: float, arc: OrbitArc | None = None) -> Array:
 
 
 def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[Array, Array]:
-    """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``: free, or on an orbit."""
+    """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``.
+
+    Free, or on an orbit.
+    """
     if arc is None:
         return x.r_a + times_s[:, None] * x.v_a, np.broadcast_to(x.v_a, (len(times_s), 3))
     found = arc.transitions(times_s) @ np.concatenate([x.r_a, x.v_a])
@@ -157,7 +178,10 @@ def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[A
 
 
 def advance(x: State, step: Flow, h: float, arc: OrbitArc | None = None) -> State:
-    """The state after a step of h seconds; ``arc``: the orbit from the instant of ``x`` on, None for free motion."""
+    """The state after a step of h seconds; ``arc``.
+
+    The orbit from the instant of ``x`` on, None for free motion.
+    """
     q_ab = hamilton(x.q_ab.tolist(), step.q.tolist())
     centre, velocity = translated(x, np.array([h]), arc)
     return State.of(np.concatenate([q_ab, step.w, centre[0], velocity[0], x.sigma, x.c_b, x.q_bc]))
@@ -172,7 +196,8 @@ def propagate_state(x: State, h: float, arc: OrbitArc | None = None) -> tuple[St
 def propagate(
     belief: Belief, t_ns: int, torque: float, force: float, orbit: RelativeOrbit | None = None
 ) -> tuple[Belief, Array]:
-    """Belief at t_ns and Phi of the step (eq:state-prop, eq:cov-prop). A step back in time adds no noise.
+    """Belief at t_ns and Phi of the step (eq:state-prop, eq:cov-prop). A step back in time adds no
+    noise.
 
     Raises:
         UsageError: the step turns the target by more than ``MOST_RAD``.
@@ -192,8 +217,15 @@ def seconds_to(belief: Belief, t_ns: int) -> float:
     """
     h = (t_ns - belief.t_ns) * 1e-9
     if (turn := abs(h) * max(map(abs, belief.x.w_b.tolist()))) > MOST_RAD:
-        what = f"a scan comes {h:.4g} s after the one before, and the target turns {turn:.3g} rad: too far to predict"
-        raise UsageError(what, where=f"stamp {t_ns}", hint="check the stamps (--clock log), or use --start or --end")
+        what = (
+            f"a scan comes {h:.4g} s after the one before, and the target turns {turn:.3g} rad: too"
+            " far to predict"
+        )
+        raise UsageError(
+            what,
+            where=f"stamp {t_ns}",
+            hint="check the stamps (--clock log), or use --start or --end",
+        )
     return h
 
 
@@ -202,8 +234,10 @@ class RotationHistory:
     """Rotation at n instants from one initial state.
 
     Attributes:
-        q: (n, 4) attitude q_ab.  w: (n, 3) rate in {B} [rad/s].
-        S: (n, 6, 8) derivative of (dq_v, w) at each instant with respect to (dq_v, w, sigma) at the start.
+        q: (n, 4) attitude q_ab.
+        w: (n, 3) rate in {B} [rad/s].
+        S: (n, 6, 8) derivative of (dq_v, w) at each instant with respect to (dq_v, w, sigma) at the
+            start.
     """
 
     q: Array
@@ -212,23 +246,28 @@ class RotationHistory:
 
 
 def rotation_history(x: State, times_s: Array, drive: Triple = NO_DRIVE) -> RotationHistory:
-    """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached from the one before.
+    """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached
+    from the one before.
 
     ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
     """
     times = np.asarray(times_s, dtype=np.float64)
     q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times, drive)
-    return RotationHistory(q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2))
+    return RotationHistory(
+        q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2)
+    )
 
 
 def rotation_path(x: State, drive: Triple = NO_DRIVE) -> _motion.Path:
-    """Rotation from ``x`` at arbitrary instants; intermediate states are kept, so repeated queries are cheap.
+    """Rotation from ``x`` at arbitrary instants; intermediate states are kept, so repeated queries
+    are cheap.
 
     ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
     Returns:
-        An object whose ``at(times_s)`` (n,) [s] gives attitude q_ab (n, 4) and rate in {B} (n, 3) [rad/s]. It raises
-        ValueError for a time that is not finite or more than a million radians away.
+        An object whose ``at(times_s)`` (n,) [s] gives attitude q_ab (n, 4) and rate in {B} (n, 3)
+        [rad/s]. It raises ValueError for a time that is not finite or more than a million radians
+        away.
     """
     return _motion.Path(x.q_ab, x.w_b, ratios(x.sigma), drive)
 
@@ -242,7 +281,8 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None, drive: Triple = NO_D
         drive: angular acceleration in {B} by a constant torque [rad/s2].
 
     Returns:
-        Function of times (n,) >= 0 [s after now]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
+        Function of times (n,) >= 0 [s after now]: positions (n, 3) [m] and velocities (n, 3) [m/s]
+        in {A}.
 
     Raises:
         ValueError: by the returned function, for a time that is negative or not finite.
@@ -261,13 +301,17 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None, drive: Triple = NO_D
 
 
 def fixture_attitude(x: State, drive: Triple = NO_DRIVE) -> Callable[[Array], Array]:
-    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture; ``drive`` as in ``grasp_trajectory``."""
+    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture.
+
+    ``drive`` as in ``grasp_trajectory``.
+    """
     path = rotation_path(x, drive)
     return lambda times: geometry.multiply(path.at(np.asarray(times, dtype=np.float64))[0], x.q_bc)
 
 
 def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:
-    """Predicted 1 sigma of the grasp point at ``times_s`` (n,) >= 0, ascending [s after now] (section 8).
+    """Predicted 1 sigma of the grasp point at ``times_s`` (n,) >= 0, ascending [s after now]
+    (section 8).
 
     The values are infinite where the target would turn by more than ``MOST_RAD``.
 
@@ -282,18 +326,25 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
 
 
 def with_change(forecast: Forecast, belief: Belief, P: Array) -> Forecast:
-    """The forecast with a possible change of the motion, by the law of total covariance at each instant.
+    """The forecast with a possible change of the motion, by the law of total covariance at each
+    instant.
 
     Args:
         forecast: of the motion without a change.
         belief: at its beginning.
-        P: (20, 20) second moments of the error that the change has caused by then, times its probability.
+        P: (20, 20) second moments of the error that the change has caused by then, times its
+            probability.
     """
     if not P.any():
         return forecast
     more = grasp_forecast(Belief(belief.t_ns, belief.x, P), forecast.times_s, 0.0, 0.0)
-    position, velocity = np.hypot(forecast.pos_1s_m, more.pos_1s_m), np.hypot(forecast.vel_1s_mps, more.vel_1s_mps)
-    return Forecast(forecast.times_s, position, velocity, np.hypot(forecast.rot_1s_rad, more.rot_1s_rad))
+    position, velocity = (
+        np.hypot(forecast.pos_1s_m, more.pos_1s_m),
+        np.hypot(forecast.vel_1s_mps, more.vel_1s_mps),
+    )
+    return Forecast(
+        forecast.times_s, position, velocity, np.hypot(forecast.rot_1s_rad, more.rot_1s_rad)
+    )
 
 
 def ascending(times_s: Array) -> Array:
@@ -305,13 +356,18 @@ def ascending(times_s: Array) -> Array:
 
 
 def forecast_of(times_s: Array, variances: Array) -> Forecast:
-    """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle; rounding below 0 is 0."""
+    """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle.
+
+    Rounding below 0 is 0.
+    """
     position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
     return Forecast(times_s, position, velocity, 2.0 * half_angle)
 
 
 def pose_rows(x: State, times_s: Array, arc: OrbitArc | None = None) -> Array:
-    """H Phi (n, 6, 20) of a pose measured at each of ``times_s`` (n,) [s], with respect to the error states at 0."""
+    """H Phi (n, 6, 20) of a pose measured at each of ``times_s`` (n,) [s], with respect to the
+    error states at 0.
+    """
     path = rotation_history(x, times_s)
     J = grasp_jacobian(geometry.matrix(path.q), path.w, x.c_b)[:, [0, 1, 2, 6, 7, 8]]
     rows, rotational = J.copy(), J[:, :, :6]
@@ -324,7 +380,8 @@ def pose_rows(x: State, times_s: Array, arc: OrbitArc | None = None) -> Array:
 
 
 def grasp_jacobian(A_ab: Array, w_b: Array, c_b: Array) -> Array:
-    """Jacobian (n, 9, 20) of the grasp point's position [m], velocity [m/s] and half-angle attitude (section 8).
+    """Jacobian (n, 9, 20) of the grasp point's position [m], velocity [m/s] and half-angle attitude
+    (section 8).
 
     Args:
         A_ab: (n, 3, 3) attitudes.

@@ -1,7 +1,7 @@
 """The 20 error states (eq:x): their order, and the operations x (+) d and x (-) y on the state.
 
-dq_v and dmu_v are HALF-angle vectors in {B}: q = dq (x) q_hat is ``q_hat * dq`` and mu = mu_hat (x) dmu is
-``dmu * mu_hat`` in Hamilton's product. All other states are additive.
+dq_v and dmu_v are HALF-angle vectors in {B}: q = dq (x) q_hat is ``q_hat * dq`` and mu = mu_hat (x)
+dmu is ``dmu * mu_hat`` in Hamilton's product. All other states are additive.
 """
 
 from __future__ import annotations
@@ -15,19 +15,26 @@ from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
 
 DIM = 20
-REACHED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on chart steps of these alone
+# error states that a disturbance reaches: attitude to velocity; they depend on chart steps of these
+# alone
+REACHED = 12
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
-ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
+# least eigenvalue of a covariance, in units of its variances, that rounding may make negative
+ROUNDING = 1e-9
 _LEAST = 1e-9  # least eigenvalue of a product of a root with itself, in the same units
 _SMALLEST = 1e-300 * np.eye(DIM)
-LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
+# largest correction in chart steps, of which none has a larger unit than a metre or a radian
+LARGEST_MOVE = 1e3
 
 Quad = tuple[float, float, float, float]
 
 
 def hamilton(a: Array | Quad, b: Array | Quad) -> Quad:
-    """Hamilton's product of two quaternions [x y z w], in scalars: faster than geometry.multiply for a single pair."""
+    """Hamilton's product of two quaternions [x y z w], in scalars.
+
+    Faster than geometry.multiply for a single pair.
+    """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -71,7 +78,13 @@ def boxplus(x: State, d: Array) -> State:
     q = hamilton(x.q_ab.tolist(), _half_angle(d[DQ]))
     mu = hamilton(_half_angle(d[DMU]), x.q_bc.tolist())
     return State(
-        _unit(q), x.w_b + d[W], x.r_a + d[RHO], x.v_a + d[VEL], x.sigma + d[SIGMA], x.c_b + d[VARRHO], _unit(mu)
+        _unit(q),
+        x.w_b + d[W],
+        x.r_a + d[RHO],
+        x.v_a + d[VEL],
+        x.sigma + d[SIGMA],
+        x.c_b + d[VARRHO],
+        _unit(mu),
     )
 
 
@@ -98,14 +111,19 @@ def _unit(q: Quad) -> Array:
 
 
 def semidefinite(P: Array) -> bool:
-    """Whether P (20, 20) is finite and no eigenvalue, in units of its variances, is below -1e-6; variances may be 0."""
+    """Whether P (20, 20) is finite and no eigenvalue, in units of its variances, is below -1e-6.
+
+    Variances may be 0.
+    """
     return _motion.above(P + _SMALLEST, -1e-6)
 
 
 def definite(P: Array) -> Array:
-    """P with its eigenvalues, in units of its variances, raised to ``ROUNDING`` where rounding made one negative.
+    """P with its eigenvalues, in units of its variances, raised to ``ROUNDING`` where rounding made
+    one negative.
 
-    Standard deviations are limited to ``LARGEST_MOVE``: about an unstable spin they grow without bound.
+    Standard deviations are limited to ``LARGEST_MOVE``: about an unstable spin they grow without
+    bound.
     """
     if _motion.above(P, 0.0) and float(np.diagonal(P).max()) <= LARGEST_MOVE**2:
         return P
@@ -116,7 +134,9 @@ def definite(P: Array) -> Array:
 
 
 def definite_product(root: Array) -> Array:
-    """Root root' with its eigenvalues, in units of its variances, raised to ``_LEAST``, so that it has an inverse."""
+    """Root root' with its eigenvalues, in units of its variances, raised to ``_LEAST``, so that it
+    has an inverse.
+    """
     scale = np.linalg.norm(root, axis=1)
     values, axes = np.linalg.eigh((root / scale[:, None]) @ (root / scale[:, None]).T)
     half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]

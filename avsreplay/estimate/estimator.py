@@ -1,8 +1,9 @@
 """The estimator as the replay uses it: pure functions from one immutable track to the next.
 
-Modes: ``near`` uses a given start until the first healthy scan, ``start`` the first poses of a cold start, ``fit`` the
-maximum-likelihood fit over all poses so far, ``filter`` the Kalman filter afterwards. The filter is compared with a fit
-at intervals; where the fit contradicts it, the fit is used again.
+Modes: ``near`` uses a given start until the first healthy scan, ``start`` the first poses of a cold
+start, ``fit`` the maximum-likelihood fit over all poses so far, ``filter`` the Kalman filter
+afterwards. The filter is compared with a fit at intervals; where the fit contradicts it, the fit is
+used again.
 """
 
 from __future__ import annotations
@@ -52,10 +53,17 @@ from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajector
 
 
 class Estimator:
-    """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it."""
+    """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and
+    checks it.
+    """
 
     def __init__(
-        self, params: EstimatorParams, start: Belief | None, extent_m: float, epoch_ns: int = 0, centre_c: Array = ZERO
+        self,
+        params: EstimatorParams,
+        start: Belief | None,
+        extent_m: float,
+        epoch_ns: int = 0,
+        centre_c: Array = ZERO,
     ) -> None:
         """Create the estimator of one run.
 
@@ -63,8 +71,10 @@ class Estimator:
             params: settings; lengths left out are taken from ``extent_m``.
             start: the first belief where one is given.
             extent_m: the target's bounding diagonal [m].
-            epoch_ns: of the first scan: the falling frame then coincides with {A}; directions of an orbit belong to it.
-            centre_c: (3,) centre of the target's bounding box in {C} [m]; the paper's method does not use it.
+            epoch_ns: of the first scan: the falling frame then coincides with {A}; directions of an
+                orbit belong to it.
+            centre_c: (3,) centre of the target's bounding box in {C} [m]; the paper's method does
+                not use it.
 
         Raises:
             UsageError: a near start is requested and none is given.
@@ -72,13 +82,19 @@ class Estimator:
         self.params = params.resolved(extent_m)
         if params.start is Start.NEAR and start is None:
             hint = "use start = cold, or a log whose scenario has a [start] table"
-            raise UsageError("a near start is requested and the log contains none", where="estimator.start", hint=hint)
+            raise UsageError(
+                "a near start is requested and the log contains none",
+                where="estimator.start",
+                hint=hint,
+            )
         middle = ZERO if params.start is Start.PAPER else centre_c
         self.frame = EstimatorFrame(middle, np.array(params.acceleration_mps2), epoch_ns)
         given = start if params.start in (Start.AUTO, Start.NEAR) else None
         self.start = None if given is None else self.frame.belief_into(given)
         self.noise = Noise(self.params, extent_m)
-        self.batch = BatchSchedule(self.params, self.noise, self.start, RelativeOrbit.of(params, epoch_ns))
+        self.batch = BatchSchedule(
+            self.params, self.noise, self.start, RelativeOrbit.of(params, epoch_ns)
+        )
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
         self.disturbances = DisturbanceSchedule(self.batch)
         self._prior = None if self.start is None else given_prior(self.start)
@@ -94,11 +110,19 @@ class Estimator:
             acquired: the pose was found by registration, which may leave directions undetermined.
         """
         if self.start is not None:
-            return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
+            return Track(
+                self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns
+            )
         belief = guessed_belief(t_ns, self.frame.pose_into(T_ac, t_ns), self.params)
         mode = "filter" if self.params.start is Start.PAPER else "start"
         unknown = common_motions(np.eye(6), np.eye(6) if acquired else None, self._length_m)
-        return Track(belief, mode, started_ns=t_ns, undetermined=unknown, errors=ModelErrors(kept=mode != "filter"))
+        return Track(
+            belief,
+            mode,
+            started_ns=t_ns,
+            undetermined=unknown,
+            errors=ModelErrors(kept=mode != "filter"),
+        )
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
@@ -111,10 +135,15 @@ class Estimator:
             UsageError: the instant is too far from the last scan to predict the rotation.
         """
         belief, Phi = self.batch.predicted(track, t_ns)
-        return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window, counted=track.errors.counted)
+        return Prediction(
+            belief, Phi, measurement_jacobian(belief.x), track.window, counted=track.errors.counted
+        )
 
-    def determined(self, track: Track, prediction: Prediction, alignment: Alignment) -> tuple[Track, Prediction]:
-        """The track before a scan and its prediction, turned if its pose first determines a rotation of the model.
+    def determined(
+        self, track: Track, prediction: Prediction, alignment: Alignment
+    ) -> tuple[Track, Prediction]:
+        """The track before a scan and its prediction, turned if its pose first determines a
+        rotation of the model.
 
         Args:
             track: after the last scan.
@@ -129,22 +158,35 @@ class Estimator:
         return (track, prediction) if after is track else (after, self.predict(after, t_ns))
 
     def innovate(self, prediction: Prediction, alignment: Alignment) -> Innovation:
-        """The innovation of a registered pose: alpha, S, R, NIS and the Cauchy weight of the pose in the update.
+        """The innovation of a registered pose: alpha, S, R, NIS and the Cauchy weight of the pose
+        in the update.
 
         Args:
             prediction: of this scan.
             alignment: a measured pose.
         """
-        x, alignment = prediction.belief.x, self.frame.alignment_into(alignment, prediction.belief.t_ns)
+        x, alignment = (
+            prediction.belief.x,
+            self.frame.alignment_into(alignment, prediction.belief.t_ns),
+        )
         R, dof = self.noise.of(alignment, x, prediction.window), self.noise.dof(alignment)
-        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment, prediction.counted)
+        alpha, share = (
+            innovation_vector(x, alignment.T_ac),
+            self.noise.correlated_share(alignment, prediction.counted),
+        )
         more = share, dof, alignment.rms_m, alignment.free
         return innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, *more)
 
     def step(
-        self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
+        self,
+        track: Track,
+        prediction: Prediction,
+        innovation: Innovation | None,
+        verdict: Verdict,
+        converged: bool,
     ) -> tuple[Track, Verdict]:
-        """The posterior and the final verdict. The cause of a large innovation is decided with the next scans.
+        """The posterior and the final verdict. The cause of a large innovation is decided with the
+        next scans.
 
         Args:
             track: after the last scan.
@@ -158,17 +200,25 @@ class Estimator:
         """
         if innovation is None:
             return self.update(track, prediction, None, 0), verdict
-        epoch = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, converged)
-        after, verdict = self.anomalies.step(
-            track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True)
+        epoch = Epoch(
+            track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, converged
         )
-        after = after.changed(undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
+        after, verdict = self.anomalies.step(
+            track,
+            epoch,
+            verdict,
+            lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True),
+        )
+        after = after.changed(
+            undetermined=undetermined(track, innovation, verdict.gamma, self._length_m)
+        )
         after = self.anomalies.with_possible_change(after) if verdict.gamma else after
         due = verdict.gamma == 1 and after.mode in ("fit", "filter")
         return self.disturbances.advanced(after, self._robust) if due else after, verdict
 
     def track_forecast(self, track: Track, times_s: Array) -> Forecast:
-        """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is not Gaussian.
+        """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is
+        not Gaussian.
 
         Args:
             track: after the scan.
@@ -178,34 +228,48 @@ class Estimator:
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
             found = driven_forecast(self.frame.belief_out(track.belief), times_s, *noise)
         else:
-            found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise, self.frame.origin_c)
+            found = mixture_forecast(
+                track.batch.components, track.belief.t_ns, times_s, *noise, self.frame.origin_c
+            )
         turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
         if (motions := self._common_motions(track)).size:
             turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(motions), 2))
             turn, position = np.hypot(turn, turns), np.hypot(position, moves)
-        return Forecast(found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD))
+        return Forecast(
+            found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD)
+        )
 
     def refitted_rows(self, track: Track) -> tuple[FittedMotion, tuple[Array, Array, Array]] | None:
-        """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
+        """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no
+        new fit.
 
         Args:
             track: after a scan.
 
         Returns:
-            The motion at the scan; H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20).
+            The motion at the scan; H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the
+            transition (20, 20).
         """
-        start, trimmed = track.batch, track.mode == "filter" and len(track.fixes) >= self.params.audit_poses
+        start, trimmed = (
+            track.batch,
+            track.mode == "filter" and len(track.fixes) >= self.params.audit_poses,
+        )
         if start is None or track.since or trimmed or start.count != pose_count(track.fixes):
             return None
         motion, Phi = (first := FittedMotion.of(start)).at(track.belief.t_ns, self.batch.orbit)
         return motion, (*rows_along(first, track.fixes), Phi)
 
     def gramian_row(
-        self, track: Track, prediction: Prediction, innovation: Innovation | None, last: FittedMotion | None
+        self,
+        track: Track,
+        prediction: Prediction,
+        innovation: Innovation | None,
+        last: FittedMotion | None,
     ) -> tuple[FittedMotion | None, tuple[Array, Array, Array | None, bool]]:
         """Phi (20, 20) and H (6, 20) of a scan, and R (6, 6) as the registration claims it.
 
-        Between two fits along the trajectory of the last one: the mean of a mixture follows no motion of the body.
+        Between two fits along the trajectory of the last one: the mean of a mixture follows no
+            motion of the body.
 
         Args:
             track: after the scan.
@@ -214,7 +278,8 @@ class Estimator:
             last: trajectory of the last fit at the last scan; None before a fit.
 
         Returns:
-            That at this scan; Phi, H, R or None, and whether Phi begins at the first pose and not at the last scan.
+            That at this scan; Phi, H, R or None, and whether Phi begins at the first pose and not
+            at the last scan.
         """
         start = track.batch
         if track.mode != "fit" or start is None or start.points is None:
@@ -228,7 +293,8 @@ class Estimator:
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
     ) -> tuple[bool, Array, Array, Array, Array, float] | None:
-        """What ``monitor.convergence.violations`` tests after the belief, in its order; None before a fit.
+        """What ``monitor.convergence.violations`` tests after the belief, in its order; None before
+        a fit.
 
         Args:
             track: after a healthy scan.
@@ -237,32 +303,65 @@ class Estimator:
         """
         if track.mode not in ("fit", "filter"):
             return None
-        if prediction.lag_s or prediction.blur is not None:  # the pose belongs to the mean instant of its points
-            fix, scaled = self.batch.fix(prediction, innovation), NoiseWindow.empty(prediction.window.rise)
+        if (
+            prediction.lag_s or prediction.blur is not None
+        ):  # the pose belongs to the mean instant of its points
+            fix, scaled = (
+                self.batch.fix(prediction, innovation),
+                NoiseWindow.empty(prediction.window.rise),
+            )
             belief, _ = propagated(track.belief, fix.t_ns, 0.0, 0.0, self.batch.orbit)
-            left, R = innovation_vector(belief.x, fix.T_ac), in_camera(fix.C, fix.T_ac.q, belief.x.q_bc)
+            left, R = (
+                innovation_vector(belief.x, fix.T_ac),
+                in_camera(fix.C, fix.T_ac.q, belief.x.q_bc),
+            )
         else:
             belief, R, scaled = track.belief, innovation.R, prediction.window
             left = residual(belief.x, prediction.belief.x, innovation.alpha)
         rise = (track.recent[-1].prediction if track.recent else prediction).window.rise
         window = track.window if track.window.rise is rise else replace(track.window, rise=rise)
         R = self.noise.rescaled(R, scaled, window)
-        C, inflation = self.pose_covariance(belief), NO_INFLATION if track.inflation is None else track.inflation
-        return semidefinite(track.belief.P), C, left, R, inflation, gate_of(innovation.dof, R, R + C)
+        C, inflation = (
+            self.pose_covariance(belief),
+            NO_INFLATION if track.inflation is None else track.inflation,
+        )
+        return (
+            semidefinite(track.belief.P),
+            C,
+            left,
+            R,
+            inflation,
+            gate_of(innovation.dof, R, R + C),
+        )
 
     def _common_motions(self, track: Track) -> Array:
         motions = track.errors.motions
-        return np.hstack([track.undetermined, self.frame.motions_into(motions)]) if motions.size else track.undetermined
+        return (
+            np.hstack([track.undetermined, self.frame.motions_into(motions)])
+            if motions.size
+            else track.undetermined
+        )
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
-        """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
+        """A stored scan, predicted and used again from another track.
+
+        The track after it, and the scan as used.
+        """
         old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
         prediction = replace(prediction, lag_s=old.lag_s, blur=old.blur)
-        seen, R = epoch.innovation, self.noise.rescaled(epoch.innovation.R, old.window, track.window)
+        seen, R = (
+            epoch.innovation,
+            self.noise.rescaled(epoch.innovation.R, old.window, track.window),
+        )
         alpha = innovation_vector(prediction.belief.x, measured_pose(old.belief.x, seen.alpha))
         more = seen.share, seen.dof, seen.rms_m
         innovation = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, *more)
-        used = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
+        used = Epoch(
+            track.changed(recent=(), doubtful=(), previous=None),
+            prediction,
+            innovation,
+            epoch.converged,
+        )
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 
     def update(
@@ -285,16 +384,22 @@ class Estimator:
             spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
-            return track.changed(belief=prediction.belief, change_P=prediction.Phi @ track.change_P @ prediction.Phi.T)
+            return track.changed(
+                belief=prediction.belief,
+                change_P=prediction.Phi @ track.change_P @ prediction.Phi.T,
+            )
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
             return self.batch.initialised(track, prediction, innovation, converged, spread)
-        return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation), spread)
+        return self.batch.check_against_batch(
+            self.batch.filtered(track, prediction, innovation), spread
+        )
 
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that the filter does not carry.
 
-        Later poses do not reduce errors that all poses may have in common, nor motions of the model that no scan
-        determines (bodies of revolution). They decide on a change of the velocities that the last scans make possible.
+        Later poses do not reduce errors that all poses may have in common, nor motions of the model
+        that no scan determines (bodies of revolution). They decide on a change of the velocities
+        that the last scans make possible.
 
         Args:
             track: after a scan.
@@ -312,11 +417,14 @@ class Estimator:
             belief: mean and covariance now, in {A}; only the mean is used.
 
         Returns:
-            Function of times (n,) >= 0 [s after the belief's instant]: positions (n, 3) [m] and velocities (n, 3) [m/s]
-            in {A}. It raises ValueError for a time that is negative or not finite.
+            Function of times (n,) >= 0 [s after the belief's instant]: positions (n, 3) [m] and
+            velocities (n, 3) [m/s] in {A}. It raises ValueError for a time that is negative or not
+            finite.
         """
         orbit = self.batch.orbit
-        path = dynamics.grasp_trajectory(belief.x, None if orbit is None else orbit.at(belief.t_ns), drive_in(belief))
+        path = dynamics.grasp_trajectory(
+            belief.x, None if orbit is None else orbit.at(belief.t_ns), drive_in(belief)
+        )
         path = accelerated(path, belief.u[3:]) if isinstance(belief, DrivenBelief) else path
         return accelerated(path, self.frame.acceleration) if self.frame.falls else path
 
@@ -338,10 +446,13 @@ class Estimator:
             belief: mean and covariance now.
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
-        return driven_forecast(belief, times_s, *(given or 0.0 for given in self.params.disturbances))
+        return driven_forecast(
+            belief, times_s, *(given or 0.0 for given in self.params.disturbances)
+        )
 
     def pose_covariance(self, belief: Belief) -> Array:
-        """Covariance (6, 6) of the pose of {C}, H P H' (eq:innovation): position in {A} [m], half angles in {B} [rad].
+        """Covariance (6, 6) of the pose of {C}, H P H' (eq:innovation): position in {A} [m], half
+        angles in {B} [rad].
 
         Args:
             belief: mean and covariance.

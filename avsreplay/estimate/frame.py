@@ -1,18 +1,23 @@
-"""The coordinates of the estimator: the fixture at the centre of the model, in a frame that falls with the target.
+"""The coordinates of the estimator: the fixture at the centre of the model, in a frame that falls
+with the target.
 
-Centre. A CAD file may have its origin far from the body, and the origin of {C} is where its designer has put it. The
-pose of a point outside the body is uncertain by the error of the attitude times the distance, and the prior of the
-offset from the centre of mass would be about a point that is unrelated to the mass. The estimator therefore
-estimates {C'}, which is {C} with its origin at the centre s of the model's bounding box, s given in {C}:
+Centre. A CAD file may have its origin far from the body, and the origin of {C} is where its
+designer has put it. The pose of a point outside the body is uncertain by the error of the attitude
+times the distance, and the prior of the offset from the centre of mass would be about a point that
+is unrelated to the mass. The estimator therefore estimates {C'}, which is {C} with its origin at
+the centre s of the model's bounding box, s given in {C}:
 
-    T_ac' = T_ac (1, s),    varrho' = varrho + A(mu) s,    v' = v + theta x s for d = [theta; v] in {C}.
+    T_ac' = T_ac (1, s),    varrho' = varrho + A(mu) s,    v' = v + theta x s for d = [theta; v] in
+    {C}.
 
 All other states are the same, so that an estimate does not depend on the origin of the model.
 
-Fall. With a known acceleration a of the centre of mass in {A}, r' = r - a tau^2 / 2, v' = v - a tau with tau the time
-since the first scan. In that frame the motion is free, and the error states and their covariance are the same.
+Fall. With a known acceleration a of the centre of mass in {A}, r' = r - a tau^2 / 2, v' = v - a tau
+with tau the time since the first scan. In that frame the motion is free, and the error states and
+their covariance are the same.
 
-``EstimatorFrame`` converts the input and the output of the estimator; no other code depends on either.
+``EstimatorFrame`` converts the input and the output of the estimator; no other code depends on
+either.
 """
 
 from __future__ import annotations
@@ -72,7 +77,9 @@ class EstimatorFrame:
         return Pose(T_ac.q, t - self._fallen(t_ns)[0]) if self.falls else Pose(T_ac.q, t)
 
     def alignment_into(self, alignment: Alignment, t_ns: int) -> Alignment:
-        """Convert a registered pose of {C} in {A} at an instant [ns] to the estimator's coordinates."""
+        """Convert a registered pose of {C} in {A} at an instant [ns] to the estimator's
+        coordinates.
+        """
         if not (self.falls or self.shifted):
             return alignment
         T_ac = self.pose_into(alignment.T_ac, t_ns)
@@ -90,7 +97,9 @@ class EstimatorFrame:
         )
 
     def instants_into(self, instants: Array) -> Array:
-        """Convert the mean instants (6, 6) [s] by directions of {C} to those by directions of {C'}."""
+        """Convert the mean instants (6, 6) [s] by directions of {C} to those by directions of
+        {C'}.
+        """
         return self._into @ instants @ self._out if self.shifted else instants
 
     def motions_into(self, motions: Array) -> Array:
@@ -114,11 +123,16 @@ class EstimatorFrame:
         return self._converted(belief, 1.0)
 
     def belief_out(self, belief: Belief) -> Belief:
-        """Convert a belief from the estimator's coordinates to {C} and {A}; the last ones are kept."""
+        """Convert a belief from the estimator's coordinates to {C} and {A}.
+
+        The last ones are kept.
+        """
         return _belief_out(self, belief)
 
     def position_out(self, r_a: Array, t_ns: int) -> Array:
-        """Convert a position (3,) [m] of the centre of mass at an instant [ns] from the falling frame to {A}."""
+        """Convert a position (3,) [m] of the centre of mass at an instant [ns] from the falling
+        frame to {A}.
+        """
         return r_a + self._fallen(t_ns)[0] if self.falls else r_a
 
     def _moved(self, x: State, t_ns: int, sign: float) -> State:
@@ -130,10 +144,14 @@ class EstimatorFrame:
         if not self.falls:
             return flat
         away, speed = self._fallen(t_ns)
-        return np.concatenate((flat[:7], flat[7:10] - sign * away, flat[10:13] - sign * speed, flat[13:]))
+        return np.concatenate(
+            (flat[:7], flat[7:10] - sign * away, flat[10:13] - sign * speed, flat[13:])
+        )
 
     def _converted(self, belief: Belief, sign: float) -> Belief:
-        """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu x]) A(mu)."""
+        """The belief, with the covariance of varrho' = varrho + A(mu) s, A(dmu mu) = (1 + 2 [dmu
+        x]) A(mu).
+        """
         if not self.shifted:
             x = self._moved(belief.x, belief.t_ns, sign)
             return belief if x is belief.x else replace(belief, x=x)

@@ -1,8 +1,9 @@
-"""Which hypothesis explains a run of large innovations: manoeuvre, torque, sensor error, bad scans, or none of these.
+"""Which hypothesis explains a run of large innovations: manoeuvre, torque, sensor error, bad scans,
+or none of these.
 
-The pose of a free body is continuous and its velocity constant but for small disturbances. A step in the velocity with
-a continuous pose is therefore a manoeuvre; a step in the pose that the velocity does not explain is an error of the
-sensor; scans that contradict one another are bad.
+The pose of a free body is continuous and its velocity constant but for small disturbances. A step
+in the velocity with a continuous pose is therefore a manoeuvre; a step in the pose that the
+velocity does not explain is an error of the sensor; scans that contradict one another are bad.
 """
 
 from __future__ import annotations
@@ -36,19 +37,43 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array
 from avsreplay.records import Belief
 
-OVER_FREE, OVER_NEXT = 3.0, 2.0  # log odds over free motion and over the next hypothesis of an early decision
-_NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
+OVER_FREE, OVER_NEXT = (
+    3.0,
+    2.0,
+)  # log odds over free motion and over the next hypothesis of an early decision
+# chi-square of free motion over the sum of the NIS from which the linearisation does not hold
+_NONLINEAR = 2.0
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
-_INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
-_LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
-_FINE, _REFINEMENTS, _NO_WEIGHT = 16, 5, 1e-4  # instants of a refined grid, refinements, share of evidence neglected
-_TAIL = 0.05  # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
+_INSTANTS, _FEWER, _LONG = (
+    8,
+    4,
+    9,
+)  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
+_LONGEST_SPREAD = (
+    6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
+)
+_FINE, _REFINEMENTS, _NO_WEIGHT = (
+    16,
+    5,
+    1e-4,
+)  # instants of a refined grid, refinements, share of evidence neglected
+# probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
+_TAIL = 0.05
 _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
 _A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
-_SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
-_BEGINS = 4.6  # log of the prior odds of a manoeuvre over random disturbances that begin within the scans: 1 to 0.01
-_PER_S = 0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
+_SPREAD = (
+    0.7,
+    0.1,
+    0.1,
+    0.1,
+)  # prior share of manoeuvres at one instant, and over one, two and three intervals
+# log of the prior odds of a manoeuvre over random disturbances that begin within the scans: 1 to
+# 0.01
+_BEGINS = 4.6
+_PER_S = (
+    0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
+)
 
 Ranked = tuple[tuple[Epoch, ...], list[Explanation]]
 """Scans and the hypotheses about them, most likely first."""
@@ -63,29 +88,36 @@ def explain(
     orbit: RelativeOrbit | None = None,
     excluded: tuple[float, float] = (0.0, 0.0),
 ) -> Ranked:
-    """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely first.
+    """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely
+    first.
 
-    The hypotheses are linear about the motion predicted from the first scan. Where the accepted scans contradict this
-    motion although each agreed with its own prediction, the linearisation does not hold so long, and the older half of
-    the accepted scans is left out.
+    The hypotheses are linear about the motion predicted from the first scan. Where the accepted
+    scans contradict this motion although each agreed with its own prediction, the linearisation
+    does not hold so long, and the older half of the accepted scans is left out.
 
     Args:
-        epochs: measured scans in the order of time, ``first_doubtful`` of them accepted, the others in doubt.
+        epochs: measured scans in the order of time, ``first_doubtful`` of them accepted, the others
+            in doubt.
         first_doubtful: index of the first doubtful scan, 1 at least.
         priors: 1 sigma of the size of a change.
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
         orbit: the relative orbit of the target; None for free motion.
-        excluded: root densities of torque and force from which on the poses before exclude a random disturbance.
+        excluded: root densities of torque and force from which on the poses before exclude a random
+            disturbance.
     """
     start = epochs[0].track.belief
     arc = None if orbit is None else orbit.at(start.t_ns)
     window = window_of(epochs, first_doubtful, start, torque, force, arc)
     white = window.whiten @ window.y
     accepted = white[: 6 * window.points.before(first_doubtful)]
-    if first_doubtful > 1 and not linear(float(accepted @ accepted), len(accepted), epochs[:first_doubtful]):
+    if first_doubtful > 1 and not linear(
+        float(accepted @ accepted), len(accepted), epochs[:first_doubtful]
+    ):
         left_out = first_doubtful // 2
-        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit, excluded)
+        return explain(
+            epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit, excluded
+        )
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     edges = window.edges_s
     between = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
@@ -93,7 +125,9 @@ def explain(
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), len(white), len(epochs)),
         _manoeuvre(window, start, white, free, priors),
         _disturbed(edges, between, white, free, excluded),
-        _accelerated(edges, between, white, free, priors, isinstance(epochs[-1].track.belief, DrivenBelief)),
+        _accelerated(
+            edges, between, white, free, priors, isinstance(epochs[-1].track.belief, DrivenBelief)
+        ),
         _sensor_bias(window, white, free, priors),
         bad_scans(window, white, priors, first_doubtful),
         noisier(window, white, first_doubtful),
@@ -103,17 +137,20 @@ def explain(
 
 
 def certain(ranked: Sequence[Explanation]) -> bool:
-    """Return whether the most likely hypothesis explains the scans and the odds suffice for a decision."""
+    """Return whether the most likely hypothesis explains the scans and the odds suffice for a
+    decision.
+    """
     best, free = ranked[0], ranked[0].hypothesis is Hypothesis.FREE_MOTION
     sure = best.explains and best.log_evidence - ranked[1].log_evidence >= OVER_NEXT
     return sure and (free or odds_over_free(ranked) >= OVER_FREE)
 
 
 def linear(chi2: float, dof: int, epochs: Sequence[Epoch]) -> bool:
-    """Return whether the linearisation about the first prediction holds over scans that were all used.
+    """Return whether the linearisation about the first prediction holds over scans that were all
+    used.
 
-    Of a linear system the chi-square of free motion is the sum of the NIS, whatever moved the target. Where scans are
-    combined, what they differ by within their points is missing in it.
+    Of a linear system the chi-square of free motion is the sum of the NIS, whatever moved the
+    target. Where scans are combined, what they differ by within their points is missing in it.
 
     Args:
         chi2: of free motion, with ``dof`` degrees of freedom.
@@ -124,12 +161,15 @@ def linear(chi2: float, dof: int, epochs: Sequence[Epoch]) -> bool:
     return chi2 < _NONLINEAR * max(total - (all_dof - dof), total * dof / all_dof)
 
 
-def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors) -> Explanation:
-    """A change of rate and velocity: at one instant, or spread over one to three intervals between scans.
+def _manoeuvre(
+    window: Window, start: Belief, white: Array, free: float, priors: ChangePriors
+) -> Explanation:
+    """A change of rate and velocity: at one instant, or spread over one to three intervals between
+    scans.
 
-    A thrust or an impact that is not instantaneous is a sum of changes, two in each interval, so that both the velocity
-    and the pose at the end of the interval are free. All instants are marginalised for the evidence; the explanation is
-    the most likely, with rate and velocity free.
+    A thrust or an impact that is not instantaneous is a sum of changes, two in each interval, so
+    that both the velocity and the pose at the end of the interval are free. All instants are
+    marginalised for the evidence; the explanation is the most likely, with rate and velocity free.
     """
     edges, lengths = window.edges_s[:-1], np.diff(window.edges_s)
     n = len(lengths)
@@ -138,8 +178,12 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     single = free + mixed(columns, white, scale, _CHANGES, priors.scales)
-    shares = np.repeat(np.log(np.maximum(n * lengths / lengths.sum(), 1e-300)), count)  # all instants are as likely
-    two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array([count // 8, count - 1 - count // 8])
+    shares = np.repeat(
+        np.log(np.maximum(n * lengths / lengths.sum(), 1e-300)), count
+    )  # all instants are as likely
+    two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array(
+        [count // 8, count - 1 - count // 8]
+    )
     M = (columns[two.reshape(-1)] * scale).transpose(1, 0, 2).reshape(len(white), -1)
     G, g = M.T @ M, M.T @ white
     found, total = [], [log_mean((single + shares).tolist())]
@@ -160,31 +204,46 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
     best = max((fine, *found), key=lambda f: f.log_evidence)
     if best is not fine:
         at = min(int(np.searchsorted(edges, best.after_s)), n - 1)
-        best = replace(best, after_1s_s=math.hypot(best.after_1s_s, float(lengths[at]) / math.sqrt(12.0)))
+        best = replace(
+            best, after_1s_s=math.hypot(best.after_1s_s, float(lengths[at]) / math.sqrt(12.0))
+        )
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
     return replace(best, log_evidence=odds, onset=onset)
 
 
-def _disturbed(edges: Array, between: Array, white: Array, free: float, excluded: tuple[float, float]) -> Explanation:
+def _disturbed(
+    edges: Array, between: Array, white: Array, free: float, excluded: tuple[float, float]
+) -> Explanation:
     """Random torque or force beyond what is allowed for: an impulse between every two scans.
 
-    ``size`` holds the most likely root density of the rate [rad/s^1.5] or of the velocity [m/s^1.5], three times each.
-    A constant torque changes the velocity in every interval as well, unlike a manoeuvre. From the densities
-    ``excluded`` on, which the earlier poses exclude, a disturbance is possible only if it begins within these scans.
+    ``size`` holds the most likely root density of the rate [rad/s^1.5] or of the velocity
+    [m/s^1.5], three times each. A constant torque changes the velocity in every interval as well,
+    unlike a manoeuvre. From the densities ``excluded`` on, which the earlier poses exclude, a
+    disturbance is possible only if it begins within these scans.
 
-    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6p, 6) the effects of a change in each middle.
+    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6p, 6) the effects of a
+    change in each middle.
     """
     columns, found, n = between * np.sqrt(np.diff(edges))[:, None, None], [], len(between)
     for kind, least in zip(_CHANGES[:2], (SPHERE * excluded[0], excluded[1]), strict=True):
         A = columns[:, :, kind].transpose(1, 0, 2).reshape(len(white), -1)
         odds, fall = _motion.impulse_odds(A.T @ A, A.T @ white, _DENSITIES**2)
         possible = least > _DENSITIES
-        odds = np.where(possible, odds + math.log(len(odds) / max(int(possible.sum()), 1)), odds - _BEGINS)
+        odds = np.where(
+            possible, odds + math.log(len(odds) / max(int(possible.sum()), 1)), odds - _BEGINS
+        )
         k, size = int(np.argmax(odds)), np.zeros(6)
         size[kind] = _DENSITIES[k]
         value = free + log_mean(odds.tolist()) - math.log(2.0) + PRIOR_ODDS
         found.append(
-            Explanation(Hypothesis.DISTURBED, value, float(white @ white) - float(fall[k]), len(white), n, size=size)
+            Explanation(
+                Hypothesis.DISTURBED,
+                value,
+                float(white @ white) - float(fall[k]),
+                len(white),
+                n,
+                size=size,
+            )
         )
     return max(found, key=lambda f: f.log_evidence)
 
@@ -192,21 +251,29 @@ def _disturbed(edges: Array, between: Array, white: Array, free: float, excluded
 def _accelerated(
     edges: Array, between: Array, white: Array, free: float, priors: ChangePriors, known: bool
 ) -> Explanation:
-    """A constant torque or force: the same change of the velocity per second in every interval, as in ``_disturbed``.
+    """A constant torque or force: the same change of the velocity per second in every interval, as
+    in ``_disturbed``.
 
-    ``size`` holds the root densities of random disturbances that cause changes as large over the window. Where one is
-    ``known`` to act, an error of its value is as likely as none.
+    ``size`` holds the root densities of random disturbances that cause changes as large over the
+    window. Where one is ``known`` to act, an error of its value is as likely as none.
     """
-    M, scale = np.tensordot(np.diff(edges), between, 1), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    M, scale = (
+        np.tensordot(np.diff(edges), between, 1),
+        _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3),
+    )
     found = [
-        (kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2]) for kind in _CHANGES for f in priors.scales
+        (kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2])
+        for kind in _CHANGES
+        for f in priors.scales
     ]
     kind, _, u = max(found, key=lambda f: f[1])
     left, size = white - M[:, kind] @ u, np.zeros(6)
     size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
     value = log_mean([float(value) for _, value, _ in found]) + (0.0 if known else PRIOR_ODDS)
     dof = len(white) - len(u)
-    return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), dof, len(between), size=size)
+    return Explanation(
+        Hypothesis.ACCELERATED, value, float(left @ left), dof, len(between), size=size
+    )
 
 
 def _located(
@@ -219,10 +286,12 @@ def _located(
     instants: Array,
     single: Array,
 ) -> tuple[Explanation, float]:
-    """A change at one unknown instant, and the log of the integral of its evidence over the instant [s].
+    """A change at one unknown instant, and the log of the integral of its evidence over the instant
+    [s].
 
-    Precise poses determine the instant more finely than the first grid, and the size depends on it: the grid is
-    refined where the evidence lies, and size and covariance are moments over the instants.
+    Precise poses determine the instant more finely than the first grid, and the size depends on it:
+    the grid is refined where the evidence lies, and size and covariance are moments over the
+    instants.
 
     ``instants`` (k,) is the first grid, ascending, and ``single`` (k,) the log evidence there.
     """
@@ -244,14 +313,21 @@ def _located(
     value = float(single.max()) + math.log(float(weight.sum()) * (last - first) / len(instants))
     share = weight / weight.sum()
     after_s, k = float(share @ instants), int(np.argmax(single))
-    spread = math.hypot(math.sqrt(float(share @ (instants - after_s) ** 2)), (last - first) / _FINE / math.sqrt(12.0))
+    spread = math.hypot(
+        math.sqrt(float(share @ (instants - after_s) ** 2)),
+        (last - first) / _FINE / math.sqrt(12.0),
+    )
     used = share > _NO_WEIGHT
     _, sizes, C = log_evidence(white, free, columns[used], scale)
     held = share[used] / share[used].sum()
     size = held @ sizes
-    P = (held[:, None, None] * (C + (sizes - size)[:, :, None] * (sizes - size)[:, None, :])).sum(axis=0)
+    P = (held[:, None, None] * (C + (sizes - size)[:, :, None] * (sizes - size)[:, None, :])).sum(
+        axis=0
+    )
     below = np.cumsum(share)
-    ends = np.clip(np.searchsorted(below, [_TAIL, 1.0 - _TAIL]) + np.array([-1, 1]), 0, len(instants) - 1)
+    ends = np.clip(
+        np.searchsorted(below, [_TAIL, 1.0 - _TAIL]) + np.array([-1, 1]), 0, len(instants) - 1
+    )
     at_best, _ = _changes(instants[[k]], columns[[k]], white, free, scale)
     changes = tuple(np.unique(instants[ends]).tolist())
     found = replace(at_best, log_evidence=float(single[k]), after_s=after_s, after_1s_s=spread)
@@ -259,13 +335,16 @@ def _located(
 
 
 def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
-    """Derivatives (k, 6p, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
+    """Derivatives (k, 6p, 6) of the whitened innovations by a change of (rate, velocity) at each
+    instant (k,) [s].
+    """
     which = np.searchsorted(window.times_s, instants, side="right")
     return _motion.after_changes(window.late, which, impulses(start.x, instants), instants)
 
 
 def _joint(G: Array, g: Array, size: int) -> Array:
-    """Log evidence over free motion of changes in successive intervals, two in each, as in ``_changes``.
+    """Log evidence over free motion of changes in successive intervals, two in each, as in
+    ``_changes``.
 
     Args:
         G: (12k, 12k) normal matrix of the changes in k intervals, of unit size.
@@ -276,10 +355,14 @@ def _joint(G: Array, g: Array, size: int) -> Array:
         The values of the manoeuvres that begin in each interval, as far as they end within the k.
     """
     parts = [slice(k, k + size) for k in range(0, len(g) + 1 - size, 12)]
-    return _motion.log_ratio(np.array([G[part, part] for part in parts]), np.array([g[part] for part in parts]))
+    return _motion.log_ratio(
+        np.array([G[part, part] for part in parts]), np.array([g[part] for part in parts])
+    )
 
 
-def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> tuple[Explanation, bool]:
+def _changes(
+    instants: Array, columns: Array, white: Array, free: float, scale: Array
+) -> tuple[Explanation, bool]:
     """Changes at given instants, and whether they may be those of a thrust or an impact.
 
     Size and P are those of their sum, ``after_s`` their mean weighted by size.
@@ -308,10 +391,12 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
 
 
 def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
-    """Return whether changes u (6m,) at ``instants`` (m,), with the sum ``net``, may be those of a thrust or an impact.
+    """Return whether changes u (6m,) at ``instants`` (m,), with the sum ``net``, may be those of a
+    thrust or an impact.
 
-    The velocity during either lies between those before and after, give or take their difference. Changes that cancel
-    displace the target further than that, or leave no change of the velocity: they imitate a wrong pose.
+    The velocity during either lies between those before and after, give or take their difference.
+    Changes that cancel displace the target further than that, or leave no change of the velocity:
+    they imitate a wrong pose.
     """
     if net.size @ np.linalg.solve(net.P, net.size) < _A_CHANGE:
         return False
@@ -327,7 +412,10 @@ def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
 
 
 def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors) -> Explanation:
-    """A constant offset of the pose in {A} from one of the scans on: of its range, its position, or all of it."""
+    """A constant offset of the pose in {A} from one of the scans on.
+
+    Of its range, its position, or all of it.
+    """
     M, scale = offsets(window, priors)
     columns = window.since_each(M)[1:]
     values = free + mixed(columns, white, scale, OFFSETS)
@@ -336,4 +424,6 @@ def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors
     _, u, P = log_evidence(white, free, whitened, scale[:6])
     left = white - whitened @ u
     odds = log_mean(values.tolist()) + PRIOR_ODDS
-    return Explanation(Hypothesis.SENSOR_BIAS, odds, float(left @ left), len(white) - 6, onset, size=u, P=P)
+    return Explanation(
+        Hypothesis.SENSOR_BIAS, odds, float(left @ left), len(white) - 6, onset, size=u, P=P
+    )

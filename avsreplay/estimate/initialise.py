@@ -1,13 +1,13 @@
 """Start without a belief: rate from the first poses, then a batch fit over all of them.
 
-The first belief has zero sigma and varrho, and mu is the identity. Its covariance is that of one linearised fit: the
-prior's information plus H' R^-1 H of each pose, propagated back along the motion. Rate, velocity and their correlations
-with the unknown parameters thus agree with the poses.
+The first belief has zero sigma and varrho, and mu is the identity. Its covariance is that of one
+linearised fit: the prior's information plus H' R^-1 H of each pose, propagated back along the
+motion. Rate, velocity and their correlations with the unknown parameters thus agree with the poses.
 
-The fit is repeated each time the poses have grown by a stated share (``refit`` decides when). It is final once its
-likelihood is Gaussian (``batch_covariance`` finds no non-Gaussian direction) and every direction is determined by the
-poses rather than by the prior: the filter may then start from its mean and covariance. A body with an unobservable
-direction stays with the fit.
+The fit is repeated each time the poses have grown by a stated share (``refit`` decides when). It is
+final once its likelihood is Gaussian (``batch_covariance`` finds no non-Gaussian direction) and
+every direction is determined by the poses rather than by the prior: the filter may then start from
+its mean and covariance. A body with an unobservable direction stays with the fit.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from avsreplay.settings import given
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
 _LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
-_DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
+# a direction whose posterior sigma is above this share of the prior's is determined by the prior
+_DETERMINED = 0.5
 
 
 @value_class
@@ -55,7 +56,8 @@ class PoseFix:
 
     Attributes:
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
-        lag_ns: the instant relative to that of its scan: a scan of finite duration shows the pose at its middle.
+        lag_ns: the instant relative to that of its scan: a scan of finite duration shows the pose
+            at its middle.
         correlated_share: the part of C that neighbouring poses have in common.
         count: number of poses that it stands for.
         orbit: the relative orbit that the target is on; None for free motion.
@@ -82,14 +84,18 @@ class BatchResult:
     """The last batch fit: its values at the epoch (the first pose) and the resulting belief.
 
     Attributes:
-        epoch_ns: instant of the first pose.  chart: values there, where the next fit starts.  count: poses.
+        epoch_ns: instant of the first pose.
+        chart: values there, where the next fit starts.
+        count: poses.
         factors, inflation: (2,) noise factors and correlation inflation, of attitude and position.
-        belief: at the last pose.  gaussian: the filter may start from it.
+        belief: at the last pose.
+        gaussian: the filter may start from it.
         components: the Gaussian mixture that ``belief`` has the moments of.
         prior_rejected: the poses contradict the given start, and it was left out.
         points: the poses of the fit, or their normal points.
         share: mean claimed part of the variance of the poses that near views have in common.
-        position_m2: (3, 3) claimed covariance of the position of a pose in {A}, the inverse of the mean information.
+        position_m2: (3, 3) claimed covariance of the position of a pose in {A}, the inverse of the
+            mean information.
     """
 
     epoch_ns: int
@@ -112,7 +118,10 @@ def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
 
 
 def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
-    """The belief at the last pose's scan: rate and velocity from all poses, at rest from a single one."""
+    """The belief at the last pose's scan.
+
+    Rate and velocity from all poses, at rest from a single one.
+    """
     last = fixes[-1]
     x, _ = propagate_state(_at_pose(last.T_ac, *mean_rates(fixes)), -last.lag_ns * 1e-9)
     info = np.diag(params.start_1s**-2.0)
@@ -126,7 +135,10 @@ def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
 
 
 def mean_rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
-    """Mean rate in {C} [rad/s] and velocity in {A} [m/s] over the poses; zero for one pose or no time between them."""
+    """Mean rate in {C} [rad/s] and velocity in {A} [m/s] over the poses.
+
+    Zero for one pose or no time between them.
+    """
     h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
     if h <= 0.0:
         return np.zeros(3), np.zeros(3)
@@ -164,7 +176,8 @@ def pose_count(fixes: tuple[PoseFix, ...]) -> int:
 
 
 def joined(fixes: tuple[PoseFix, ...], reference: Chart, factors: Array) -> tuple[PoseFix, ...]:
-    """Half as many poses that carry the information of these: neighbouring ones are joined about a reference motion.
+    """Half as many poses that carry the information of these: neighbouring ones are joined about a
+    reference motion.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -177,17 +190,26 @@ def joined(fixes: tuple[PoseFix, ...], reference: Chart, factors: Array) -> tupl
     return tuple(
         PoseFix(fixes[0].t_ns + round(t * 1e9), Pose(q, p), C, 0, share, int(count), fixes[0].orbit)
         for t, q, p, C, share, count in zip(
-            points.times_s.tolist(), points.q, points.t, points.C, shares.tolist(), counts, strict=True
+            points.times_s.tolist(),
+            points.q,
+            points.t,
+            points.C,
+            shares.tolist(),
+            counts,
+            strict=True,
         )
     )
 
 
 def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
-    """The prior of a cold start, with large standard deviations: a sphere at rest at the first pose.
+    """The prior of a cold start, with large standard deviations: a sphere at rest at the first
+    pose.
 
     The centre of the sphere is at the fixture.
     """
-    mean = Chart.of(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
+    mean = Chart.of(
+        poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3)
+    )
     arm = given(params.start_varrho_1s_m)
     speed = given(params.start_vel_1s_mps) + params.start_rate_1s_radps * arm
     widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]
@@ -197,8 +219,8 @@ def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
 def given_prior(belief: Belief) -> Prior:
     """A given belief in chart coordinates, by Monte Carlo.
 
-    The Jacobian would not do: where two moments are nearly equal, the effect of the axes mu on the inertia depends on
-    how far the moments differ, which the linearisation does not contain.
+    The Jacobian would not do: where two moments are nearly equal, the effect of the axes mu on the
+    inertia depends on how far the moments differ, which the linearisation does not contain.
     """
     x, mean, root = belief.x, to_chart(belief.x), np.linalg.cholesky(belief.P)
     draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
@@ -207,9 +229,11 @@ def given_prior(belief: Belief) -> Prior:
 
 
 def rough_state(fixes: tuple[PoseFix, ...]) -> State:
-    """A sphere that spins about its fixture at the poses' median rate, which single outliers do not affect.
+    """A sphere that spins about its fixture at the poses' median rate, which single outliers do not
+    affect.
 
-    Neighbouring poses give a coarse rate; pairs about 0.7 rad of rotation apart then give a finer one.
+    Neighbouring poses give a coarse rate; pairs about 0.7 rad of rotation apart then give a finer
+    one.
     """
     coarse = _median_rates(fixes, 1)[0]
     step = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9 / max(1, len(fixes) - 1)
@@ -220,7 +244,10 @@ def rough_state(fixes: tuple[PoseFix, ...]) -> State:
 
 
 def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
-    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``, without those almost at one instant."""
+    """Rate in {C} and velocity in {A}.
+
+    Medians over pairs of poses ``apart``, without those almost at one instant.
+    """
     least = 1e-3 * (fixes[-1].t_ns - fixes[0].t_ns) / max(1, len(fixes) - 1)
     times, t = np.array([fix.t_ns for fix in fixes]), np.array([fix.T_ac.t for fix in fixes])
     h_ns = times[apart:] - times[:-apart]
@@ -228,7 +255,9 @@ def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]
     if not used.any():
         return np.zeros(3), np.zeros(3)
     h = h_ns[used, None] * 1e-9
-    return np.median(_turns(fixes, apart)[used] / h, axis=0), np.median((t[apart:] - t[:-apart])[used] / h, axis=0)
+    return np.median(_turns(fixes, apart)[used] / h, axis=0), np.median(
+        (t[apart:] - t[:-apart])[used] / h, axis=0
+    )
 
 
 def batch_estimate(
@@ -240,7 +269,8 @@ def batch_estimate(
     start: Chart | None = None,
     given: Prior | None = None,
 ) -> Parts[BatchResult]:
-    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit, in parts.
+    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit, in
+    parts.
 
     ``given`` is the prior at the first pose; it is left out once the poses contradict it.
     """
@@ -261,7 +291,9 @@ def batch_estimate(
     noise, slack = (levels.torque, levels.force), levels.slack
     fitted = yield from fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
     if given is not None and not rejected:
-        joint = yield from fit(points, start, given, rules, factors, robust_start=first, slack=slack)
+        joint = yield from fit(
+            points, start, given, rules, factors, robust_start=first, slack=slack
+        )
         rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
     yield fitted.steps * len(points)
@@ -273,7 +305,9 @@ def batch_estimate(
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
     unseen = unseen_torque(problem, after_s) if params.torque_noise_radps15 is None else None
     latest = poses.latest(LATEST, after_s)
-    components = yield from final_mixture(found, problem, latest, noise, now_ns, after_s, spread, unseen)
+    components = yield from final_mixture(
+        found, problem, latest, noise, now_ns, after_s, spread, unseen
+    )
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
@@ -292,10 +326,14 @@ def batch_estimate(
 
 
 def _position_noise(points: Poses) -> Array:
-    """Covariance (3, 3) in {A} that each pose would have for the sum of their information on the position."""
+    """Covariance (3, 3) in {A} that each pose would have for the sum of their information on the
+    position.
+    """
     R = geometry.matrix(points.q)
     info = np.sum(R @ np.linalg.inv(points.C[:, 3:, 3:]) @ np.swapaxes(R, 1, 2), axis=0)
-    return np.asarray(np.linalg.inv(info) * (len(points) if points.counts is None else float(points.counts.sum())))
+    return np.asarray(
+        np.linalg.inv(info) * (len(points) if points.counts is None else float(points.counts.sum()))
+    )
 
 
 def improved_levels(
@@ -306,7 +344,8 @@ def improved_levels(
     levels: NoiseLevels,
     positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
-    """Noise levels from the residuals of the poses but those with gross errors, which are no noise, in parts.
+    """Noise levels from the residuals of the poses but those with gross errors, which are no noise,
+    in parts.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -319,23 +358,32 @@ def improved_levels(
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
     prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
-    poses = poses.some(~gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors))
+    poses = poses.some(
+        ~gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors)
+    )
     for _ in range(2):  # normal points about the given motion, then about the fitted one
         points = normal_points(poses, chart, gate, MOST_POINTS, scatter=True)
-        problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1
+        problem = Problem(
+            points, prior, factors, chart, np.inf
+        )  # residuals with disturbances have the weight 1
         yield from problem.descended(_LEVEL_STEPS, _LEVEL_TOL)
         chart = problem.chart
     problem.core.linearise(chart.flat)
     yield BUDGET
     claimed = params.adapt is Adaptation.OFF
-    found = yield from estimate_levels(points, problem, levels, claimed, params.disturbances, positions=positions)
+    found = yield from estimate_levels(
+        points, problem, levels, claimed, params.disturbances, positions=positions
+    )
     return replace(found, count=pose_count(fixes))
 
 
-def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:
+def _contradicts(
+    poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior
+) -> bool:
     """Return whether the given prior raises the cost of the poses too much, at the fitted noise.
 
-    If the given prior is right, twice the difference is at most chi-square with 20 degrees of freedom.
+    If the given prior is right, twice the difference is at most chi-square with 20 degrees of
+    freedom.
     """
     alone, with_given = (Problem(poses, prior, fitted.effective) for prior in (weak, given))
     return 2.0 * (with_given.cost(joint.chart) - alone.cost(fitted.chart)) > BOUND

@@ -1,16 +1,17 @@
 """The measurement of a pose and the update of the filter with it.
 
-The model (eq:innovation): z = (rho, deta_v) of a registered pose, its Jacobian H, its noise R.
-deta = mu_hat^-1 (x) eta (x) q_hat^-1, in Hamilton's product q_hat^-1 * eta * mu_hat^-1, of the sign with w >= 0. The
-errors are zero after each update, so the attitude part of h is zero and H is taken there.
+The model (eq:innovation): z = (rho, deta_v) of a registered pose, its Jacobian H, its noise R. deta
+= mu_hat^-1 (x) eta (x) q_hat^-1, in Hamilton's product q_hat^-1 * eta * mu_hat^-1, of the sign with
+w >= 0. The errors are zero after each update, so the attitude part of h is zero and H is taken
+there.
 
-The constrained update (eq:innovation, eq:K_phi, eq:sigma_bounds): K = gamma beta K^u, in Joseph's form. beta scales the
-two sigma rows of the gain (rows 12, 13) so that sigma stays inside its bounds. A scaled gain is not optimal, hence
-Joseph's form.
+The constrained update (eq:innovation, eq:K_phi, eq:sigma_bounds): K = gamma beta K^u, in Joseph's
+form. beta scales the two sigma rows of the gain (rows 12, 13) so that sigma stays inside its
+bounds. A scaled gain is not optimal, hence Joseph's form.
 
-Three sets of estimated parameters on one motion, for the observability of each (the paper's claim on two ratios):
-``two``: the 20 states; ``three``: sigma1, sigma2 and sigma3 independent, 21 states; ``known``: sigma, varrho and mu
-known, the 12 states of motion.
+Three sets of estimated parameters on one motion, for the observability of each (the paper's claim
+on two ratios): ``two``: the 20 states; ``three``: sigma1, sigma2 and sigma3 independent, 21 states;
+``known``: sigma, varrho and mu known, the 12 states of motion.
 """
 
 from __future__ import annotations
@@ -24,7 +25,15 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import DrivenBelief, corrected
 from avsreplay.estimate.dynamics import advance, flow, sigma_join, transition
-from avsreplay.estimate.error_state import DIM, SIGMA, Quad, boxplus, conjugate_quad, hamilton, rotation
+from avsreplay.estimate.error_state import (
+    DIM,
+    SIGMA,
+    Quad,
+    boxplus,
+    conjugate_quad,
+    hamilton,
+    rotation,
+)
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, State
 
@@ -54,15 +63,19 @@ def residual(posterior: State, prior: State, alpha: Array) -> Array:
 def measured_pose(x: State, alpha: Array) -> Pose:
     """The pose T_ac whose innovation at x is ``alpha``: the inverse of ``innovation_vector``."""
     position, deta = _measured(x, alpha)
-    return Pose(np.array(hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())), np.array(position))
+    return Pose(
+        np.array(hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())), np.array(position)
+    )
 
 
 def registration_noise(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
-    """R (6, 6) [m, half-angle] from the registration's covariance of d = [theta; v] in {C}; None if it gives none.
+    """R (6, 6) [m, half-angle] from the registration's covariance of d = [theta; v] in {C}; None if
+    it gives none.
 
-    Attitude is A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. For a
-    degenerate view the covariance is computed from ``info``, with the standard deviations ``free`` (rad, m) along the
-    unobservable directions, so that the observable directions of the scan are still used.
+    Attitude is A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms
+    stay. For a degenerate view the covariance is computed from ``info``, with the standard
+    deviations ``free`` (rad, m) along the unobservable directions, so that the observable
+    directions of the scan are still used.
     """
     if alignment.covariance is not None:
         C = alignment.covariance
@@ -74,7 +87,10 @@ def registration_noise(alignment: Alignment, x: State, free: tuple[float, float]
 
 
 def _inverse(info: Array) -> Array:
-    """The inverse; if ``info`` is numerically singular, eigenvalues are raised to 1e-15 of the largest."""
+    """The inverse.
+
+    If ``info`` is numerically singular, eigenvalues are raised to 1e-15 of the largest.
+    """
     try:
         return np.asarray(np.linalg.inv(info))
     except np.linalg.LinAlgError:
@@ -156,7 +172,8 @@ def innovation_of(
         H: (6, 20) measurement Jacobian.
         alpha: (6,) innovation [m, half-angle].
         R: (6, 6) measurement noise.
-        robust: give a pose whose NIS is above its 99.99 % point the Cauchy weight point / NIS; otherwise it is 1.
+        robust: give a pose whose NIS is above its 99.99 % point the Cauchy weight point / NIS;
+            otherwise it is 1.
         correlated_share: the part of R that neighbouring scans have in common.
         dof: degrees of freedom of R as an estimate, inf if it is known.
         rms_m: of the alignment.
@@ -172,13 +189,17 @@ def innovation_of(
     chi2, limit = as_chi2(nis, of_S), from_chi2(GATE, of_S)
     weight = limit / nis if robust and nis > limit else 1.0
     angle = 2.0 * math.asin(half)
-    return Innovation(alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, rms_m, dof, free)
+    return Innovation(
+        alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, rms_m, dof, free
+    )
 
 
 def dof_of_sum(dof: float, part: Array, total: Array) -> float:
-    """Degrees of freedom of a covariance of which a part is an estimate and the rest is known (Welch, Satterthwaite).
+    """Degrees of freedom of a covariance of which a part is an estimate and the rest is known
+    (Welch, Satterthwaite).
 
-    With B = total^-1 part they are dof p (p + 1) / (tr B^2 + (tr B)^2), by Nel and van der Merwe (1986), for p = 6.
+    With B = total^-1 part they are dof p (p + 1) / (tr B^2 + (tr B)^2), by Nel and van der Merwe
+    (1986), for p = 6.
 
     Args:
         dof: degrees of freedom of the part, inf if it is known.
@@ -191,14 +212,16 @@ def dof_of_sum(dof: float, part: Array, total: Array) -> float:
 
 
 def as_chi2(square: float, dof: float) -> float:
-    """Hotelling's T^2 of six variables, with an estimated covariance, as chi-square with 6 degrees of freedom.
+    """Hotelling's T^2 of six variables, with an estimated covariance, as chi-square with 6 degrees
+    of freedom.
 
     Args:
         square: T^2 >= 0.
         dof: degrees of freedom of the covariance, above 3; inf if it is known.
 
     Returns:
-        (dof - 3) log(1 + T^2 / dof), Bartlett's approximation. At dof = 40, 0.95e-4 exceed the 99.99 % point.
+        (dof - 3) log(1 + T^2 / dof), Bartlett's approximation. At dof = 40, 0.95e-4 exceed the
+        99.99 % point.
     """
     return (dof - 3.0) * math.log1p(square / dof) if math.isfinite(dof) else square
 
@@ -214,7 +237,9 @@ def from_chi2(value: float, dof: float) -> float:
 
 
 def gate_of(dof: float, part: Array, total: Array) -> float:
-    """The 99.99 % point of T^2 in the metric of a sum of which a part is an estimate (``dof_of_sum``)."""
+    """The 99.99 % point of T^2 in the metric of a sum of which a part is an estimate
+    (``dof_of_sum``).
+    """
     return from_chi2(GATE, dof_of_sum(dof, part, total))
 
 
@@ -249,9 +274,11 @@ def constrained_update(
 
 
 def sigma_bounds(sigma: Array, step: Array, margin: float) -> tuple[tuple[float, float], int]:
-    """(beta1, beta2) and how many bounds acted, for the step d_i = k_i' e from the prior sigma (2,) (eq:sigma_bounds).
+    """(beta1, beta2) and how many bounds acted, for the step d_i = k_i' e from the prior sigma (2,)
+    (eq:sigma_bounds).
 
-    Where |sigma_i + d_i| > 1 - m, beta_i puts the posterior on the bound: (sgn(sigma_i + d_i)(1 - m) - sigma_i) / d_i.
+    Where |sigma_i + d_i| > 1 - m, beta_i puts the posterior on the bound: (sgn(sigma_i + d_i)(1 -
+    m) - sigma_i) / d_i.
     """
     betas = [_beta(s, d, 1.0 - margin) for s, d in zip(sigma.tolist(), step.tolist(), strict=True)]
     return (betas[0], betas[1]), sum(beta != 1.0 for beta in betas)
@@ -263,9 +290,11 @@ def _beta(sigma: float, d: float, bound: float) -> float:
 
 
 def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Array) -> Belief:
-    """The same update with the state displaced through the chart, where inertia has no bounds and beta is not needed.
+    """The same update with the state displaced through the chart, where inertia has no bounds and
+    beta is not needed.
 
-    Gain, Joseph's form and the displacement of mean and P by the chart's Jacobians are one call of the extension.
+    Gain, Joseph's form and the displacement of mean and P by the chart's Jacobians are one call of
+    the extension.
     """
     x, factors = prior.x, inflation / innovation.weight
     alpha, S, R = innovation.alpha, innovation.S, innovation.R
@@ -285,7 +314,8 @@ def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:
 
 
 def inflated(R: Array, inflation: Array) -> Array:
-    """R times ``inflation`` (2,), of attitude and position: correlated errors carry less information than white ones.
+    """R times ``inflation`` (2,), of attitude and position: correlated errors carry less
+    information than white ones.
 
     S of the innovation itself is not inflated: a single scan has the noise R.
     """
@@ -298,8 +328,12 @@ _THREE = {"sigma": slice(12, 15), "varrho": slice(15, 18), "mu": slice(18, 21)}
 BLOCKS_OF: Mapping[str, Mapping[str, slice]] = MappingProxyType(
     {
         "two": BLOCKS,
-        "three": MappingProxyType({name: _THREE.get(name, where) for name, where in BLOCKS.items()}),
-        "known": MappingProxyType({name: where for name, where in BLOCKS.items() if where.stop <= _MOTION}),
+        "three": MappingProxyType(
+            {name: _THREE.get(name, where) for name, where in BLOCKS.items()}
+        ),
+        "known": MappingProxyType(
+            {name: where for name, where in BLOCKS.items() if where.stop <= _MOTION}
+        ),
     }
 )
 
@@ -321,7 +355,10 @@ def step_of_sets(x: State, h: float) -> tuple[State, dict[str, tuple[Array, Arra
 
 
 def prior_1s(one_sigma: Array, sigma: Array) -> dict[str, Array]:
-    """Prior standard deviations (n,) of each set from the 20; that of sigma3 follows from sigma1 and sigma2."""
+    """Prior standard deviations (n,) of each set from the 20.
+
+    That of sigma3 follows from sigma1 and sigma2.
+    """
     third = np.sqrt(np.sum((sigma_join(sigma)[2] * one_sigma[SIGMA]) ** 2))
     return {
         "two": one_sigma,

@@ -1,13 +1,16 @@
 """The result of a fit as a mixture of Gaussians, carried on from scan to scan until the next fit.
 
-Each component is linearised about its own trajectory: a pose corrects its mean and covariance as in the filter, and its
-weight by the likelihood of the pose. No new fit is needed while the weights are still those of a quadrature.
+Each component is linearised about its own trajectory: a pose corrects its mean and covariance as in
+the filter, and its weight by the likelihood of the pose. No new fit is needed while the weights are
+still those of a quadrature.
 
-Covariance and Jacobians of a component follow the trajectory that the fit gave it, not its corrected mean. In a spin
-about a principal axis the effect of the inertia is proportional to the nutation, whose estimate is noise. With a point
-of linearisation that moves from pose to pose, a direction without information would seem to have some (first-estimates
-Jacobians: Huang, Mourikis, Roumeliotis, Int. J. Robotics Research 29, 2010), and the predicted covariance of an instant
-would rise and fall from pose to pose. Along one trajectory and without disturbances, each pose can only reduce it.
+Covariance and Jacobians of a component follow the trajectory that the fit gave it, not its
+corrected mean. In a spin about a principal axis the effect of the inertia is proportional to the
+nutation, whose estimate is noise. With a point of linearisation that moves from pose to pose, a
+direction without information would seem to have some (first-estimates Jacobians: Huang, Mourikis,
+Roumeliotis, Int. J. Robotics Research 29, 2010), and the predicted covariance of an instant would
+rise and fall from pose to pose. Along one trajectory and without disturbances, each pose can only
+reduce it.
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ from avsreplay.records import Belief, Forecast
 
 _NO_POSE = np.zeros((6, 6))  # root of the information of a scan without a pose
 _SMALL_EXCESS = 1.1  # largest ratio of the corrected covariance to that of the last pose
-_POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])  # half angle in {C} and position in {A} of the chart's steps
+_POSE = np.ix_(
+    [0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8]
+)  # half angle in {C} and position in {A} of the chart's steps
 _ORIGIN = (0.0, 0.0, 0.0)
 _MOVED = 0.5  # sum of the changes of the weights above which the mixture is not a quadrature
 
@@ -39,11 +44,12 @@ _MOVED = 0.5  # sum of the changes of the weights above which the mixture is not
 class Component:
     """One Gaussian of a mixture.
 
-    The covariance is in the chart: where two moments are nearly equal, rounding of the much larger error states of mu
-    would spoil that of the other states.
+    The covariance is in the chart: where two moments are nearly equal, rounding of the much larger
+    error states of mu would spoil that of the other states.
 
     Attributes:
-        weight: by now.  quadrature: its weight at the fit.
+        weight: by now.
+        quadrature: its weight at the fit.
         t_ns: instant of ``chart``, its mean, and of ``P`` (20, 20), its covariance in the chart.
         share: part of the correction by process noise that the mean contains.
         reference: motion about which ``P`` is linearised, ``chart`` where it is None.
@@ -59,7 +65,10 @@ class Component:
 
 
 def moments(components: tuple[Component, ...]) -> Belief:
-    """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
+    """Mean and second moments about it.
+
+    The mean of the first component, and what the weights have moved it since.
+    """
     return _belief(_joined(components))
 
 
@@ -87,15 +96,18 @@ def _joined(components: tuple[Component, ...]) -> Component:
 
 
 def worn(components: tuple[Component, ...]) -> bool:
-    """Return whether the poses since the fit have changed the weights so much that another fit is due."""
+    """Return whether the poses since the fit have changed the weights so much that another fit is
+    due.
+    """
     return sum(abs(c.weight - c.quadrature) for c in components) > _MOVED
 
 
 def volumes(P: Sequence[Array], rows: Sequence[Array]) -> Array:
     """Volumes (n,) of 1 sigma of n covariances, relative to the largest one.
 
-    The probability of a fit with some directions fixed is that of its cost times this volume (Laplace's approximation):
-    a spin that is unstable for an inertia needs initial values in a small volume to look like the measured one.
+    The probability of a fit with some directions fixed is that of its cost times this volume
+    (Laplace's approximation): a spin that is unstable for an inertia needs initial values in a
+    small volume to look like the measured one.
 
     Args:
         P: n covariances (20, 20) in chart steps.
@@ -103,7 +115,11 @@ def volumes(P: Sequence[Array], rows: Sequence[Array]) -> Array:
     """
     R = np.reshape(rows, (-1, DIM))
     logs = np.array([np.linalg.slogdet(C)[1] - np.linalg.slogdet(R @ C @ R.T)[1] for C in P])
-    return np.asarray(np.exp(0.5 * (logs - logs.max()))) if np.isfinite(logs).all() else np.ones(len(P))
+    return (
+        np.asarray(np.exp(0.5 * (logs - logs.max())))
+        if np.isfinite(logs).all()
+        else np.ones(len(P))
+    )
 
 
 def carried(
@@ -122,8 +138,8 @@ def carried(
         components: after an earlier pose.
         t_ns: instant of the pose [ns].
         pose: measured T_ac.
-        root: (6, 6), lower triangular; root' root is the information of d = [theta; v] in {C} [rad, m], T_true =
-            T_ac Exp(d). It may be singular.
+        root: (6, 6), lower triangular; root' root is the information of d = [theta; v] in {C} [rad,
+            m], T_true = T_ac Exp(d). It may be singular.
         factors: (2,) on the standard deviations of attitude and position.
         weight: Cauchy weight of the pose.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
@@ -146,20 +162,35 @@ def carried(
     )
     found = misfits.tolist()
     best = min(found)
-    weights = [c.weight * math.exp(0.5 * (best - value)) for c, value in zip(components, found, strict=True)]
+    weights = [
+        c.weight * math.exp(0.5 * (best - value))
+        for c, value in zip(components, found, strict=True)
+    ]
     total = sum(weights)
     return tuple(
         Component(
-            weights[k] / total, c.quadrature, t_ns, Chart(charts[k]), definite(P[k]), c.share, Chart(references[k])
+            weights[k] / total,
+            c.quadrature,
+            t_ns,
+            Chart(charts[k]),
+            definite(P[k]),
+            c.share,
+            Chart(references[k]),
         )
         for k, c in enumerate(components)
     )
 
 
 def without_pose(
-    components: tuple[Component, ...], t_ns: int, near: Pose, noise: tuple[float, float], orbit: RelativeOrbit | None
+    components: tuple[Component, ...],
+    t_ns: int,
+    near: Pose,
+    noise: tuple[float, float],
+    orbit: RelativeOrbit | None,
 ) -> tuple[Component, ...]:
-    """The mixture at another instant, as ``carried`` with a pose ``near`` its own that has no information."""
+    """The mixture at another instant, as ``carried`` with a pose ``near`` its own that has no
+    information.
+    """
     return carried(components, t_ns, near, _NO_POSE, NO_INFLATION, 1.0, noise, orbit)
 
 
@@ -172,16 +203,19 @@ def not_worse(
     noise: tuple[float, float],
     orbit: RelativeOrbit | None = None,
 ) -> tuple[Component, ...]:
-    """The result of a fit, corrected by its last pose where it states that pose less precisely than it was measured.
+    """The result of a fit, corrected by its last pose where it states that pose less precisely than
+    it was measured.
 
-    A fit weights all poses alike and adds the covariance that disturbances cause afterwards. Where these are large, its
-    mean at the last pose is far from that pose. In the directions in which the pose's covariance S exceeds C, the pose
-    is used as a measurement with the information C^-1 - S^-1, which makes the posterior covariance C. As the fit has
-    used the pose before, it is not made smaller than that.
+    A fit weights all poses alike and adds the covariance that disturbances cause afterwards. Where
+    these are large, its mean at the last pose is far from that pose. In the directions in which the
+    pose's covariance S exceeds C, the pose is used as a measurement with the information C^-1 -
+    S^-1, which makes the posterior covariance C. As the fit has used the pose before, it is not
+    made smaller than that.
 
     Args:
         components: the result of the fit.
-        t_ns: instant of its last pose [ns]: the mean instant of the points, where each has its own time.
+        t_ns: instant of its last pose [ns]: the mean instant of the points, where each has its own
+            time.
         pose: that pose T_ac, as measured.
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
         weight: Cauchy weight of the pose.
@@ -198,12 +232,16 @@ def not_worse(
     after = carried(components, t_ns, pose, root, np.ones(2), weight, noise, orbit)
     if _excess(after, whiten)[0][-1] <= _SMALL_EXCESS:
         return after
-    # the components lie further apart than C: the pose can only move each of them within its own covariance
+    # the components lie further apart than C: the pose can only move each of them within its own
+    # covariance
     return carried((_joined(components),), t_ns, pose, root, np.ones(2), weight, noise, orbit)
 
 
 def _excess(components: tuple[Component, ...], whiten: Array) -> tuple[Array, Array]:
-    """Ascending eigenvalues of S in units of C, and their directions in columns; ``whiten`` C whiten' = 1."""
+    """Ascending eigenvalues of S in units of C, and their directions in columns.
+
+    ``whiten`` C whiten' = 1.
+    """
     joined = _joined(components)
     R_ac = rotation(joined.chart.q_ac)
     J = np.hstack([2.0 * whiten[:, :3], whiten[:, 3:] @ R_ac.T])
@@ -226,10 +264,11 @@ def mixture_forecast(
     force: float,
     origin_c: tuple[float, float, float] = _ORIGIN,
 ) -> Forecast:
-    """Predicted 1 sigma of the grasp point about the published motion, each component about its own trajectory.
+    """Predicted 1 sigma of the grasp point about the published motion, each component about its own
+    trajectory.
 
-    About the mean alone the propagation would be wrong by orders of magnitude where the components differ in inertia:
-    a spin that is stable for one of them is unstable for another.
+    About the mean alone the propagation would be wrong by orders of magnitude where the components
+    differ in inertia: a spin that is stable for one of them is unstable for another.
 
     Args:
         components: at the last pose.
@@ -242,7 +281,10 @@ def mixture_forecast(
     times = np.asarray(times_s, dtype=np.float64)
     ahead, published = times + (t_ns - components[0].t_ns) * 1e-9, _joined(components)
     about = [separated(c.reference or c.chart, c.P) for c in components]
-    fastest = max(float(np.abs(chart.w_c).max()) for chart in (*about, *(c.chart for c in components), published.chart))
+    fastest = max(
+        float(np.abs(chart.w_c).max())
+        for chart in (*about, *(c.chart for c in components), published.chart)
+    )
     if fastest * float(ahead.max(initial=0.0)) > MOST_RAD:
         return Forecast(times, *np.full((3, len(times)), np.inf))
     moments = _motion.mixture_forecast(
@@ -260,12 +302,14 @@ def mixture_forecast(
 
 
 def contradicted(belief: Belief, fitted: Belief) -> bool:
-    """Return whether the means differ by more than 99.99 % of the larger covariance, both at one instant.
+    """Return whether the means differ by more than 99.99 % of the larger covariance, both at one
+    instant.
 
-    Both use the same poses. Where a fit is efficient, their difference has the covariance P - P_fit (Hausman's test),
-    which is below P; a belief that claims less than the fit may differ by the fit's covariance. In each generalised
-    eigendirection of P and P_fit the larger of the two is therefore the scale. The difference is taken in the chart,
-    where the order of the axes has no effect.
+    Both use the same poses. Where a fit is efficient, their difference has the covariance P - P_fit
+    (Hausman's test), which is below P; a belief that claims less than the fit may differ by the
+    fit's covariance. In each generalised eigendirection of P and P_fit the larger of the two is
+    therefore the scale. The difference is taken in the chart, where the order of the axes has no
+    effect.
     """
     here, there = to_chart(belief.x), to_chart(fitted.x)
     T = to_errors(there)

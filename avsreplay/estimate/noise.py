@@ -1,13 +1,16 @@
-"""The measurement noise R: registration covariance or R0, adapted from residuals, and its correlation in time.
+"""The measurement noise R: registration covariance or R0, adapted from residuals, and its
+correlation in time.
 
-Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding errors do not
-accumulate. There are two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps
-the shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
-attitude. Its square s^2 is the sum of r' R_b^-1 r over the sum of the degrees of freedom that the update leaves, 3 -
-tr(R_b^-1 H P+ H') / s^2 for a block. There the derivative of the likelihood of the innovations vanishes. The level of
-the last fit is its prior, with the weight of a few scans: under large disturbances the residuals hardly determine R.
-Two numbers are estimated from a window instead of 21, so that the scatter of the factors hardly affects the
-consistency. The sums use the weights of the updates, so that outliers do not increase R.
+Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding
+errors do not accumulate. There are two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma
+the mean of r r'. ``scale`` keeps the shape of the base R (the registration's own covariance, else
+R0) and adapts one factor for position and one for attitude. Its square s^2 is the sum of r' R_b^-1
+r over the sum of the degrees of freedom that the update leaves, 3 - tr(R_b^-1 H P+ H') / s^2 for a
+block. There the derivative of the likelihood of the innovations vanishes. The level of the last fit
+is its prior, with the weight of a few scans: under large disturbances the residuals hardly
+determine R. Two numbers are estimated from a window instead of 21, so that the scatter of the
+factors hardly affects the consistency. The sums use the weights of the updates, so that outliers do
+not increase R.
 """
 
 from __future__ import annotations
@@ -29,22 +32,33 @@ from avsreplay.records import Alignment, Belief, Innovation, State
 BOUND = 52.4  # 99.99 % point of chi-square with 20 degrees of freedom, for a state
 NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
-_FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine
+_FREE_RAD = (
+    1.0  # standard deviation of an attitude direction that a degenerate view does not determine
+)
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
 _LEVEL_DOF = 10.0  # degrees of freedom with which the level of the last fit counts in the window
 _MOST_COMMON = 0.8  # largest share from errors of the model: the views of two scans differ
 _LAGS = (5, 10, 20, 40)
-_CALM = 7.0  # log likelihood ratio of the usual noise over the risen one from which the rise has ended
+_CALM = (
+    7.0  # log likelihood ratio of the usual noise over the risen one from which the rise has ended
+)
 _EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
-_MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
+_MOST_ALIKE = (
+    50.0  # largest number of scans with correlated errors, reached where the view does not turn
+)
 
 
 def integrated_autocorrelation(e: Array) -> float:
-    """1 + 2 sum of the autocorrelations of rows e (n, 3), over the lags with the largest significant (3 sigma) sum."""
+    """1 + 2 sum of the autocorrelations of rows e (n, 3), over the lags with the largest
+    significant (3 sigma) sum.
+    """
     n, e = len(e), np.ascontiguousarray(e).reshape(-1)
     total = float(e @ e)
     lags = [k for k in _LAGS if k <= n // 8]
-    rho = [float(e[3 * k :] @ e[: -3 * k]) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
+    rho = [
+        float(e[3 * k :] @ e[: -3 * k]) / total * n / (n - k)
+        for k in range(1, max(lags, default=0) + 1)
+    ]
     sums = [(sum(rho[:k]), 3.0 * np.sqrt(k / (3.0 * n))) for k in lags]
     return 1.0 + 2.0 * max((found for found, bound in sums if found > bound), default=0.0)
 
@@ -54,8 +68,10 @@ class NoiseEpoch:
     """One healthy epoch.
 
     Attributes:
-        outer: r r' (6, 6).  HPH: H P+ H' (6, 6).
-        squares: r' R_b^-1 r of position and attitude.  left: the degrees of freedom that the update leaves of them.
+        outer: r r' (6, 6).
+        HPH: H P+ H' (6, 6).
+        squares: r' R_b^-1 r of position and attitude.
+        left: the degrees of freedom that the update leaves of them.
         weight: of the update.
     """
 
@@ -72,7 +88,8 @@ class NoiseRise:
 
     Attributes:
         factor: (6,) on the standard deviation of a pose (position, half angle); 1 without a rise.
-        calm: log likelihood ratio of the usual noise over the risen one in the last scans, 0 at least.
+        calm: log likelihood ratio of the usual noise over the risen one in the last scans, 0 at
+            least.
     """
 
     factor: Array
@@ -92,8 +109,8 @@ class NoiseWindow:
     """The last healthy epochs, oldest first, at most the window's length.
 
     Attributes:
-        factors: (6,) standard deviations relative to the base R, position three times, attitude three times; 1 until
-            the window is full.
+        factors: (6,) standard deviations relative to the base R, position three times, attitude
+            three times; 1 until the window is full.
         many_outliers: more than a tenth of the weight is lost: the poses contradict the estimate.
         level: (2,) variance of position and attitude relative to the base R by the last fit.
         rise: of the noise, which the base R contains.
@@ -114,10 +131,16 @@ class NoiseWindow:
 def push(
     window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
 ) -> NoiseWindow:
-    """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R that was used."""
+    """The window with one more epoch.
+
+    Residual (6,) after the update, H P+ H' (6, 6), the base R that was used.
+    """
     (a, b), known = _motion.block_squares(base, residual, HPH)
     factors = window.factors[::3].tolist()
-    p, q = (max(3.0 - each / (factor * factor), 0.0) for each, factor in zip(known, factors, strict=True))
+    p, q = (
+        max(3.0 - each / (factor * factor), 0.0)
+        for each, factor in zip(known, factors, strict=True)
+    )
     epoch = NoiseEpoch(residual[:, None] * residual, HPH, (a, b), (p, q), weight)
     return _summed((*window.epochs[-length + 1 :], epoch), length, window.level, window.rise)
 
@@ -130,8 +153,8 @@ def risen(window: NoiseWindow, factor: Array) -> NoiseWindow:
 def lasting(window: NoiseWindow, seen: Innovation) -> NoiseWindow:
     """The window after an accepted scan: without a rise if the last scans show the usual noise.
 
-    The log likelihood ratio of the two noise levels is summed over the scans (cumulative sum; Page, Biometrika 41,
-    1954).
+    The log likelihood ratio of the two noise levels is summed over the scans (cumulative sum; Page,
+    Biometrika 41, 1954).
 
     Args:
         window: before the scan.
@@ -148,7 +171,10 @@ def lasting(window: NoiseWindow, seen: Innovation) -> NoiseWindow:
 
 
 def _summed(
-    epochs: tuple[NoiseEpoch, ...], length: int, level: tuple[float, float], rise: NoiseRise = NO_RISE
+    epochs: tuple[NoiseEpoch, ...],
+    length: int,
+    level: tuple[float, float],
+    rise: NoiseRise = NO_RISE,
 ) -> NoiseWindow:
     weight = sum([epoch.weight for epoch in epochs])
     many_outliers = weight < (1.0 - _MANY_OUTLIERS) * len(epochs)
@@ -156,14 +182,20 @@ def _summed(
         return NoiseWindow(epochs, _ONES, many_outliers, level, rise)
     factors = []
     for block in (0, 1):
-        squares = sum([epoch.weight * epoch.squares[block] for epoch in epochs]) + _LEVEL_DOF * level[block]
+        squares = (
+            sum([epoch.weight * epoch.squares[block] for epoch in epochs])
+            + _LEVEL_DOF * level[block]
+        )
         left = sum([epoch.weight * epoch.left[block] for epoch in epochs]) + _LEVEL_DOF
         factors += [math.sqrt(squares / left)] * 3
     return NoiseWindow(epochs, np.array(factors), many_outliers, level, rise)
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
-    """The paper's R: R0 until the window is full, then Sigma, the mean of r r' over it, plus the latest H P+ H'."""
+    """The paper's R.
+
+    R0 until the window is full, then Sigma, the mean of r r' over it, plus the latest H P+ H'.
+    """
     if len(window.epochs) < length:
         return R0
     weight = sum(epoch.weight for epoch in window.epochs)
@@ -172,10 +204,14 @@ def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
 
 
 def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
-    """A full window with the noise ``factors`` (2,) of attitude and position that a fit found on ``base`` (6, 6)."""
+    """A full window with the noise ``factors`` (2,) of attitude and position that a fit found on
+    ``base`` (6, 6).
+    """
     attitude, position = factors.tolist()
     s, level = factors[::-1].repeat(3), (position**2, attitude**2)
-    epoch = NoiseEpoch(base * np.outer(s, s), np.zeros((6, 6)), (3.0 * level[0], 3.0 * level[1]), (3.0, 3.0), 1.0)
+    epoch = NoiseEpoch(
+        base * np.outer(s, s), np.zeros((6, 6)), (3.0 * level[0], 3.0 * level[1]), (3.0, 3.0), 1.0
+    )
     return _summed((epoch,) * length, length, level)
 
 
@@ -203,10 +239,12 @@ def _eigen(R: Array, R0: Array) -> tuple[Array, Array]:
 
 
 def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
-    """Covariance (6n, 6n) of the errors of n neighbouring scans that have a share of their variance in common.
+    """Covariance (6n, 6n) of the errors of n neighbouring scans that have a share of their variance
+    in common.
 
-    The common part of scan k is sqrt(share_k) L_k z with one z for all scans and R_k = L_k L_k', so the covariance of
-    scans i and j is sqrt(share_i share_j) L_i L_j'. The matrix is positive semidefinite for any R and shares up to 1.
+    The common part of scan k is sqrt(share_k) L_k z with one z for all scans and R_k = L_k L_k', so
+    the covariance of scans i and j is sqrt(share_i share_j) L_i L_j'. The matrix is positive
+    semidefinite for any R and shares up to 1.
 
     Args:
         R: (6, 6) noise of each scan.
@@ -221,14 +259,15 @@ def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
 
 
 def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a covariance that rounding may have made indefinite, or of several of one size.
+    """Lower Cholesky factor of a covariance that rounding may have made indefinite, or of several
+    of one size.
 
     Args:
         C: (..., n, n) covariance.
 
     Returns:
-        (..., n, n) factor of C; if one is indefinite, of each plus the smallest multiple of the identity, relative to
-        its mean variance, that suffices for all.
+        (..., n, n) factor of C; if one is indefinite, of each plus the smallest multiple of the
+        identity, relative to its mean variance, that suffices for all.
 
     Raises:
         ValueError: no multiple suffices, as with a matrix that is not finite.
@@ -275,14 +314,18 @@ class Noise:
         return np.asarray(R / (s[:, None] * s))
 
     def rescaled(self, R: Array, before: NoiseWindow, after: NoiseWindow) -> Array:
-        """An R that ``of`` returned with one window, as it is with the factors and the rise of another."""
+        """An R that ``of`` returned with one window, as it is with the factors and the rise of
+        another.
+        """
         s = after.rise.factor / before.rise.factor
         if self.params.adapt is Adaptation.SCALE:
             s = s * (after.factors / before.factors)
         return np.asarray(R * (s[:, None] * s))
 
     def dof(self, alignment: Alignment) -> float:
-        """Degrees of freedom of the base R as an estimate from the residuals of the scan, inf where it is none."""
+        """Degrees of freedom of the base R as an estimate from the residuals of the scan, inf where
+        it is none.
+        """
         own = self.params.noise is NoiseSource.R0 or self.params.adapt is Adaptation.MATRIX
         return math.inf if own or alignment.covariance is None else alignment.dof
 
@@ -293,9 +336,10 @@ class Noise:
     def correlated_share(self, alignment: Alignment, counted: float = 0.0) -> float:
         """The share of R, from 0 to 1, that poses from nearly the same view have in common.
 
-        The variance from independent errors of the points falls with the number of inliers; that from the bias of
-        points near edges does not. Their ratio is K inliers (rms / extent)^2, whatever the target's size. K was fitted
-        to simulated scans of five meshes. Errors of the model are common to near views as well.
+        The variance from independent errors of the points falls with the number of inliers; that
+        from the bias of points near edges does not. Their ratio is K inliers (rms / extent)^2,
+        whatever the target's size. K was fitted to simulated scans of five meshes. Errors of the
+        model are common to near views as well.
 
         Args:
             alignment: of the scan.
@@ -305,14 +349,21 @@ class Noise:
             return self.params.correlated_share
         lean = _EDGE_LEAN * alignment.inliers * (alignment.rms_m / self._extent_m) ** 2
         edges = lean / (1.0 + lean)
-        return max(edges, min(counted * systematic_share(alignment), _MOST_COMMON)) if counted else edges
+        return (
+            max(edges, min(counted * systematic_share(alignment), _MOST_COMMON))
+            if counted
+            else edges
+        )
 
-    def inflation(self, known: Array | None, mean: float, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
-        """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.
+    def inflation(
+        self, known: Array | None, mean: float, w_b: Array, dt_ns: int, correlated_share: float
+    ) -> Array:
+        """(2,) factor on R for errors correlated in time: that of the last fit, else from the
+        rotation between scans.
 
-        That of the fit holds for the ``mean`` share of its poses. Without it, neighbours have ``correlated_share`` of
-        their variance in common over ``correlated_rad``: 1 + 2 sum of correlations. The paper's filter assumes white
-        errors.
+        That of the fit holds for the ``mean`` share of its poses. Without it, neighbours have
+        ``correlated_share`` of their variance in common over ``correlated_rad``: 1 + 2 sum of
+        correlations. The paper's filter assumes white errors.
         """
         if known is not None:
             return 1.0 + (known - 1.0) * (correlated_share / mean if mean > 0.0 else 1.0)
@@ -323,7 +374,13 @@ class Noise:
         return np.full(2, 1.0 + 2.0 * correlated_share * scans)
 
     def updated(
-        self, window: NoiseWindow, prior: State, H: Array, innovation: Innovation, posterior: Belief, inflation: Array
+        self,
+        window: NoiseWindow,
+        prior: State,
+        H: Array,
+        innovation: Innovation,
+        posterior: Belief,
+        inflation: Array,
     ) -> NoiseWindow:
         """The window with this epoch's a-posteriori residual z - h(x+), relative to the base R.
 
@@ -331,7 +388,14 @@ class Noise:
         """
         left = residual(posterior.x, prior, innovation.alpha)
         HPH = _motion.pose_covariance(posterior.P, H) * (2.0 / float(inflation[0] + inflation[1]))
-        return push(window, left, HPH, self.base(innovation.R, window), self.params.window, innovation.weight)
+        return push(
+            window,
+            left,
+            HPH,
+            self.base(innovation.R, window),
+            self.params.window,
+            innovation.weight,
+        )
 
     def _base(self, alignment: Alignment, x: State) -> Array:
         if self.params.noise is NoiseSource.R0 or self.params.adapt is Adaptation.MATRIX:

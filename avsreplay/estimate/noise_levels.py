@@ -2,15 +2,17 @@
 
 The residuals of a fit are a sum of independent parts whose covariances are known but for a factor:
 
-- errors of the registered poses, independent from scan to scan;
-- errors of the registered poses that views of the target from nearly the same direction have in common (points next to
-  an edge, interior faces, a coarse mesh): a function on the sphere of view directions, with a Gaussian correlation;
+- errors of the registered poses, independent from scan to scan; - errors of the registered poses
+that views of the target from nearly the same direction have in common (points next to
+  an edge, interior faces, a coarse mesh): a function on the sphere of view directions, with a
+  Gaussian correlation;
 - the disturbance torque and force, white in time, which displace all later poses.
 
-Attitude and position have factors of their own, so that there are six. They are estimated from some tens of normal
-points by the average-information algorithm (Gilmour, Thompson and Cullis, Biometrics 51, 1995), which takes the degrees
-of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
-well. The claimed noise is the prior, with the weight of a few poses.
+Attitude and position have factors of their own, so that there are six. They are estimated from some
+tens of normal points by the average-information algorithm (Gilmour, Thompson and Cullis, Biometrics
+51, 1995), which takes the degrees of freedom of the fit into account. Differences within the normal
+points give the independent part of the errors as well. The claimed noise is the prior, with the
+weight of a few poses.
 
 The density of a disturbance stands for all candidates, none among them (``disturbance_density``).
 """
@@ -63,10 +65,12 @@ class NoiseLevels:
         white: (attitude, position) factor on the independent part of the claimed variance.
         common: the same on the part that near views have in common.
         torque, force: root densities of the disturbances [rad/s^1.5, m/s^1.5].
-        slack: by which disturbances enlarge the squared residuals of a fit without them, at least 1.
+        slack: by which disturbances enlarge the squared residuals of a fit without them, at least
+            1.
         count: poses of the estimate, 0 for the prior.
         established: the poses show a random disturbance.
-        excluded: root densities of torque and force from which on the poses exclude a random disturbance.
+        excluded: root densities of torque and force from which on the poses exclude a random
+            disturbance.
     """
 
     white: tuple[float, float] = (1.0, 1.0)
@@ -79,8 +83,12 @@ class NoiseLevels:
     excluded: tuple[float, float] = (math.inf, math.inf)
 
     def factors(self, share: float) -> Array:
-        """(2,) factors on the claimed standard deviations of poses with this claimed share of common errors."""
-        return np.sqrt([w * (1.0 - share) + c * share for w, c in zip(self.white, self.common, strict=True)])
+        """(2,) factors on the claimed standard deviations of poses with this claimed share of
+        common errors.
+        """
+        return np.sqrt(
+            [w * (1.0 - share) + c * share for w, c in zip(self.white, self.common, strict=True)]
+        )
 
 
 NO_LEVELS = NoiseLevels()
@@ -88,7 +96,8 @@ NO_LEVELS = NoiseLevels()
 
 
 def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) -> Array:
-    """(2, n, n) covariance of the whitened residuals of attitude and of position, each the same for its three axes.
+    """(2, n, n) covariance of the whitened residuals of attitude and of position, each the same for
+    its three axes.
 
     Args:
         points: poses, or normal points.
@@ -96,7 +105,12 @@ def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) ->
         factors: (2,) noise factors with which the residuals are whitened.
     """
     white, common = error_parts(points)
-    return np.array([(levels.white[b] * white + levels.common[b] * common) / factors[b] ** 2 for b in range(BLOCKS)])
+    return np.array(
+        [
+            (levels.white[b] * white + levels.common[b] * common) / factors[b] ** 2
+            for b in range(BLOCKS)
+        ]
+    )
 
 
 def mean_share(points: Poses) -> float:
@@ -113,7 +127,8 @@ def estimate_levels(
     others: tuple[Array, Array] | None = None,
     positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
-    """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses, in parts.
+    """Improve variance components by a bounded number of steps, from those of an estimate with
+    fewer poses, in parts.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
@@ -122,12 +137,15 @@ def estimate_levels(
         claimed: only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
         others: effects and size of other unknowns, as in ``disturbed_likelihood``.
-        positions: of more poses, from which the density of the force is found; None for those of ``points``.
+        positions: of more poses, from which the density of the force is found; None for those of
+            ``points``.
     """
     n, theta = len(points), _variances(levels)
     open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
     open_[2:4] &= points.shares is not None and bool(np.any(points.shares))
-    theta[4:] = [old if given is None else given**2 for old, given in zip(theta[4:], fixed, strict=True)]
+    theta[4:] = [
+        old if given is None else given**2 for old, given in zip(theta[4:], fixed, strict=True)
+    ]
     data, parts = _linearised(points, problem)
     data = data if others is None else _extended(data, *others)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
@@ -139,7 +157,10 @@ def estimate_levels(
         if positions is not None and k == 5:
             found[k] = _of_positions(likely, positions), positions.present
         else:
-            found[k] = marginal(_covariance(likely, parts, k), parts.effects[k - 4], data), parts.present[k - 4]
+            found[k] = (
+                marginal(_covariance(likely, parts, k), parts.effects[k - 4], data),
+                parts.present[k - 4],
+            )
         yield n**3 // 40
     for k, each in found.items():
         beside = found[9 - k][0].evidence if 9 - k in found else 0.0
@@ -154,7 +175,10 @@ def estimate_levels(
         force=math.sqrt(theta[5]),
         slack=slack,
         established=any(each.evidence > _ESTABLISHED for each, _ in found.values()),
-        excluded=(found[4][0].excluded if 4 in found else 0.0, found[5][0].excluded if 5 in found else 0.0),
+        excluded=(
+            found[4][0].excluded if 4 in found else 0.0,
+            found[5][0].excluded if 5 in found else 0.0,
+        ),
     )
 
 
@@ -178,28 +202,35 @@ def disturbed_likelihood(
     kinds: Sequence[int],
     others: Sequence[tuple[Array, Array]] = (),
 ) -> float:
-    """Log likelihood of the poses with random disturbances of the likeliest densities, or with other unknowns instead.
+    """Log likelihood of the poses with random disturbances of the likeliest densities, or with
+    other unknowns instead.
 
-    The greatest likelihood and not its mean over all densities: these range over eight decades, and the mean would make
-    random disturbances less likely by the logarithm of the number of candidates.
+    The greatest likelihood and not its mean over all densities: these range over eight decades, and
+    the mean would make random disturbances less likely by the logarithm of the number of
+    candidates.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
         problem: their cost, linearised at the fit.
-        levels: variance components; those of the errors of the poses and of the other disturbance are used.
+        levels: variance components; those of the errors of the poses and of the other disturbance
+            are used.
         kinds: 0 for a random torque, 1 for a random force, or both.
-        others: the other unknowns with each of several priors that are equally likely: (n, 6, m) effect on the whitened
-            residuals of each at its prior 1 sigma, and (m,) size in the motion about which the residuals are, in
-            1 sigma.
+        others: the other unknowns with each of several priors that are equally likely: (n, 6, m)
+            effect on the whitened residuals of each at its prior 1 sigma, and (m,) size in the
+            motion about which the residuals are, in 1 sigma.
     """
     data, parts = _linearised(points, problem)
     theta, likelihood = _variances(levels), -math.inf
     if others:
         theta[[4 + k for k in kinds]] = 0.0
         V, nothing = _covariance(theta, parts), np.zeros((data.e.size, 0))
-        return _log_mean(np.array([marginal(V, nothing, _extended(data, *each)).none for each in others]))
+        return _log_mean(
+            np.array([marginal(V, nothing, _extended(data, *each)).none for each in others])
+        )
     for k in (*kinds, *kinds[:-1]):  # each given the other
-        density, likelihood = marginal(_covariance(theta, parts, 4 + k), parts.effects[k], data).likeliest
+        density, likelihood = marginal(
+            _covariance(theta, parts, 4 + k), parts.effects[k], data
+        ).likeliest
         theta[4 + k] = density**2
     return likelihood
 
@@ -217,9 +248,11 @@ class _Components:
     """The six components at unit factors.
 
     Attributes:
-        C: their covariances; of the errors of attitude and position (3n, 3n), of the disturbances (6n, 6n).
+        C: their covariances; of the errors of attitude and position (3n, 3n), of the disturbances
+            (6n, 6n).
         effects: (6n, 3(n - 1)) of torque and of force, the roots of their covariances.
-        present: the rate in {B} and the velocity at the last point, by initial values and by these impulses.
+        present: the rate in {B} and the velocity at the last point, by initial values and by these
+            impulses.
     """
 
     C: tuple[Array, ...]
@@ -228,11 +261,15 @@ class _Components:
 
 
 def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components]:
-    """Residuals about the chart of ``problem``, ordered by axis, attitude first, then pose, and the six components."""
+    """Residuals about the chart of ``problem``, ordered by axis, attitude first, then pose, and the
+    six components.
+    """
     (e, H), T = problem.core.rows(), to_errors(problem.chart)
     white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
     *effects, present = _disturbances(points, problem.chart, H, T)
-    torque, force, J = (np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in (*effects, H @ T))
+    torque, force, J = (
+        np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in (*effects, H @ T)
+    )
     f, off = problem.factors**-2.0, problem.chart.minus(problem.prior.mean)
     C = white * f[0], white * f[1], common * f[0], common * f[1], torque @ torque.T, force @ force.T
     data = Residuals(np.ascontiguousarray(e.T).reshape(-1), J, problem.prior.info, off)
@@ -243,7 +280,9 @@ def _extended(data: Residuals, effects: Array, size: Array) -> Residuals:
     """The residuals with other unknowns, as in ``disturbed_likelihood``."""
     m = len(size)
     J = np.hstack([data.J, np.ascontiguousarray(effects.transpose(1, 0, 2)).reshape(-1, m)])
-    info = np.block([[data.info, np.zeros((len(data.info), m))], [np.zeros((m, len(data.info))), np.eye(m)]])
+    info = np.block(
+        [[data.info, np.zeros((len(data.info), m))], [np.zeros((m, len(data.info))), np.eye(m)]]
+    )
     return Residuals(data.e, J, info, np.concatenate([data.off, size]))
 
 
@@ -262,17 +301,23 @@ def _covariance(theta: Array, parts: _Components, without: int | None = None) ->
     return V
 
 
-def _disturbances(points: Poses, chart: Chart, H: Array, T: Array) -> tuple[Array, Array, tuple[Present, Present]]:
-    """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit density; the present.
+def _disturbances(
+    points: Poses, chart: Chart, H: Array, T: Array
+) -> tuple[Array, Array, tuple[Present, Present]]:
+    """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit
+    density; the present.
 
-    The disturbance between two neighbouring poses acts as one impulse in the middle. An impulse equals the errors at
-    the epoch from which free motion leads to it. ``T`` (20, 20): derivative of the errors by chart steps.
+    The disturbance between two neighbouring poses acts as one impulse in the middle. An impulse
+    equals the errors at the epoch from which free motion leads to it. ``T`` (20, 20): derivative of
+    the errors by chart steps.
     """
     x, times, n = to_state(chart), points.times_s, len(points)
     middle, root = 0.5 * (times[1:] + times[:-1]), np.sqrt(np.diff(times))
     later = times[:, None] > middle
     back = impulses(x, middle) * np.sqrt(torque_density(x.sigma, 1.0))
-    turn = (H[:, :, :6].reshape(-1, 6) @ back.transpose(1, 0, 2).reshape(6, -1)).reshape(n, 6, -1, 3)
+    turn = (H[:, :, :6].reshape(-1, 6) @ back.transpose(1, 0, 2).reshape(6, -1)).reshape(
+        n, 6, -1, 3
+    )
     push = H[:, :, None, VEL] - middle[:, None] * H[:, :, None, RHO]
     weight = (later * root)[:, None, :, None]
     Phi = propagate_state(x, float(times[-1]), points.arc)[1]
@@ -281,7 +326,9 @@ def _disturbances(points: Poses, chart: Chart, H: Array, T: Array) -> tuple[Arra
     return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1), present
 
 
-def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: Residuals, points: Poses) -> Array:
+def _improved(
+    theta: Array, open_: NDArray[np.bool_], parts: _Components, data: Residuals, points: Poses
+) -> Array:
     """Variance components (6,) after one step of average information from theta (6,)."""
     inverse = np.linalg.inv(_covariance(theta, parts))
     VJ = inverse @ data.J
@@ -291,7 +338,10 @@ def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: 
     P, Py = inverse - VJ @ G @ VJ.T, inverse @ left
     applied, traces, half = np.zeros((6, len(Py))), np.zeros(6), len(parts.C[0])
     for k in np.flatnonzero(open_).tolist():
-        here, C = slice(None) if k >= 4 else slice(half * (k % 2), half * (k % 2) + half), parts.C[k]
+        here, C = (
+            slice(None) if k >= 4 else slice(half * (k % 2), half * (k % 2) + half),
+            parts.C[k],
+        )
         applied[k, here] = C @ Py[here]
         traces[k] = float(np.sum(C * P[here, here]))
     score = 0.5 * (applied @ Py - traces)
@@ -304,12 +354,17 @@ def _improved(theta: Array, open_: NDArray[np.bool_], parts: _Components, data: 
 
 
 def _priors(points: Poses) -> list[tuple[float, float]]:
-    """Degrees of freedom and mean of what is known of the first four components besides the normal points."""
+    """Degrees of freedom and mean of what is known of the first four components besides the normal
+    points.
+    """
     out, share = [], mean_share(points)
     for b in range(BLOCKS):
         dof, total = _CLAIMED_DOF, _CLAIMED_DOF
         if points.within is not None:
-            dof, total = dof + points.within[1], total + points.within[0][b] / max(1.0 - share, 1e-3)
+            dof, total = (
+                dof + points.within[1],
+                total + points.within[0][b] / max(1.0 - share, 1e-3),
+            )
         out.append((dof, total / dof))
     return [*out, (_LAW_DOF, 1.0), (_LAW_DOF, 1.0)]
 
@@ -317,7 +372,8 @@ def _priors(points: Poses) -> list[tuple[float, float]]:
 def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) -> Array:
     """The components after a step, each changed by a bounded factor.
 
-    A disturbance whose derivative is negative goes to zero once it is a small part of its own standard deviation.
+    A disturbance whose derivative is negative goes to zero once it is a small part of its own
+    standard deviation.
     """
     disturbance = np.arange(6) >= 4
     free = open_ & ((theta > 0.0) | (score > 0.0)) & (np.diagonal(info) > 0.0)
@@ -325,7 +381,9 @@ def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) 
     if not np.any(free):
         return out
     scale = np.sqrt(np.diagonal(info)[free])
-    inverse = np.linalg.pinv(info[np.ix_(free, free)] / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    inverse = np.linalg.pinv(
+        info[np.ix_(free, free)] / np.outer(scale, scale), rcond=1e-9, hermitian=True
+    )
     factor = np.where(disturbance, _STEP**2, _STEP)[free]
     old, new = theta[free], theta[free] + inverse @ (score[free] / scale) / scale
     started = np.where(old > 0.0, np.clip(new, old / factor, old * factor), np.maximum(new, 0.0))

@@ -1,4 +1,7 @@
-"""Normal points: few poses that carry the information of many, for fits whose cost does not grow with the log."""
+"""Normal points.
+
+Few poses that carry the information of many, for fits whose cost does not grow with the log.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,14 @@ from avsreplay.estimate.measurement import GATE
 from avsreplay.geometry import Array
 from avsreplay.records import Manoeuvre
 
-_POINTS, _SPAN_RAD = 128, 0.25  # most normal points, and least rotation over which poses are joined [rad]
+_POINTS, _SPAN_RAD = (
+    128,
+    0.25,
+)  # most normal points, and least rotation over which poses are joined [rad]
 _FEW = 48  # poses up to which none are joined
 _NEIGHBOURS = 5  # poses with whose median a pose is compared
-_GROSS = 100.0  # squared difference of a gross error over the median of all poses, or over its expectation
+# squared difference of a gross error over the median of all poses, or over its expectation
+_GROSS = 100.0
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _FREE = (1e2, 1e3, 1e1)  # 1 sigma of arm [m], position [m] and velocity [m/s] before the positions
 _LEAST_M = 1e-6  # least 1 sigma of a displacement [m]
@@ -32,14 +39,17 @@ _ANY_PRIOR = Prior(Chart(np.zeros(34)), np.eye(DIM))  # of residuals, which do n
 
 @value_class
 class PositionRows:
-    """Positions of many poses as n points that are linear in the motion of the mass centre, whatever the rotation.
+    """Positions of many poses as n points that are linear in the motion of the mass centre,
+    whatever the rotation.
 
     Rows are whitened and ordered by axis of {C}, and for each axis by point.
 
     Attributes:
-        e: (3n,) positions.  J: (3n, m) of arm in {C}, position, velocity, and changes of them.
+        e: (3n,) positions.
+        J: (3n, m) of arm in {C}, position, velocity, and changes of them.
         info: (m, m) information of these unknowns before the positions.
-        white, common: (n, n) covariance of the independent and of the common errors, the same for three axes.
+        white, common: (n, n) covariance of the independent and of the common errors, the same for
+            three axes.
         force: (3n, 3(n - 1)) of impulses of the force between the points, of unit density.
         present: the velocity at the last point, by the unknowns and by these impulses.
     """
@@ -54,11 +64,17 @@ class PositionRows:
 
 
 def position_rows(
-    poses: Poses, weights: Array, arm: Array, most: int, epoch_ns: int = 0, changes: Sequence[Manoeuvre] = ()
+    poses: Poses,
+    weights: Array,
+    arm: Array,
+    most: int,
+    epoch_ns: int = 0,
+    changes: Sequence[Manoeuvre] = (),
 ) -> PositionRows:
     """Weighted means of the positions over equal shares of the time.
 
-    The position is r + v t + R c with the measured rotation R, so that a mean of positions belongs to the mean of R.
+    The position is r + v t + R c with the measured rotation R, so that a mean of positions belongs
+    to the mean of R.
 
     Args:
         poses: n poses, in free motion apart from disturbances.
@@ -76,11 +92,15 @@ def position_rows(
     w = weights / np.trace(C, axis1=1, axis2=2)
     w /= np.repeat(np.add.reduceat(w, first), np.diff(first, append=len(t)))
     R, middle = geometry.matrix(poses.q), (first + np.append(first[1:], len(t))) // 2
-    seen, turns, times = (np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (poses.t, R, t))
+    seen, turns, times = (
+        np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (poses.t, R, t)
+    )
     noise = np.add.reduceat((w * w)[:, None, None] * (R @ C @ np.swapaxes(R, 1, 2)), first)
     root = np.linalg.inv(np.linalg.cholesky(np.swapaxes(R[middle], 1, 2) @ noise @ R[middle]))
     root = root @ np.swapaxes(R[middle], 1, 2)
-    late = np.maximum(times[:, None] - 0.5 * (times[1:] + times[:-1]), 0.0) * np.sqrt(np.diff(times))
+    late = np.maximum(times[:, None] - 0.5 * (times[1:] + times[:-1]), 0.0) * np.sqrt(
+        np.diff(times)
+    )
     counts = 1.0 / np.add.reduceat(w * w, first)
     shares = None if poses.shares is None else np.add.reduceat(w * poses.shares, first)
     points = Poses(times, poses.q[middle], poses.t[middle], poses.C[middle], counts, shares)
@@ -93,16 +113,28 @@ def position_rows(
     sizes = np.repeat([*_FREE, *(a for size in shifts for a in (_FREE[2], size))], 3)
     force = (late[:, None, :, None] * root[:, :, None, :]).reshape(len(times), 3, -1)
     e = (root @ (seen - seen[0])[:, :, None])[:, :, 0]
-    rows = [np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)]
+    rows = [
+        np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)
+    ]
     speed = np.array([0.0, 0.0, 1.0, *(1.0, 0.0) * len(changes)])
-    present = Present(*(np.asarray(np.kron(a, np.eye(3))) for a in (speed, np.sqrt(np.diff(times)))))
+    present = Present(
+        *(np.asarray(np.kron(a, np.eye(3))) for a in (speed, np.sqrt(np.diff(times))))
+    )
     return PositionRows(
-        np.ascontiguousarray(e.T).reshape(-1), rows[0], np.diag(sizes**-2.0), white, common, rows[1], present
+        np.ascontiguousarray(e.T).reshape(-1),
+        rows[0],
+        np.diag(sizes**-2.0),
+        white,
+        common,
+        rows[1],
+        present,
     )
 
 
 def view_correlation(poses: Poses) -> Array:
-    """(n, n) correlation of the common errors of poses, by the direction from the target to the camera in {C}."""
+    """(n, n) correlation of the common errors of poses, by the direction from the target to the
+    camera in {C}.
+    """
     u = (poses.t[:, None, :] @ geometry.matrix(poses.q))[:, 0]
     u /= np.maximum(np.linalg.norm(u, axis=1), 1e-300)[:, None]
     angle = np.arccos(np.clip(u @ u.T, -1.0, 1.0))
@@ -110,21 +142,26 @@ def view_correlation(poses: Poses) -> Array:
 
 
 def error_parts(points: Poses) -> tuple[Array, Array]:
-    """Covariances (n, n) of the independent and of the common errors of whitened poses at unit factors."""
+    """Covariances (n, n) of the independent and of the common errors of whitened poses at unit
+    factors.
+    """
     n = len(points)
     share = np.zeros(n) if points.shares is None else points.shares
     amplitude = np.sqrt(share * (np.ones(n) if points.counts is None else points.counts))
     return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
 
 
-def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS, scatter: bool = False) -> Poses:
-    """At most some hundred poses that carry the information of many: weighted means about a reference motion.
+def normal_points(
+    poses: Poses, reference: Chart, factors: Array, most: int = _POINTS, scatter: bool = False
+) -> Poses:
+    """At most some hundred poses that carry the information of many: weighted means about a
+    reference motion.
 
-    Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's pose at their mean
-    instant, corrected by the mean of their differences from it. Its covariance is the inverse of the sum of their
-    information. The difference of two solutions of the motion changes little over such a turn, so the fit to the
-    normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
-    way.
+    Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's
+    pose at their mean instant, corrected by the mean of their differences from it. Its covariance
+    is the inverse of the sum of their information. The difference of two solutions of the motion
+    changes little over such a turn, so the fit to the normal points is the fit to the poses.
+    Satellite laser ranging reduces its observations to normal points in the same way.
 
     Args:
         poses: the measurements.
@@ -166,13 +203,16 @@ def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
     """
     first = np.clip(np.arange(len(d)) - _NEIGHBOURS // 2, 0, max(0, len(d) - _NEIGHBOURS))
     around = d[np.minimum(first[:, None] + np.arange(_NEIGHBOURS), len(d) - 1)]
-    white = (poses.root @ ((d - np.median(around, axis=1)) / np.repeat(factors, 3))[:, :, None])[:, :, 0]
+    white = (poses.root @ ((d - np.median(around, axis=1)) / np.repeat(factors, 3))[:, :, None])[
+        :, :, 0
+    ]
     squares = (white * white).sum(axis=1)
     return np.asarray(squares > _GROSS * max(float(np.median(squares)), 6.0))
 
 
 def _parts(turned: Array, most: int) -> NDArray[np.int64]:
-    """Index of the first pose of each normal point: it ends after a share of the rotation, or of the poses.
+    """Index of the first pose of each normal point: it ends after a share of the rotation, or of
+    the poses.
 
     Args:
         turned: (n,) rotation of the poses since the first [rad].
@@ -189,7 +229,8 @@ def _parts(turned: Array, most: int) -> NDArray[np.int64]:
 def _within(
     poses: Poses, d: Array, weights: Array, first: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[tuple[float, float], float]:
-    """Squared whitened residuals d (n, 6) about a straight line through each normal point, and degrees of freedom.
+    """Squared whitened residuals d (n, 6) about a straight line through each normal point, and
+    degrees of freedom.
 
     The line takes what is left of the difference between the motion and its reference.
     """
@@ -201,7 +242,9 @@ def _within(
     if not np.any(some):
         return (0.0, 0.0), 0.0
     A: Array = np.moveaxis(np.array(sums), 2, 0)[some]
-    rhs = np.stack([np.add.reduceat(a[:, None] * white, first, axis=0) for a in (one, late)], axis=1)[some]
+    rhs = np.stack(
+        [np.add.reduceat(a[:, None] * white, first, axis=0) for a in (one, late)], axis=1
+    )[some]
     lines = np.linalg.solve(A, rhs)
     kept = np.repeat(some, counts)
     left = white[kept] - np.repeat(lines[:, 0], counts[some], axis=0) * one[kept, None]

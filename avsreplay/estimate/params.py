@@ -13,7 +13,9 @@ from avsreplay.settings import Settings, are_orthonormal, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-_PER_POSE = 0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
+_PER_POSE = (
+    0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
+)
 
 
 class NoiseSource(Enum):
@@ -35,7 +37,8 @@ class Start(Enum):
 class Constraint(Enum):
     """How sigma stays inside its bounds, and where the filter begins from a given belief."""
 
-    CHART = "chart"  # coordinates that have no bounds; a fit with the given belief as its prior comes first
+    # coordinates that have no bounds; a fit with the given belief as its prior comes first
+    CHART = "chart"
     GAIN = "gain"  # the paper's beta on the gain; the filter begins at once
 
 
@@ -53,8 +56,8 @@ class EstimatorParams(Settings):
 
     torque_noise_radps15: float | None = setting(
         None,
-        "Root spectral density of the angular acceleration noise eps_tau. With a larger value the estimate follows"
-        " disturbances faster and has larger standard deviations.",
+        "Root spectral density of the angular acceleration noise eps_tau. With a larger value the"
+        " estimate follows disturbances faster and has larger standard deviations.",
         unit="rad/s^1.5",
         low=0.0,
         high=1e6,
@@ -62,8 +65,8 @@ class EstimatorParams(Settings):
     )
     force_noise_mps15: float | None = setting(
         None,
-        "Root spectral density of the linear acceleration noise eps_f. With a larger value the estimate follows"
-        " disturbances faster and has larger standard deviations.",
+        "Root spectral density of the linear acceleration noise eps_f. With a larger value the"
+        " estimate follows disturbances faster and has larger standard deviations.",
         unit="m/s^1.5",
         low=0.0,
         unset="estimated from the residuals of the poses",
@@ -75,107 +78,125 @@ class EstimatorParams(Settings):
     )
     fit_acceleration: bool = setting(
         False,
-        "Fit this acceleration in a first pass, to the poses up to the first manoeuvre. acceleration_mps2 is then"
-        " not used.",
+        "Fit this acceleration in a first pass, to the poses up to the first manoeuvre."
+        " acceleration_mps2 is then not used.",
     )
     orbit_rate_radps: float = setting(
         0.0,
-        "Mean motion of the camera's circular orbit. The centre of mass moves by the equations of Clohessy and"
-        " Wiltshire; 0 means free motion.",
+        "Mean motion of the camera's circular orbit. The centre of mass moves by the equations of"
+        " Clohessy and Wiltshire; 0 means free motion.",
         unit="rad/s",
         low=0.0,
         high=0.1,
     )
     orbit_radial_a: tuple[float, float, float] = setting(
-        (1.0, 0.0, 0.0), "Unit vector from the centre of the Earth to the camera in {A}, at the first scan."
+        (1.0, 0.0, 0.0),
+        "Unit vector from the centre of the Earth to the camera in {A}, at the first scan.",
     )
-    orbit_normal_a: tuple[float, float, float] = setting((0.0, 1.0, 0.0), "Unit normal of the orbit in {A}.")
+    orbit_normal_a: tuple[float, float, float] = setting(
+        (0.0, 1.0, 0.0), "Unit normal of the orbit in {A}."
+    )
     noise: NoiseSource = setting(
         NoiseSource.REGISTRATION,
-        "Source of the measurement noise: the covariance that the registration computes (registration), or the"
-        " fixed R0 (r0).",
+        "Source of the measurement noise: the covariance that the registration computes"
+        " (registration), or the fixed R0 (r0).",
     )
     adapt: Adaptation = setting(
         Adaptation.SCALE,
-        "Adaptation of the measurement noise to the residuals: one factor each for position and attitude (scale),"
-        " the paper's whole matrix starting from R0 (matrix), or none (off).",
+        "Adaptation of the measurement noise to the residuals: one factor each for position and"
+        " attitude (scale), the paper's whole matrix starting from R0 (matrix), or none (off).",
     )
     window: int = setting(
         30,
-        "Number of healthy scans to whose residuals the measurement noise is adapted. A larger value gives a"
-        " steadier noise level that follows changes more slowly.",
+        "Number of healthy scans to whose residuals the measurement noise is adapted. A larger"
+        " value gives a steadier noise level that follows changes more slowly.",
         low=6,
     )
     r0_pos_m: float | None = setting(
-        None, "R0: 1 sigma of the measured position.", unit="m", above=0.0, high=1e6, of_extent=0.002
+        None,
+        "R0: 1 sigma of the measured position.",
+        unit="m",
+        above=0.0,
+        high=1e6,
+        of_extent=0.002,
     )
-    r0_rot_deg: float = setting(0.5, "R0: 1 sigma of the measured attitude about each axis.", unit="deg", above=0.0)
+    r0_rot_deg: float = setting(
+        0.5, "R0: 1 sigma of the measured attitude about each axis.", unit="deg", above=0.0
+    )
     r_floor: float = setting(
-        1e-6, "Smallest eigenvalue of R in units of R0. A larger value limits the weight of precise poses.", above=0.0
+        1e-6,
+        "Smallest eigenvalue of R in units of R0. A larger value limits the weight of precise"
+        " poses.",
+        above=0.0,
     )
     constraint: Constraint = setting(
         Constraint.CHART,
-        "How the inertia ratios stay within their bounds: coordinates without bounds (chart), or the paper's scaling"
-        " beta of the Kalman gain (gain).",
+        "How the inertia ratios stay within their bounds: coordinates without bounds (chart), or"
+        " the paper's scaling beta of the Kalman gain (gain).",
     )
     sigma_margin: float = setting(
         0.01,
-        "With constraint gain: |sigma| stays below 1 minus this margin. A larger value excludes more of the"
-        " nearly flat or slender bodies.",
+        "With constraint gain: |sigma| stays below 1 minus this margin. A larger value excludes"
+        " more of the nearly flat or slender bodies.",
         above=0.0,
         below=0.5,
     )
     correlated_share: float | None = setting(
         None,
-        "Share of a registered pose's variance that is common to scans from nearly the same view. A larger value"
-        " gives such scans together less weight.",
+        "Share of a registered pose's variance that is common to scans from nearly the same view. A"
+        " larger value gives such scans together less weight.",
         low=0.0,
         high=1.0,
-        unset="computed from the number of inliers and their rms residual (docs/estimation.md, Noise)",
+        unset=(
+            "computed from the number of inliers and their rms residual (docs/estimation.md, Noise)"
+        ),
     )
     correlated_rad: float = setting(
         0.4,
-        "Rotation of the view over which this common error changes. A larger value gives the scans of a slowly"
-        " turning target less weight.",
+        "Rotation of the view over which this common error changes. A larger value gives the scans"
+        " of a slowly turning target less weight.",
         unit="rad",
         low=0.0,
     )
     start: Start = setting(
         Start.AUTO,
-        "How the estimate begins: from a given belief (near), by a batch fit to the first poses (cold), or by the"
-        " paper's filter from zero (paper). auto is near if a belief is given and cold otherwise.",
+        "How the estimate begins: from a given belief (near), by a batch fit to the first poses"
+        " (cold), or by the paper's filter from zero (paper). auto is near if a belief is given and"
+        " cold otherwise.",
     )
     refit_growth: float = setting(
         0.2,
-        "The batch fit is repeated when the number of healthy poses has grown by this share, until its likelihood"
-        " is close to Gaussian. A larger value takes less time and leaves more poses to linear updates between two"
-        " fits.",
+        "The batch fit is repeated when the number of healthy poses has grown by this share, until"
+        " its likelihood is close to Gaussian. A larger value takes less time and leaves more poses"
+        " to linear updates between two fits.",
         low=0.0,
         high=1.0,
     )
     audit_poses: int = setting(
         1000,
-        "Number of healthy poses up to which the filter is compared with a batch fit. A larger value continues"
-        " the comparison for longer and takes more time; 0 switches it off.",
+        "Number of healthy poses up to which the filter is compared with a batch fit. A larger"
+        " value continues the comparison for longer and takes more time; 0 switches it off.",
         low=0,
     )
     robust: bool = setting(
         True,
-        "Decide about scans with a large innovation by the test of hypotheses, and reduce the weight of a healthy pose"
-        " whose NIS exceeds its 99.99 % point. false switches both off, as the paper's start does.",
+        "Decide about scans with a large innovation by the test of hypotheses, and reduce the"
+        " weight of a healthy pose whose NIS exceeds its 99.99 % point. false switches both off, as"
+        " the paper's start does.",
     )
     bias_s: float = setting(
         20.0,
-        "Time for which poses must have been consistent before a step of the measured pose counts as the beginning"
-        " of a sensor error; an earlier step counts as its end. It is used if the residuals of the registration do"
-        " not distinguish the two.",
+        "Time for which poses must have been consistent before a step of the measured pose counts"
+        " as the beginning of a sensor error; an earlier step counts as its end. It is used if the"
+        " residuals of the registration do not distinguish the two.",
         unit="s",
         low=0.0,
     )
     change_probability: float = setting(
         0.02,
-        "Prior probability that rate or velocity of the target changed within the last five intervals between scans."
-        " With a larger value the published covariance is larger where the last scans make a change possible.",
+        "Prior probability that rate or velocity of the target changed within the last five"
+        " intervals between scans. With a larger value the published covariance is larger where the"
+        " last scans make a change possible.",
         low=0.0,
         below=1.0,
     )
@@ -186,17 +207,27 @@ class EstimatorParams(Settings):
         10.0, "1 sigma of the attitude of the initial pose about each axis.", unit="deg", above=0.0
     )
     start_rate_1s_radps: float = setting(
-        0.5, "1 sigma of the unknown angular rate about each axis.", unit="rad/s", above=0.0, high=1e3
+        0.5,
+        "1 sigma of the unknown angular rate about each axis.",
+        unit="rad/s",
+        above=0.0,
+        high=1e3,
     )
     start_vel_1s_mps: float | None = setting(
-        None, "1 sigma of the unknown velocity along each axis.", unit="m/s", above=0.0, high=1e6, of_extent=0.05
+        None,
+        "1 sigma of the unknown velocity along each axis.",
+        unit="m/s",
+        above=0.0,
+        high=1e6,
+        of_extent=0.05,
     )
     start_sigma_1s: float = setting(
         0.5, "With start paper: 1 sigma of each unknown inertia ratio.", above=0.0, high=1.0
     )
     start_log_inertia_1s: float = setting(
         1.0,
-        "With start cold: 1 sigma of each of the five components of the logarithm of the mass moments.",
+        "With start cold: 1 sigma of each of the five components of the logarithm of the mass"
+        " moments.",
         above=0.0,
         high=10.0,
     )
@@ -204,22 +235,34 @@ class EstimatorParams(Settings):
         None, "1 sigma of the unknown fixture position in {B}.", unit="m", above=0.0, of_extent=0.25
     )
     start_mu_1s_deg: float = setting(
-        20.0, "With start paper: 1 sigma of the unknown misalignment about each axis.", unit="deg", above=0.0
+        20.0,
+        "With start paper: 1 sigma of the unknown misalignment about each axis.",
+        unit="deg",
+        above=0.0,
     )
 
     def check(self) -> None:
-        """Raise ValueError where the axes of the orbit are not orthonormal, or it has an acceleration beside it."""
+        """Raise ValueError where the axes of the orbit are not orthonormal, or it has an
+        acceleration beside it.
+        """
         if not are_orthonormal(self.orbit_radial_a, self.orbit_normal_a):
-            raise ValueError("orbit_radial_a and orbit_normal_a must be unit vectors at right angles to each other")
+            raise ValueError(
+                "orbit_radial_a and orbit_normal_a must be unit vectors at right angles to each"
+                " other"
+            )
         if self.orbit_rate_radps > 0.0 and (any(self.acceleration_mps2) or self.fit_acceleration):
-            raise ValueError("orbit_rate_radps cannot be combined with acceleration_mps2 or fit_acceleration")
+            raise ValueError(
+                "orbit_rate_radps cannot be combined with acceleration_mps2 or fit_acceleration"
+            )
 
     def at_interval(self, period_s: float, extent_m: float) -> EstimatorParams:
-        """Return the settings with start and changes of the motion that fit to poses at short intervals.
+        """Return the settings with start and changes of the motion that fit to poses at short
+        intervals.
 
-        Poses need no initial guess, so that any motion may be tracked. The rate and velocity expected at the start, and
-        the expected size of a manoeuvre, therefore at least turn the target by a quarter of a radian and move it by a
-        quarter of its extent between two poses. Settings that differ from their defaults are kept.
+        Poses need no initial guess, so that any motion may be tracked. The rate and velocity
+        expected at the start, and the expected size of a manoeuvre, therefore at least turn the
+        target by a quarter of a radian and move it by a quarter of its extent between two poses.
+        Settings that differ from their defaults are kept.
 
         Args:
             period_s: interval between poses [s]; 0 if it is not known.
@@ -231,13 +274,17 @@ class EstimatorParams(Settings):
         if rate == plain.start_rate_1s_radps:
             rate = max(rate, _PER_POSE / period_s)
         if speed is None:
-            speed = max(given(plain.resolved(extent_m).start_vel_1s_mps), _PER_POSE * extent_m / period_s)
+            speed = max(
+                given(plain.resolved(extent_m).start_vel_1s_mps), _PER_POSE * extent_m / period_s
+            )
         return replace(self, start_rate_1s_radps=rate, start_vel_1s_mps=speed)
 
     @property
     def R0(self) -> Array:
         """(6, 6) noise for (metres, half angle); auto values must be filled in."""
-        return np.diag(np.repeat([given(self.r0_pos_m), 0.5 * math.radians(self.r0_rot_deg)], 3) ** 2)
+        return np.diag(
+            np.repeat([given(self.r0_pos_m), 0.5 * math.radians(self.r0_rot_deg)], 3) ** 2
+        )
 
     @property
     def by_gain(self) -> bool:
@@ -246,12 +293,18 @@ class EstimatorParams(Settings):
 
     @property
     def disturbances(self) -> tuple[float | None, float | None]:
-        """Root densities of torque and force noise that are given; None for one that is estimated."""
+        """Root densities of torque and force noise that are given.
+
+        None for one that is estimated.
+        """
         return self.torque_noise_radps15, self.force_noise_mps15
 
     @property
     def change_1s(self) -> tuple[float, float]:
-        """Prior 1 sigma of a change of the rate [rad/s] and of the velocity [m/s]; auto values must be filled in."""
+        """Prior 1 sigma of a change of the rate [rad/s] and of the velocity [m/s].
+
+        Auto values must be filled in.
+        """
         return 0.1 * self.start_rate_1s_radps, 0.2 * given(self.start_vel_1s_mps)
 
     @property

@@ -1,4 +1,7 @@
-"""A reference for logs without ground truth: one batch fit over all poses of a log, as a function of time."""
+"""A reference for logs without ground truth.
+
+One batch fit over all poses of a log, as a function of time.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,8 @@ class Reference:
     """The motion with the maximum likelihood over all poses.
 
     Attributes:
-        fitted: the fit with its residuals.  epoch_ns, end_ns: instants of the first and the last pose.
+        fitted: the fit with its residuals.
+        epoch_ns, end_ns: instants of the first and the last pose.
         at: instant [ns] between these -> state.
     """
 
@@ -51,9 +55,11 @@ def reference_fit(
     Args:
         t_ns: instants, ascending [ns].
         poses: T_ac.
-        covariances: (6, 6) each, of d = [theta; v] in {C} [rad, m]; None takes R0 for all (the residuals rescale it).
+        covariances: (6, 6) each, of d = [theta; v] in {C} [rad, m]; None takes R0 for all (the
+            residuals rescale it).
         extent_m: bounding diagonal of the target [m].
-        params: the estimator's; None is the default. The axes of an orbit are those at the first pose.
+        params: the estimator's; None is the default. The axes of an orbit are those at the first
+            pose.
 
     Raises:
         UsageError: fewer than four poses.
@@ -61,7 +67,9 @@ def reference_fit(
     settings = (params or EstimatorParams()).resolved(extent_m)
     given = covariances or [r0_covariance(settings)] * len(poses)
     orbit = RelativeOrbit.of(settings, t_ns[0]) if len(t_ns) else None
-    fixes = [PoseFix(t, pose, C, orbit=orbit) for t, pose, C in zip(t_ns, poses, given, strict=True)]
+    fixes = [
+        PoseFix(t, pose, C, orbit=orbit) for t, pose, C in zip(t_ns, poses, given, strict=True)
+    ]
     return reference_of(fixes, settings)
 
 
@@ -73,7 +81,9 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
     """
     if len(poses) < _FEWEST:
         hint = "a reference needs four healthy poses at least"
-        raise UsageError(f"only {len(poses)} poses to fit a reference to", where="--reference fit", hint=hint)
+        raise UsageError(
+            f"only {len(poses)} poses to fit a reference to", where="--reference fit", hint=hint
+        )
     fixes = tuple(poses)
     fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), params)
     first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
@@ -86,8 +96,10 @@ class FittedMotion:
     """The motion of a fit at one instant.
 
     Attributes:
-        epoch_ns: instant of its initial values [ns].  chart: these.
-        t_ns: the instant [ns].  x: the state there.
+        epoch_ns: instant of its initial values [ns].
+        chart: these.
+        t_ns: the instant [ns].
+        x: the state there.
     """
 
     epoch_ns: int
@@ -102,10 +114,15 @@ class FittedMotion:
 
     def is_of(self, fitted: BatchResult) -> bool:
         """Whether the motion is that of a fit."""
-        return self.epoch_ns == fitted.epoch_ns and bool(np.array_equal(self.chart.flat, fitted.chart.flat))
+        return self.epoch_ns == fitted.epoch_ns and bool(
+            np.array_equal(self.chart.flat, fitted.chart.flat)
+        )
 
     def at(self, t_ns: int, orbit: RelativeOrbit | None) -> tuple[FittedMotion, Array]:
-        """The motion at another instant [ns], and the transition (20, 20) to there; ``orbit``: of the target."""
+        """The motion at another instant [ns], and the transition (20, 20) to there; ``orbit``.
+
+        Of the target.
+        """
         arc = None if orbit is None else orbit.at(self.t_ns)
         x, Phi = propagate_state(self.x, (t_ns - self.t_ns) * 1e-9, arc)
         return replace(self, t_ns=t_ns, x=x), Phi
@@ -134,7 +151,9 @@ def rows_along(motion: FittedMotion, fixes: tuple[PoseFix, ...]) -> tuple[Array,
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
-    """The pose of a healthy scan, at its own instant and with its covariance if the track still contains it."""
+    """The pose of a healthy scan, at its own instant and with its covariance if the track still
+    contains it.
+    """
     return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, r0_covariance(params))
 
 
@@ -153,7 +172,9 @@ def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> BatchFit:
     prior, rules = weak_prior(poses, params), FitParams(max_steps=60)
     chart = start
     for count in _windows(poses, start):
-        chart = whole(fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False))).chart
+        chart = whole(
+            fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False))
+        ).chart
     return whole(fit(poses, chart, prior, rules))
 
 
@@ -177,7 +198,9 @@ def _motion(x: State, first_ns: int, last_ns: int, arc: OrbitArc | None) -> Call
         """The state at an instant within the poses' span."""
         h = (t_ns - first_ns) * 1e-9
         if not 0 <= t_ns - first_ns <= last_ns - first_ns:
-            raise ValueError(f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}")
+            raise ValueError(
+                f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}"
+            )
         q, w = path.at(np.array([h]))
         centre, velocity = translated(x, np.array([h]), arc)
         return State(q[0], w[0], centre[0], velocity[0], x.sigma, x.c_b, x.q_bc)

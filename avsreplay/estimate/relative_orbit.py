@@ -1,13 +1,15 @@
-"""The motion of the centre of mass relative to a camera on a circular orbit (Clohessy and Wiltshire).
+"""The motion of the centre of mass relative to a camera on a circular orbit (Clohessy and
+Wiltshire).
 
-{A} keeps its inertial attitude. With the mean motion n and the radial unit vector o(t), to first order in the distance,
+{A} keeps its inertial attitude. With the mean motion n and the radial unit vector o(t), to first
+order in the distance,
 
     d2r/dt2 = n^2 (3 o o' - 1) r.
 
-In axes that turn with the orbit (radial, along the track, normal) the coefficients are constant, and the transition
-from one instant to another is a closed form (Clohessy and Wiltshire, Terminal Guidance System for Satellite Rendezvous,
-1960; Vallado, Fundamentals of Astrodynamics and Applications, section 6.8). The attitude is not affected: the gravity
-gradient torque is neglected.
+In axes that turn with the orbit (radial, along the track, normal) the coefficients are constant,
+and the transition from one instant to another is a closed form (Clohessy and Wiltshire, Terminal
+Guidance System for Satellite Rendezvous, 1960; Vallado, Fundamentals of Astrodynamics and
+Applications, section 6.8). The attitude is not affected: the gravity gradient torque is neglected.
 """
 
 from __future__ import annotations
@@ -44,7 +46,11 @@ class RelativeOrbit:
         if params.orbit_rate_radps == 0.0:
             return None
         radial, normal = np.array(params.orbit_radial_a), np.array(params.orbit_normal_a)
-        return cls(params.orbit_rate_radps, np.stack([radial, np.cross(normal, radial), normal], axis=1), epoch_ns)
+        return cls(
+            params.orbit_rate_radps,
+            np.stack([radial, np.cross(normal, radial), normal], axis=1),
+            epoch_ns,
+        )
 
     def at(self, t_ns: int) -> OrbitArc:
         """The orbit from an instant [ns] on."""
@@ -63,7 +69,9 @@ class OrbitArc:
         return OrbitArc(self.orbit, self.start_ns + round(after_s * 1e9))
 
     def transitions(self, times_s: Array) -> Array:
-        """(n, 6, 6) position and velocity in {A} after ``times_s`` (n,) [s], of either sign, by those at the start."""
+        """(n, 6, 6) position and velocity in {A} after ``times_s`` (n,) [s], of either sign, by
+        those at the start.
+        """
         n, times = self.orbit.rate, np.asarray(times_s, dtype=np.float64)
         begin = (self.start_ns - self.orbit.epoch_ns) * 1e-9
         turning = _turning_axes(n, times)
@@ -75,7 +83,9 @@ class OrbitArc:
         return np.asarray(end @ turning @ back)
 
     def _inertial(self, after_s: Array) -> Array:
-        """(n, 6, 6) from position and velocity in the turning axes to those in {A}, v = C (u + n x p)."""
+        """(n, 6, 6) from position and velocity in the turning axes to those in {A}, v = C (u + n x
+        p).
+        """
         n = self.orbit.rate
         c, s = np.cos(n * after_s), np.sin(n * after_s)
         radial, along, normal = self.orbit.axes.T

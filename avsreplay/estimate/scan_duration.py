@@ -1,8 +1,9 @@
 """The motion during a scan whose points were measured one after the other.
 
-The points are moved to the scan's instant by the predicted motion (``deskew``). The error of the prediction moves with
-them, so the scan's pose is not a measurement at the scan's instant alone: ``with_scan_duration`` gives its Jacobian.
-Without it, part of the prior would be used as new information, and the covariance would be too small.
+The points are moved to the scan's instant by the predicted motion (``deskew``). The error of the
+prediction moves with them, so the scan's pose is not a measurement at the scan's instant alone:
+``with_scan_duration`` gives its Jacobian. Without it, part of the prior would be used as new
+information, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -20,11 +21,14 @@ from avsreplay.estimate.track import Prediction
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-_KNOTS = 65  # instants at which the motion is computed; in between, rotation and position are interpolated linearly
+# instants at which the motion is computed; in between, rotation and position are interpolated
+# linearly
+_KNOTS = 65
 
 
 def deskew(points: NDArray[Any], times_s: NDArray[Any], x: State) -> Array:
-    """Points in {A} as if all had been measured at the scan's instant: p(0) = T_ac(0) T_ac(t)^-1 p(t).
+    """Points in {A} as if all had been measured at the scan's instant: p(0) = T_ac(0) T_ac(t)^-1
+    p(t).
 
     The remaining error is that of the predicted rate and velocity times the duration of the scan.
 
@@ -41,7 +45,9 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], x: State) -> Array:
     """
     points, times = np.asarray(points, dtype=np.float64), np.asarray(times_s, dtype=np.float64)
     if points.shape != (len(times), 3) or not np.all(np.isfinite(times)):
-        raise ValueError(f"points {points.shape} and times {times.shape} do not fit, or a time is not finite")
+        raise ValueError(
+            f"points {points.shape} and times {times.shape} do not fit, or a time is not finite"
+        )
     if not len(times) or float(np.ptp(times)) == 0.0 == float(times[0]):
         return points
     knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
@@ -49,13 +55,16 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], x: State) -> Array:
     return geometry.moved_in_time(points, times, knots, rotations, offsets)
 
 
-def with_scan_duration(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:
-    """The prediction with the H (6, 20), the lag and the blur of a scan that was deskewed by the same prediction.
+def with_scan_duration(
+    prediction: Prediction, instants: Array, times_s: NDArray[Any]
+) -> Prediction:
+    """The prediction with the H (6, 20), the lag and the blur of a scan that was deskewed by the
+    same prediction.
 
-    A point measured at tau and moved by the prior shows the prior's error at tau: delta(tau) in {C}, whatever instant
-    it is moved to. Over a scan delta is taken as linear in time, so the registered pose shows
-    delta(first) + (M - first) delta', with the mean instants M. Treated as the pose at one instant, the lag tr M / 6,
-    it is off by (M - lag) delta': the blur.
+    A point measured at tau and moved by the prior shows the prior's error at tau: delta(tau) in
+    {C}, whatever instant it is moved to. Over a scan delta is taken as linear in time, so the
+    registered pose shows delta(first) + (M - first) delta', with the mean instants M. Treated as
+    the pose at one instant, the lag tr M / 6, it is off by (M - lag) delta': the blur.
 
     Args:
         prediction: the scan's prior, that of ``deskew``.
@@ -77,13 +86,18 @@ def with_scan_duration(prediction: Prediction, instants: Array, times_s: NDArray
 
 
 def _fixture_jacobian(x: State, h: float) -> Array:
-    """(6, 20) error of the pose h seconds later, d = [theta; v] in {C} [rad, m], by the error states now."""
+    """(6, 20) error of the pose h seconds later, d = [theta.
+
+    V] in {C} [rad, m], by the error states now.
+    """
     then, Phi = propagate_state(x, h)
     return to_fixture(then.T_ac.q, x.q_bc) @ measurement_jacobian(then) @ Phi
 
 
 def _to_scan_instant(x: State, knots: Array) -> tuple[Array, Array]:
-    """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` relative to the scan's instant."""
+    """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` relative to the scan's
+    instant.
+    """
     q_ab, _ = rotation_path(x).at(knots)
     A_t, now = geometry.matrix(q_ab), x.T_ac
     q_ac = geometry.multiply(q_ab, x.q_bc)

@@ -1,8 +1,10 @@
-"""A sensor error in effect: whether it lasts, and whether a manoeuvre explains its scans better after all.
+"""A sensor error in effect: whether it lasts, and whether a manoeuvre explains its scans better
+after all.
 
-A bias of the sensor is a step of the pose; a manoeuvre is a step of the velocity. A small manoeuvre between two scans
-may resemble a bias in the first scans after it. The hypotheses are therefore compared again while the bias lasts. A
-constant offset that grows with time is a manoeuvre, where the pose is continuous at its beginning.
+A bias of the sensor is a step of the pose; a manoeuvre is a step of the velocity. A small manoeuvre
+between two scans may resemble a bias in the first scans after it. The hypotheses are therefore
+compared again while the bias lasts. A constant offset that grows with time is a manoeuvre, where
+the pose is continuous at its beginning.
 """
 
 from __future__ import annotations
@@ -30,8 +32,11 @@ from avsreplay.estimate.track import Epoch, SensorBias
 from avsreplay.geometry import Array
 
 _MOST = 12  # scans of a bias that are compared
-_VARIES = 0.02  # 1 sigma of the change of an offset from scan to scan, because the view changes, over its size
-_QUIETER = 1.5  # least rms residual before and during an error over that of a scan which shows its end
+# 1 sigma of the change of an offset from scan to scan, because the view changes, over its size
+_VARIES = 0.02
+_QUIETER = (
+    1.5  # least rms residual before and during an error over that of a scan which shows its end
+)
 
 Windowed = Callable[[tuple[Epoch, ...], int], Window]
 """Scans, of which as many as stated are accepted, about the motion predicted from before (``window_of``)."""
@@ -50,14 +55,18 @@ def begun(window: Sequence[Epoch], found: Explanation) -> SensorBias:
     return SensorBias(found.size, found.P, window[-1], tuple(window[:onset]), tuple(window[onset:]))
 
 
-def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: ChangePriors) -> SensorBias | None:
+def continued(
+    bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: ChangePriors
+) -> SensorBias | None:
     """Return the error after one more scan, None where it has ended.
 
-    The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
-    scan to the next, where an offset that ends changes the innovation by its own size. A range error displaces the pose
-    a little differently in every view. Where this change does not
-    decide, because the offset is small, all scans do that are compared. An error that begins with more noise ends with
-    it: the bias of the noise is such an error, and after it the prediction is too uncertain to show the end.
+    The error of the prediction grows while the estimate coasts, and with it the innovation. It
+    changes little from one scan to the next, where an offset that ends changes the innovation by
+    its own size. A range error displaces the pose a little differently in every view. Where this
+    change does not decide, because the offset is small, all scans do that are compared. An error
+    that begins with more noise ends with
+    it: the bias of the noise is such an error, and after it the prediction is too uncertain to show
+        the end.
 
     Args:
         bias: after the last scan.
@@ -84,26 +93,37 @@ def continued(bias: SensorBias, epoch: Epoch, windowed: Windowed, priors: Change
 
 
 def _end_odds(window: Window, onset: int, priors: ChangePriors) -> float:
-    """Log odds of an error that begins at the scan ``onset`` of a window and has ended, over one that lasts."""
+    """Log odds of an error that begins at the scan ``onset`` of a window and has ended, over one
+    that lasts.
+    """
     white = window.whiten @ window.y
     M, scale = offsets(window, priors)
     since = window.since_each(M)[onset:]
-    ratios = mixed(since[0] - np.concatenate([since[1:], np.zeros((1, *since.shape[1:]))]), white, scale, OFFSETS)
+    ratios = mixed(
+        since[0] - np.concatenate([since[1:], np.zeros((1, *since.shape[1:]))]),
+        white,
+        scale,
+        OFFSETS,
+    )
     return log_mean(ratios[:-1].tolist()) - float(ratios[-1]) + PRIOR_ODDS
 
 
-def compared(bias: SensorBias, compare: Compare) -> tuple[SensorBias, tuple[tuple[Epoch, ...], Explanation] | None]:
-    """Return the error with its last scan among those that are compared, and a manoeuvre that explains them instead.
+def compared(
+    bias: SensorBias, compare: Compare
+) -> tuple[SensorBias, tuple[tuple[Epoch, ...], Explanation] | None]:
+    """Return the error with its last scan among those that are compared, and a manoeuvre that
+    explains them instead.
 
-    At most ``_MOST`` scans of the error are kept. Then every second one is left out, and the next ones are added half
-    as often, so that a slow growth of the offset is found as well.
+    At most ``_MOST`` scans of the error are kept. Then every second one is left out, and the next
+    ones are added half as often, so that a slow growth of the offset is found as well.
 
     Args:
         bias: after the last scan.
         compare: the hypotheses about scans.
 
     Returns:
-        The error, and the scans with the manoeuvre if that is the most likely cause of them; else None.
+        The error, and the scans with the manoeuvre if that is the most likely cause of them; else
+        None.
     """
     if bias.left_out + 1 < bias.spacing or not bias.before:
         return replace(bias, left_out=bias.left_out + 1), None

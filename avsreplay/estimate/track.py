@@ -22,11 +22,19 @@ from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre
 
-_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
-_READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
+_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = (
+    5,
+    61,
+    5.348,
+)  # NIS values for the scale; median of chi-square with 6 degrees
+_READY, _READY_AFTER_MANOEUVRE = (
+    8,
+    3,
+)  # least number of poses of an estimate whose prediction can be tested
 _NO_NOISE, _NO_MOTION = frozen(np.zeros((6, 6))), frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
-_TURN_WITHIN_RAD = 0.2  # largest change of the other rotations if a rotation that is first determined turns the track
+# largest change of the other rotations if a rotation that is first determined turns the track
+_TURN_WITHIN_RAD = 0.2
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 
@@ -36,8 +44,10 @@ class SensorBias:
 
     Attributes:
         offset: (6,) of the measured poses in {A} at its onset: position [m] and half angle.
-        P: (6, 6) its covariance.  last: the last scan with this error.
-        before, since: scans without and with it that are compared.  doubted: another hypothesis is more likely.
+        P: (6, 6) its covariance.
+        last: the last scan with this error.
+        before, since: scans without and with it that are compared.
+        doubted: another hypothesis is more likely.
         spacing, left_out: scans to the next that is compared, of which so many have passed.
     """
 
@@ -53,7 +63,10 @@ class SensorBias:
 
 @value_class
 class Epoch:
-    """A scan as the estimator received it: the track before it (without history), its prediction and innovation."""
+    """A scan as the estimator received it.
+
+    The track before it (without history), its prediction and innovation.
+    """
 
     track: Track
     prediction: Prediction
@@ -75,7 +88,11 @@ class Epoch:
         """Its transition, innovation and gain as ``_motion.change`` takes them; computed once."""
         if (found := self._used) is None:
             prior, seen, inflation = self.prediction, self.innovation, self.track.inflation
-            factors = (1.0 / seen.weight,) * 2 if inflation is None else tuple((inflation / seen.weight).tolist())
+            factors = (
+                (1.0 / seen.weight,) * 2
+                if inflation is None
+                else tuple((inflation / seen.weight).tolist())
+            )
             H, P = prior.H, prior.belief.P
             found = _motion.used(prior.Phi, P, H, seen.alpha, seen.S, seen.R, factors)
             object.__setattr__(self, "_used", found)
@@ -87,26 +104,41 @@ class Track:
     """The state of the estimator between two scans.
 
     Attributes:
-        belief: after the last scan.  mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
-        window: of the noise adaptation.  sigma_hits: sigma bounds that cut the gain so far.
-        r_floors: eigenvalues of R raised so far.  R: (6, 6) noise of the last healthy scan [m, half angle].
-        fixes: healthy poses that fits use.  older: those before.
-        batch: the last batch fit whose estimate was adopted.  since: healthy poses since the last fit.
-        reinitialised: how often a fit replaced the filter's estimate, or the given start was rejected.
-        inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last fit; None before it.
-        prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
-        recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
+        belief: after the last scan.
+        mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
+        window: of the noise adaptation.
+        sigma_hits: sigma bounds that cut the gain so far.
+        r_floors: eigenvalues of R raised so far.
+        R: (6, 6) noise of the last healthy scan [m, half angle].
+        fixes: healthy poses that fits use.
+        older: those before.
+        batch: the last batch fit whose estimate was adopted.
+        since: healthy poses since the last fit.
+        reinitialised: how often a fit replaced the filter's estimate, or the given start was
+            rejected.
+        inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last
+            fit; None before it.
+        prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a
+            manoeuvre.
+        recent: the last accepted scans.
+        doubtful: the scans not yet decided on.
+        nis: of the last healthy scans.
         rejected: the last poses since the last accepted scan that nothing explained.
-        bias: an error of the sensor in effect, or None.  started_ns: instant of the first scan of this estimate.
+        bias: an error of the sensor in effect, or None.
+        started_ns: instant of the first scan of this estimate.
         previous: the estimate before the last new start, None where there was none.
-        manoeuvres: all that were found.  pending: the last of them is reported, and the motion after it not determined.
-        drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
+        manoeuvres: all that were found.
+        pending: the last of them is reported, and the motion after it not determined.
+        drift: a constant torque or force on the target, None where none is found.
+        untested: healthy poses since the
             last test for one.
-        levels: noise levels estimated so far.  unlevelled: healthy poses since the last estimate of them.
+        levels: noise levels estimated so far.
+        unlevelled: healthy poses since the last estimate of them.
         fitting, testing: a fit and a test that are spread over scans, None where none is under way.
-        undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines, each
-            as large as half the extent: 1 sigma.
-        change_probability, change_P: of a change of the velocities in the last scans, and what it adds to P (20, 20).
+        undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so
+            far determines, each as large as half the extent: 1 sigma.
+        change_probability, change_P: of a change of the velocities in the last scans, and what it
+            adds to P (20, 20).
         errors: of the model and of the ranges, as the healthy scans so far show them.
     """
 
@@ -158,12 +190,14 @@ class Track:
 
 
 def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
-    """Return the motions of the model that two sets contain, as columns d = [theta; v] in {C} (6, k).
+    """Return the motions of the model that two sets contain, as columns d = [theta; v] in {C} (6,
+    k).
 
     Args:
         first: (6, n) independent motions.
         other: (6, m) likewise; None for no motion.
-        length_m: a rotation by 1 rad is as large as a displacement by this length; each column is twice as large.
+        length_m: a rotation by 1 rad is as large as a displacement by this length; each column is
+            twice as large.
     """
     if other is None or not first.size:
         return _NO_MOTION
@@ -174,15 +208,23 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
 
 
 def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
-    """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in ``common_motions``."""
-    return common_motions(track.undetermined, innovation.free, length_m) if gamma else track.undetermined
+    """Return ``Track.undetermined`` after a scan.
+
+    ``track`` before it, ``length_m`` as in ``common_motions``.
+    """
+    return (
+        common_motions(track.undetermined, innovation.free, length_m)
+        if gamma
+        else track.undetermined
+    )
 
 
 def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Track:
-    """Return the track after a pose first determines a rotation of the model: all of it is turned to this pose.
+    """Return the track after a pose first determines a rotation of the model: all of it is turned
+    to this pose.
 
-    No scan before has determined this rotation, so that the earlier poses are as correct after any such turn of the
-    model. The next fit begins anew, because the turn is not small.
+    No scan before has determined this rotation, so that the earlier poses are as correct after any
+    such turn of the model. The next fit begins anew, because the turn is not small.
 
     Args:
         track: before the scan.
@@ -191,10 +233,13 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
         alignment: of the scan.
 
     Returns:
-        The track itself if the view has unobservable directions, or if not one rotation alone is undetermined or
-        explains the difference.
+        The track itself if the view has unobservable directions, or if not one rotation alone is
+        undetermined or explains the difference.
     """
-    d, determines = track.undetermined, alignment.status is AlignStatus.ALIGNED and alignment.free is None
+    d, determines = (
+        track.undetermined,
+        alignment.status is AlignStatus.ALIGNED and alignment.free is None,
+    )
     size = float(np.linalg.norm(d[:3])) if d.shape[1] == 1 and determines else 0.0
     if size < 1e-9:
         return track
@@ -207,15 +252,21 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
     x, adjoint = track.belief.x, np.kron(np.eye(2), G.R.T)  # d' = adjoint d of T_ac G
     adjoint[3:, :3] = -G.R.T @ geometry.skew(G.t)
     x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
-    fixes = tuple(replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes)
+    fixes = tuple(
+        replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes
+    )
     belief = replace(track.belief, x=x)
-    anew = track.changed(belief=belief, fixes=fixes, older=(), mode="start", batch=None, fitting=None, testing=None)
+    anew = track.changed(
+        belief=belief, fixes=fixes, older=(), mode="start", batch=None, fitting=None, testing=None
+    )
     return anew.changed(recent=(), doubtful=(), bias=None)
 
 
 @lru_cache(maxsize=1)  # the belief and its forecasts need it
 def common_1s(track: Track, frame: EstimatorFrame) -> Array:
-    """Return the 1 sigma (3,) in {A} [m] of the error of the position along the line of sight that all poses have."""
+    """Return the 1 sigma (3,) in {A} [m] of the error of the position along the line of sight that
+    all poses have.
+    """
     r_a = frame.position_out(track.belief.x.r_a, track.belief.t_ns)
     batch, variance = track.batch, _NO_NOISE[:3, :3]
     if batch is not None and batch.position_m2 is not None:
@@ -228,12 +279,14 @@ class Prediction:
     """The prior at the instant of a scan.
 
     Attributes:
-        belief: prior mean and covariance.  Phi: (20, 20) of the step.  H: (6, 20) at the prior.
+        belief: prior mean and covariance.
+        Phi: (20, 20) of the step.
+        H: (6, 20) at the prior.
         window: the track's noise window.
         lag_s: mean measurement instant of the scan's points after the scan's instant [s].
         counted: how far systematic errors of its pose count (``ModelErrors.counted``).
-        blur: (6, 6) covariance in {C} of treating the pose as one of a single instant although its points were
-            measured at many; None for zero.
+        blur: (6, 6) covariance in {C} of treating the pose as one of a single instant although its
+            points were measured at many; None for zero.
     """
 
     belief: Belief
@@ -251,8 +304,14 @@ def confirmed(track: Track) -> tuple[Manoeuvre, ...]:
 
 
 def in_doubt(track: Track) -> bool:
-    """Return whether a scan is not decided on, or a bias or an unchanged motion is not the most likely cause."""
-    return bool(track.doubtful) or track.change_probability > 0.5 or (track.bias is not None and track.bias.doubted)
+    """Return whether a scan is not decided on, or a bias or an unchanged motion is not the most
+    likely cause.
+    """
+    return (
+        bool(track.doubtful)
+        or track.change_probability > 0.5
+        or (track.bias is not None and track.bias.doubted)
+    )
 
 
 def with_history(then: Track, now: Track) -> Track:
@@ -267,11 +326,13 @@ def with_history(then: Track, now: Track) -> Track:
 
 
 def nis_scale(track: Track) -> float:
-    """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
+    """How many times larger than chi-square the NIS of the accepted scans is: their median over
+    that of chi-square.
 
-    Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a doubtful scan must be
-    large compared with that of the accepted scans. The median is taken over many scans: errors of the registration last
-    for the whole log, while a sensor error that grows over some tens of scans must not raise the gate that detects it.
+    Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a
+    doubtful scan must be large compared with that of the accepted scans. The median is taken over
+    many scans: errors of the registration last for the whole log, while a sensor error that grows
+    over some tens of scans must not raise the gate that detects it.
     """
     if len(track.nis) < _FEWEST_NIS:
         return 1.0
@@ -286,7 +347,10 @@ def with_nis(after: Track, before: Track, nis: float) -> Track:
 def ready(track: Track) -> bool:
     """Return whether the estimate is based on enough poses for its prediction to be tested.
 
-    After a manoeuvre the prior keeps all but the velocities, so that few poses determine the motion.
+    After a manoeuvre the prior keeps all but the velocities, so that few poses determine the
+    motion.
     """
     least = _READY_AFTER_MANOEUVRE if track.manoeuvres else _READY
-    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)
+    return track.mode == "filter" or (
+        track.mode == "fit" and track.batch is not None and track.batch.count >= least
+    )

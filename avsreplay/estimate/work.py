@@ -1,9 +1,9 @@
 """Long computations in parts over several scans, so that no scan takes much longer than the others.
 
-A computation is a generator that yields the size of each part when the part is done, in linearised poses: those over
-which residuals and their derivatives are computed, or as many as take the same time. A budget per scan counts them. A
-computation that is continued over scans uses the poses that were there when it began; its result is corrected by the
-later ones.
+A computation is a generator that yields the size of each part when the part is done, in linearised
+poses: those over which residuals and their derivatives are computed, or as many as take the same
+time. A budget per scan counts them. A computation that is continued over scans uses the poses that
+were there when it began; its result is corrected by the later ones.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ def whole(parts: Parts[T]) -> T:
 
 
 class Work(Generic[T]):
-    """A computation up to some part. ``continued`` leaves it as it is: any track that holds it may continue it.
+    """A computation up to some part. ``continued`` leaves it as it is: any track that holds it may
+    continue it.
 
-    A checkpoint contains the number of its parts only. A run that continues from there computes them again.
+    A checkpoint contains the number of its parts only. A run that continues from there computes
+    them again.
     """
 
     def __init__(self, count: int = 0) -> None:
@@ -85,7 +87,8 @@ class Computation:
     Attributes:
         kind: of the computation.
         begin: its arguments.
-        finish: the arguments, besides track and result, of the change of the track when it has ended.
+        finish: the arguments, besides track and result, of the change of the track when it has
+            ended.
         work: the computation so far.
     """
 

@@ -1,4 +1,7 @@
-"""Bytes of a file: reading at an offset, decompression with a size limit, and text made safe to print."""
+"""Bytes of a file.
+
+Reading at an offset, decompression with a size limit, and text made safe to print.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,17 @@ from typing import Any
 from avsreplay.errors import UnreadableInput
 
 # C0 and C1 control characters, bidirectional marks, zero-width characters and lone surrogates.
-_UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
+_UNSAFE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
 _SMALL, _BLOCK = 256, 1 << 16  # small reads (record heads) are served from one cached block
-ROS1_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"SQLite format 3\x00"  # first bytes of the files of ROS bags
-_PER_THREAD = threading.local()  # a decompressor is expensive to create and may serve one thread at a time
+ROS1_MAGIC, SQLITE_MAGIC = (
+    b"#ROSBAG V2.0\n",
+    b"SQLite format 3\x00",
+)  # first bytes of the files of ROS bags
+_PER_THREAD = (
+    threading.local()
+)  # a decompressor is expensive to create and may serve one thread at a time
 
 
 class BadMessage(ValueError):
@@ -21,8 +31,12 @@ class BadMessage(ValueError):
 
 
 def shown(text: object) -> str:
-    r"""Return ``str(text)`` with every control character replaced by an escape (``\x1b``, ``\u202e``)."""
-    return _UNSAFE.sub(lambda m: m[0].encode("unicode_escape", "surrogatepass").decode("ascii"), str(text))
+    r"""Return ``str(text)`` with every control character replaced by an escape (``\x1b``,
+    ``\u202e``).
+    """
+    return _UNSAFE.sub(
+        lambda m: m[0].encode("unicode_escape", "surrogatepass").decode("ascii"), str(text)
+    )
 
 
 class ByteFile:
@@ -47,7 +61,11 @@ class ByteFile:
             size = path.stat().st_size
             self.size = size if upto is None else min(size, upto)
         except OSError as error:
-            what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
+            what = (
+                "no such file"
+                if isinstance(error, FileNotFoundError)
+                else error.strerror or "cannot be read"
+            )
             raise UnreadableInput(what, where=shown(path), hint="check the path") from None
         self._lock = threading.Lock()
         self._block = (0, b"")
@@ -58,7 +76,10 @@ class ByteFile:
             return self._read(offset, size)
         begin, block = self._block
         if not begin <= offset <= offset + size <= begin + len(block):
-            begin, block = self._block = offset, self._read(offset, max(min(_BLOCK, self.size - offset), size))
+            begin, block = self._block = (
+                offset,
+                self._read(offset, max(min(_BLOCK, self.size - offset), size)),
+            )
         return block[offset - begin : offset - begin + size]
 
     def read_at_most(self, offset: int, size: int) -> bytes:
@@ -89,7 +110,8 @@ class ByteFile:
 def inflate(data: bytes, compression: str, size: int) -> bytes:
     """Return ``data`` decompressed, exactly ``size`` bytes.
 
-    Raises BadMessage if the data is damaged, gives another number of bytes, or the compression is unknown.
+    Raises BadMessage if the data is damaged, gives another number of bytes, or the compression is
+    unknown.
     """
     if compression == "":
         out = data

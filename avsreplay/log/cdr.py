@@ -1,7 +1,9 @@
-"""Reading and writing of serialised ROS messages: CDR (ROS 2, both byte orders) and the ROS 1 wire format.
+"""Reading and writing of serialised ROS messages: CDR (ROS 2, both byte orders) and the ROS 1 wire
+format.
 
-One reader serves both: they differ in alignment, in the closing NUL of a string and in the ``seq`` of a header. Every
-read is checked against the end of the buffer, so that a wrong length raises ``BadMessage``.
+One reader serves both: they differ in alignment, in the closing NUL of a string and in the ``seq``
+of a header. Every read is checked against the end of the buffer, so that a wrong length raises
+``BadMessage``.
 """
 
 from __future__ import annotations
@@ -18,7 +20,10 @@ from avsreplay.log.bytes_io import BadMessage
 from avsreplay.records import Label, State
 
 _U32, _STAMP = struct.Struct("<I"), struct.Struct("<iI")
-_CDR_LITTLE = {0x0001: "<", 0x0000: ">"}  # plain CDR; parameter lists (0x0002, 0x0003) do not occur in ROS
+_CDR_LITTLE = {
+    0x0001: "<",
+    0x0000: ">",
+}  # plain CDR; parameter lists (0x0002, 0x0003) do not occur in ROS
 
 
 class Cursor:
@@ -226,7 +231,10 @@ def point_cloud2(
     """
     fields = (("t", times_s), ("intensity", intensities), ("residual", residuals))
     besides = [(name, values) for name, values in fields if values is not None]
-    names, size = ["x", "y", "z", *(name for name, _ in besides)], 4 if point_type == "float32" else 8
+    names, size = (
+        ["x", "y", "z", *(name for name, _ in besides)],
+        4 if point_type == "float32" else 8,
+    )
     step = 3 * size + 4 * len(besides)
     table = np.empty((len(points), step // 4), "<f4")
     table[:, : 3 * size // 4].view(f"<f{size}")[:] = points
@@ -260,7 +268,12 @@ def transform(t_ns: int, parent: str, child: str, pose: Pose) -> bytes:
 def diagnostic(t_ns: int, label: Label, begins: bool) -> bytes:
     """Return a diagnostic_msgs DiagnosticArray: an injected fault begins (WARN) or ends (OK)."""
     message = "injected fault begins" if begins else "injected fault ends"
-    values = {"start_ns": label.start_ns, "end_ns": label.end_ns, "harmful": label.harmful, "strength": label.strength}
+    values = {
+        "start_ns": label.start_ns,
+        "end_ns": label.end_ns,
+        "harmful": label.harmful,
+        "strength": label.strength,
+    }
     packer = Packer().header(t_ns, "").u32(1).u8(1 if begins else 0)
     packer.string(label.kind).string(message).string("").u32(len(values))
     for key, value in values.items():
@@ -277,24 +290,34 @@ _POSE = ("geometry_msgs/Pose", "Point position\nQuaternion orientation\n")
 _TWIST = ("geometry_msgs/Twist", "Vector3 linear\nVector3 angular\n")
 _FIELD = (
     "sensor_msgs/PointField",
-    "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\nuint8 FLOAT32=7\n"
-    "uint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count\n",
+    (
+        "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8"
+        " UINT32=6\nuint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\nuint8"
+        " datatype\nuint32 count\n"
+    ),
 )
 _TRANSFORM = ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation\n")
-_STAMPED = ("geometry_msgs/TransformStamped", "std_msgs/Header header\nstring child_frame_id\nTransform transform\n")
+_STAMPED = (
+    "geometry_msgs/TransformStamped",
+    "std_msgs/Header header\nstring child_frame_id\nTransform transform\n",
+)
 _POSE_COV = ("geometry_msgs/PoseWithCovariance", "Pose pose\nfloat64[36] covariance\n")
 _TWIST_COV = ("geometry_msgs/TwistWithCovariance", "Twist twist\nfloat64[36] covariance\n")
 _KEY_VALUE = ("diagnostic_msgs/KeyValue", "string key\nstring value\n")
 _DIAGNOSTIC = (
     "diagnostic_msgs/DiagnosticStatus",
-    "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
-    "string hardware_id\nKeyValue[] values\n",
+    (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring"
+        " message\nstring hardware_id\nKeyValue[] values\n"
+    ),
 )
 
 SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
     "sensor_msgs/msg/PointCloud2": (
-        "std_msgs/Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool is_bigendian\n"
-        "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n",
+        (
+            "std_msgs/Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool"
+            " is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n"
+        ),
         (_HEADER, _TIME, _FIELD),
     ),
     "geometry_msgs/msg/PoseStamped": (
@@ -302,8 +325,10 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
         (_HEADER, _TIME, _POSE, _POINT, _QUATERNION),
     ),
     "nav_msgs/msg/Odometry": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-        "geometry_msgs/TwistWithCovariance twist\n",
+        (
+            "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+            "geometry_msgs/TwistWithCovariance twist\n"
+        ),
         (_HEADER, _TIME, _POSE_COV, _POSE, _POINT, _QUATERNION, _TWIST_COV, _TWIST, _VECTOR3),
     ),
     "tf2_msgs/msg/TFMessage": (
@@ -318,7 +343,9 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
 
 
 def schema_text(name: str) -> bytes:
-    """Return the definition of a message type of ``SCHEMAS`` with its dependencies, in the ``ros2msg`` format."""
+    """Return the definition of a message type of ``SCHEMAS`` with its dependencies, in the
+    ``ros2msg`` format.
+    """
     body, dependencies = SCHEMAS[name]
     parts = [body, *(f"MSG: {dep}\n{text}" for dep, text in dependencies)]
     return ("\n" + "=" * 80 + "\n").join(p.rstrip("\n") for p in parts).encode() + b"\n"

@@ -2,16 +2,16 @@
 
 Scans are ordered by log time, then by file order. The rules for ``ClockChoice.HEADER``:
 
-1. If no header stamp is set, all times are taken from the log clock.
-2. The offset (header minus log clock) starts as the median of the first nine scans and follows each deviation by one
+1. If no header stamp is set, all times are taken from the log clock. 2. The offset (header minus
+log clock) starts as the median of the first nine scans and follows each deviation by one
    tenth, so that clocks that differ by months or drift are handled.
-3. A stamp that deviates from log time + offset by more than max(0.5 s, 5 periods) is a jump. If instead the log clock
-   has stepped (its interval differs more from the period than the header's), the offset is corrected by the step and
-   the stamp is used.
-4. A jump, an unset stamp (0), or a stamp not after the previous one gives ``ScanStatus.CLOCK`` and the time log +
-   offset.
-5. Three consecutive jumps to the same new offset are a permanent step of the header clock: from the third on, the
-   stamps minus the step are used, so that ``t_ns`` is continuous.
+3. A stamp that deviates from log time + offset by more than max(0.5 s, 5 periods) is a jump. If
+   instead the log clock has stepped (its interval differs more from the period than the header's),
+   the offset is corrected by the step and the stamp is used.
+4. A jump, an unset stamp (0), or a stamp not after the previous one gives ``ScanStatus.CLOCK`` and
+   the time log + offset.
+5. Three consecutive jumps to the same new offset are a permanent step of the header clock: from the
+   third on, the stamps minus the step are used, so that ``t_ns`` is continuous.
 """
 
 from __future__ import annotations
@@ -43,15 +43,23 @@ class Placed:
 def place(
     log_ns: Sequence[int], publish_ns: Sequence[int], header_ns: Sequence[int], choice: ClockChoice
 ) -> tuple[list[Placed], ClockSummary]:
-    """Return the times of all scans, given in the order of the recorder, and a summary of the corrections."""
-    period = int(statistics.median(np.diff(log_ns).tolist())) if len(log_ns) > 1 else 0  # np.median loads numpy.ma
+    """Return the times of all scans, given in the order of the recorder, and a summary of the
+    corrections.
+    """
+    period = (
+        int(statistics.median(np.diff(log_ns).tolist())) if len(log_ns) > 1 else 0
+    )  # np.median loads numpy.ma
     offsets = [h - r for h, r in zip(header_ns, log_ns, strict=True)]
     summary = ClockSummary(choice.value, len(log_ns), _median(offsets) * 1e-9, period * 1e-9)
     if choice is not ClockChoice.HEADER:
         return _monotone(log_ns if choice is ClockChoice.LOG else publish_ns, summary)
     if len(log_ns) and not any(header_ns) and any(log_ns):
-        placed, summary = _monotone(log_ns, replace(summary, clock=ClockChoice.LOG.value, offset_s=0.0))
-        return placed, replace(summary, unset=0, note="header stamps are never set: the log clock is used")
+        placed, summary = _monotone(
+            log_ns, replace(summary, clock=ClockChoice.LOG.value, offset_s=0.0)
+        )
+        return placed, replace(
+            summary, unset=0, note="header stamps are never set: the log clock is used"
+        )
     tracker = _Tracker(max(_FLOOR_NS, _PERIODS * period), period, _first_offset(offsets, header_ns))
     placed = [tracker.take(r, h) for r, h in zip(log_ns, header_ns, strict=True)]
     return placed, tracker.summary(summary)
@@ -67,7 +75,10 @@ def _first_offset(offsets: Sequence[int], header_ns: Sequence[int]) -> int:
 
 
 def _monotone(instants: Sequence[int], summary: ClockSummary) -> tuple[list[Placed], ClockSummary]:
-    """Use a clock unchanged; a time that is not after the previous one is set one nanosecond after it."""
+    """Use a clock unchanged.
+
+    A time that is not after the previous one is set one nanosecond after it.
+    """
     placed, last = list[Placed](), None
     equal = back = 0
     for instant in instants:
@@ -86,10 +97,19 @@ class _Tracker:
     def __init__(self, tolerance: int, period: int, offset: int) -> None:
         self._tolerance, self._period, self._offset = tolerance, period, offset
         self._correction = 0  # sum of the permanent steps of the header clock, subtracted from t_ns
-        self._last: tuple[int, int] | None = None  # log and header time of the last scan whose stamp was used
+        self._last: tuple[int, int] | None = (
+            None  # log and header time of the last scan whose stamp was used
+        )
         self._last_t: int | None = None
         self._jumped: list[tuple[int, int]] = []  # deviation and header time of consecutive jumps
-        self.counts = {"unset": 0, "jumps": 0, "equal": 0, "back": 0, "header_steps": 0, "log_steps": 0}
+        self.counts = {
+            "unset": 0,
+            "jumps": 0,
+            "equal": 0,
+            "back": 0,
+            "header_steps": 0,
+            "log_steps": 0,
+        }
 
     def take(self, log_ns: int, header_ns: int) -> Placed:
         """Return the time of the next scan."""
@@ -116,9 +136,14 @@ class _Tracker:
         """Return the summary with the counts."""
         c = self.counts
         return replace(
-            summary, unset=c["unset"], jumps=c["jumps"], equal=c["equal"], back=c["back"],
-            header_steps=c["header_steps"], log_steps=c["log_steps"],
-        )  # fmt: skip
+            summary,
+            unset=c["unset"],
+            jumps=c["jumps"],
+            equal=c["equal"],
+            back=c["back"],
+            header_steps=c["header_steps"],
+            log_steps=c["log_steps"],
+        )
 
     def _trouble(self, deviation: int, header_ns: int) -> str | None:
         if abs(deviation) > self._tolerance:
@@ -137,7 +162,10 @@ class _Tracker:
         return Placed(t_ns, _NOTES[trouble].format(deviation * 1e-9))
 
     def _log_stepped(self, log_ns: int, header_ns: int) -> bool:
-        """Return whether the log clock stepped: the interval of the header is closer to the period."""
+        """Return whether the log clock stepped.
+
+        The interval of the header is closer to the period.
+        """
         if self._last is None or self._jumped:
             return False
         log_step, header_step = log_ns - self._last[0], header_ns - self._last[1]

@@ -1,7 +1,7 @@
 """Reading of the sqlite3 storage of rosbag2, read-only.
 
-The database has no checksums. A damaged page makes a query fail part of the way: the pass then continues behind it and
-counts the rows that it skips.
+The database has no checksums. A damaged page makes a query fail part of the way: the pass then
+continues behind it and counts the rows that it skips.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ class Db3File(Recording):
             raise _unreadable(path, error) from None
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
+        """Return the payload of the cloud message with this index entry.
+
+        Raises BadMessage if it cannot be read.
+        """
         row_id = self._table.clouds(topic).offset[place]
         try:
             row = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
@@ -78,7 +81,11 @@ class Db3File(Recording):
             elif not self._take(row):
                 lost += 1
         if skipped or lost:
-            what = "the database is damaged" if skipped else "messages without a topic, a time or bytes"
+            what = (
+                "the database is damaged"
+                if skipped
+                else "messages without a topic, a time or bytes"
+            )
             self.losses.append(Loss(what, 0, 0, messages=lost or None, file=self.path.name))
 
     def _last(self) -> int:
@@ -90,7 +97,10 @@ class Db3File(Recording):
 
     def _rows(self, last: int) -> Iterator[tuple[object, ...] | None]:
         """Yield the messages by id; None for a range that cannot be read."""
-        query = "SELECT id, topic_id, timestamp, substr(data, 1, ?) FROM messages WHERE id > ? AND id <= ? ORDER BY id"
+        query = (
+            "SELECT id, topic_id, timestamp, substr(data, 1, ?) FROM messages WHERE id > ? AND id"
+            " <= ? ORDER BY id"
+        )
         at, failures = -1, 0
         while at < last:
             done = at
@@ -113,14 +123,17 @@ class Db3File(Recording):
             return False
         payload = memoryview(head)
         if topic in self._sinks:
-            whole = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()[0]
+            whole = self._db.execute(
+                "SELECT data FROM messages WHERE id = ?", (row_id,)
+            ).fetchone()[0]
             payload = memoryview(whole if isinstance(whole, bytes) else b"")
         self._table.add(topic, (max(log_ns, 0), max(log_ns, 0)), payload, (0, row_id))
         return True
 
 
 def _connected(path: Path, limit: int) -> sqlite3.Connection:
-    # The write-ahead log beside the file holds messages of a recorder that was killed: sqlite must read it.
+    # The write-ahead log beside the file holds messages of a recorder that was killed: sqlite must
+    # read it.
     alone = not path.with_name(path.name + "-wal").exists()
     uri = f"{path.resolve().as_uri()}?mode=ro" + ("&immutable=1" if alone else "")
     try:
@@ -137,10 +150,14 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
     for name in ("topics", "messages"):
         if name not in found or "VIRTUAL" in found[name] or "GENERATED" in found[name]:
             db.close()
-            raise UnreadableInput(f"a database without the table '{name}'", where=shown(path), hint="give a ROS 2 bag")
+            raise UnreadableInput(
+                f"a database without the table '{name}'", where=shown(path), hint="give a ROS 2 bag"
+            )
     return db
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableInput:
     hint = "the sqlite3 program's .recover may save part of it"
-    return UnreadableInput(f"not a readable ROS 2 bag: {shown(error)}", where=shown(path), hint=hint)
+    return UnreadableInput(
+        f"not a readable ROS 2 bag: {shown(error)}", where=shown(path), hint=hint
+    )

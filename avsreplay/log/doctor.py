@@ -1,4 +1,6 @@
-"""Examination of a log (structure, checksums, clocks, gaps, duplicates, points, truth) and repair of an MCAP file."""
+"""Examination of a log (structure, checksums, clocks, gaps, duplicates, points, truth) and repair
+of an MCAP file.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,10 @@ class Severity(Enum):
 
 @value_class(eq=True)
 class Finding:
-    """One finding: severity, subject, text, and the file offsets or scan numbers that it refers to."""
+    """One finding.
+
+    Severity, subject, text, and the file offsets or scan numbers that it refers to.
+    """
 
     severity: Severity
     about: str
@@ -102,7 +107,11 @@ def _losses(losses: tuple[Loss, ...]) -> Iterator[Finding]:
 
 def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
     if not is_mcap(path):
-        yield Finding(Severity.NOTE, "checksums", "this format has none: damage inside a message cannot be detected")
+        yield Finding(
+            Severity.NOTE,
+            "checksums",
+            "this format has none: damage inside a message cannot be detected",
+        )
         return
     file = McapFile(path, options.max_message_mib << 20)
     try:
@@ -110,7 +119,9 @@ def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
             text = f"invalid: {file.summary.trouble}; other readers may reject the file"
             yield Finding(Severity.ERROR, "summary", text)
         elif file.closed_properly and not file.summary.start:
-            yield Finding(Severity.WARNING, "summary", "missing: other readers are slow or reject the file")
+            yield Finding(
+                Severity.WARNING, "summary", "missing: other readers are slow or reject the file"
+            )
         if file.unchecked:
             yield Finding(Severity.WARNING, "checksums", f"{file.unchecked} chunks have none")
         if file.closed_properly and not file.data_checksum_holds():
@@ -119,7 +130,11 @@ def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
         elif not file.unchecked and not file.losses:
             yield Finding(Severity.OK, "checksums", "all are correct")
         if file.profile != "ros2":
-            yield Finding(Severity.NOTE, "profile", f"'{shown(file.profile)}', not ros2: some readers do not open it")
+            yield Finding(
+                Severity.NOTE,
+                "profile",
+                f"'{shown(file.profile)}', not ros2: some readers do not open it",
+            )
         yield from _schemas(file)
     finally:
         file.close()
@@ -128,19 +143,30 @@ def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
 def _schemas(file: McapFile) -> Iterator[Finding]:
     for channel in file.channels().values():
         if channel.encoding not in ("cdr", "ros1"):
-            text = f"{shown(channel.topic)} is encoded as '{shown(channel.encoding)}', which is not read"
+            text = (
+                f"{shown(channel.topic)} is encoded as '{shown(channel.encoding)}', which is not"
+                " read"
+            )
             yield Finding(Severity.NOTE, "encoding", text)
         elif not channel.schema:
-            yield Finding(Severity.NOTE, "schema", f"{shown(channel.topic)} has no message definition")
+            yield Finding(
+                Severity.NOTE, "schema", f"{shown(channel.topic)} has no message definition"
+            )
 
 
 def _content(info: LogInfo) -> Iterator[Finding]:
     if not info.scans:
-        yield Finding(Severity.WARNING, "scans", "no cloud topic with a message, or several of which none was chosen")
+        yield Finding(
+            Severity.WARNING,
+            "scans",
+            "no cloud topic with a message, or several of which none was chosen",
+        )
     if info.model is None:
         yield Finding(Severity.NOTE, "model", "the log has none: give --model to run it")
     elif not info.model_faces:
-        yield Finding(Severity.NOTE, "model", f"{shown(info.model)} has no faces: it is used as a point cloud")
+        yield Finding(
+            Severity.NOTE, "model", f"{shown(info.model)} has no faces: it is used as a point cloud"
+        )
 
 
 def _pass(source: Source) -> tuple[_Tally, list[int]]:
@@ -172,7 +198,8 @@ def _clocks(clock: ClockSummary) -> Iterator[Finding]:
         yield Finding(Severity.WARNING, "clock", clock.note)
     elif abs(clock.offset_s) > _APART_S:
         text = (
-            f"header and log clock are {clock.offset_s:+.3f} s apart; scan times are taken from the {clock.clock} clock"
+            f"header and log clock are {clock.offset_s:+.3f} s apart; scan times are taken from the"
+            f" {clock.clock} clock"
         )
         yield Finding(Severity.NOTE, "clock", text)
     for name, words in (
@@ -186,7 +213,9 @@ def _clocks(clock: ClockSummary) -> Iterator[Finding]:
         if count := getattr(clock, name):
             yield Finding(Severity.WARNING, "clock", f"{count} {words}")
     if not clock.placed and not clock.note:
-        yield Finding(Severity.OK, "clock", f"every stamp is plausible; median period {clock.period_s:.4f} s")
+        yield Finding(
+            Severity.OK, "clock", f"every stamp is plausible; median period {clock.period_s:.4f} s"
+        )
 
 
 def _gaps(times: list[int]) -> Iterator[Finding]:
@@ -233,7 +262,10 @@ def _layout(source: Source) -> Iterator[Finding]:
             continue
         fields = " ".join(f"{shown(f.name)}:{f.kind}@{f.offset}" for f in layout.fields)
         order = "little" if layout.order == "<" else "big"
-        layouts[f"{fields}, {layout.point_step} bytes a point, {order} endian, frame '{shown(layout.frame)}'"] += 1
+        layouts[
+            f"{fields}, {layout.point_step} bytes a point, {order} endian, frame"
+            f" '{shown(layout.frame)}'"
+        ] += 1
     for text, count in layouts.most_common(_NAMED):
         severity = Severity.OK if len(layouts) == 1 else Severity.WARNING
         yield Finding(severity, "layout", text if len(layouts) == 1 else f"{count} scans: {text}")
@@ -261,8 +293,12 @@ class _Copier:
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, int] = {}
 
-    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
-        """Copy a message, unless it is a cloud that cannot be decoded or its time is beyond 2^63 ns."""
+    def message(
+        self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview
+    ) -> None:
+        """Copy a message, unless it is a cloud that cannot be decoded or its time is beyond 2^63
+        ns.
+        """
         if channel.type in CLOUD_TYPES:
             try:
                 decode_cloud(payload, channel.encoding)
@@ -307,12 +343,16 @@ class _Copier:
             key = (channel.type, channel.schema_encoding, channel.schema)
             if key not in self._schemas:
                 self._schemas[key] = self._writer.register_schema(*key)
-            new = self._writer.register_channel(channel.topic, channel.encoding, self._schemas[key], channel.metadata)
+            new = self._writer.register_channel(
+                channel.topic, channel.encoding, self._schemas[key], channel.metadata
+            )
             self._channels[channel.id] = new
         return self._channels[channel.id]
 
 
-def repair(path: Path, output: Path, *, overwrite: bool = False, max_message_mib: int = 128) -> Repaired:
+def repair(
+    path: Path, output: Path, *, overwrite: bool = False, max_message_mib: int = 128
+) -> Repaired:
     """Write every intact record of an MCAP file to a new file.
 
     Args:

@@ -1,11 +1,12 @@
 """The header of a log and the model of the target that it names.
 
-The header (scenario, seed, fault labels, start state) is one MCAP metadata record of JSON values. Floats are written in
-their shortest exact form, so that a header read back equals the one written, bit for bit. MCAP has no checksum for
-metadata records; this record contains one over its own values.
+The header (scenario, seed, fault labels, start state) is one MCAP metadata record of JSON values.
+Floats are written in their shortest exact form, so that a header read back equals the one written,
+bit for bit. MCAP has no checksum for metadata records; this record contains one over its own
+values.
 
-The model is an attachment or a file of its own: PLY and PCD are read with the readers of this package, STL, OBJ, OFF
-and GLB with trimesh.
+The model is an attachment or a file of its own: PLY and PCD are read with the readers of this
+package, STL, OBJ, OFF and GLB with trimesh.
 """
 
 from __future__ import annotations
@@ -66,7 +67,9 @@ def decode_header(values: Mapping[str, str]) -> LogHeader:
     if values.get("crc32") != f"{_checksum(rest):08x}":
         raise ValueError("the checksum of the header record is wrong")
     if values.get("format") != FORMAT:
-        raise ValueError(f"header record of format {values.get('format')!r}, this version reads {FORMAT}")
+        raise ValueError(
+            f"header record of format {values.get('format')!r}, this version reads {FORMAT}"
+        )
     try:
         return LogHeader(
             scenario=values["scenario"],
@@ -91,7 +94,9 @@ def _json(value: Any) -> str:
 
 
 def _label(label: Label) -> dict[str, Any]:
-    return {name: getattr(label, name) for name in ("kind", "start_ns", "end_ns", "harmful", "strength")}
+    return {
+        name: getattr(label, name) for name in ("kind", "start_ns", "end_ns", "harmful", "strength")
+    }
 
 
 def _state(state: State | None) -> dict[str, Any] | None:
@@ -99,7 +104,11 @@ def _state(state: State | None) -> dict[str, Any] | None:
 
 
 def _belief(belief: Belief | None) -> dict[str, Any] | None:
-    return None if belief is None else {"t_ns": belief.t_ns, "x": _state(belief.x), "P": belief.P.tolist()}
+    return (
+        None
+        if belief is None
+        else {"t_ns": belief.t_ns, "x": _state(belief.x), "P": belief.P.tolist()}
+    )
 
 
 def _loads(text: str) -> Any:
@@ -124,8 +133,14 @@ def _to_frame(value: Any) -> str:
 
 def _to_label(values: Any) -> Label:
     label = Label(**values)
-    whole = type(label.start_ns) is int and type(label.end_ns) is int and type(label.harmful) is bool
-    if not isinstance(label.kind, str) or not whole or not isinstance(label.strength, (int, float, type(None))):
+    whole = (
+        type(label.start_ns) is int and type(label.end_ns) is int and type(label.harmful) is bool
+    )
+    if (
+        not isinstance(label.kind, str)
+        or not whole
+        or not isinstance(label.strength, (int, float, type(None)))
+    ):
         raise ValueError("a fault label with a value of the wrong type")
     return label
 
@@ -136,7 +151,9 @@ def _to_state(values: Any) -> State | None:
     state = State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
     lengths = np.linalg.norm(state.q_ab), np.linalg.norm(state.q_bc)
     if not all(abs(length - 1.0) < 1e-6 for length in lengths) or np.abs(state.sigma).max() >= 1.0:
-        raise ValueError("an invalid state: a quaternion is not of unit length, or a sigma is not below 1")
+        raise ValueError(
+            "an invalid state: a quaternion is not of unit length, or a sigma is not below 1"
+        )
     return state
 
 
@@ -155,24 +172,39 @@ _FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
 MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
 # Exceptions that trimesh raises for malformed files.
 _FOREIGN = (
-    ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
-    NameError, NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
-)  # fmt: skip
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    BufferError,
+    EOFError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    NameError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zlib.error,
+)
 
 
 def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     """Read a model file.
 
     Args:
-        path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of the model.
+        path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of
+            the model.
         cloud_ok: accept a file without faces as a point-cloud model.
 
     Returns:
         The model with the bytes and the SHA-256 of its file.
 
     Raises:
-        UnreadableInput: the file does not exist, is not a model, has vertices that are not finite, or has no faces
-            although they are needed.
+        UnreadableInput: the file does not exist, is not a model, has vertices that are not finite,
+            or has no faces although they are needed.
     """
     path = Path(path)
     data = read_limited(path, MAX_BYTES, "name a model file of at most 512 MiB")
@@ -196,12 +228,18 @@ def parse_surface(data: bytes, name: str) -> Surface:
 
 
 def scaled(surface: Surface, scale: float) -> Surface:
-    """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256 are those of the result."""
+    """Return the model with its coordinates multiplied by ``scale``.
+
+    Its bytes and SHA-256 are those of the result.
+    """
     return surface if scale == 1.0 else with_vertices(surface, scale * surface.vertices)
 
 
 def with_vertices(surface: Surface, vertices: Array) -> Surface:
-    """Return the model with other coordinates (n, 3) [m]; its bytes and SHA-256 are those of the result."""
+    """Return the model with other coordinates (n, 3) [m].
+
+    Its bytes and SHA-256 are those of the result.
+    """
     bare = replace(surface, vertices=frozen(vertices, -1, 3), sha256="", data=b"")
     data = surface_bytes(bare)
     return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
@@ -212,7 +250,8 @@ def in_metres(surface: Surface, factor: float, mirror: bool = False) -> Surface:
 
     Args:
         surface: the model as in its file.
-        factor: of its coordinates: metres per unit of the file, times the scale that the user gives.
+        factor: of its coordinates: metres per unit of the file, times the scale that the user
+            gives.
         mirror: change the sign of the x coordinates, and the winding of the faces.
 
     Raises:
@@ -220,14 +259,19 @@ def in_metres(surface: Surface, factor: float, mirror: bool = False) -> Surface:
     """
     found = scaled(surface, factor)
     if mirror:
-        found = with_vertices(replace(found, faces=found.faces[:, ::-1].copy()), found.vertices * [-1.0, 1.0, 1.0])
+        found = with_vertices(
+            replace(found, faces=found.faces[:, ::-1].copy()), found.vertices * [-1.0, 1.0, 1.0]
+        )
     if found is not surface:
         _check(found.vertices, found.faces, shown(surface.name), cloud_ok=True)
     return found
 
 
 def surface_bytes(surface: Surface) -> bytes:
-    """Return the bytes of the model's file; if it was not read from one, a binary PLY with float64 vertices."""
+    """Return the bytes of the model's file.
+
+    If it was not read from one, a binary PLY with float64 vertices.
+    """
     if surface.data:
         return surface.data
     header = (
@@ -247,10 +291,17 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     if data.startswith(b"ply"):
         suffix = "ply"
     if suffix not in _FORMATS:
-        hint = f"give a model as {', '.join(_FORMATS).upper()}; CAD programs export STEP and IGES files as STL"
-        raise UnreadableInput(f"'{shown(suffix)}' is not a known model format", where=where, hint=hint)
+        hint = (
+            f"give a model as {', '.join(_FORMATS).upper()}; CAD programs export STEP and IGES"
+            " files as STL"
+        )
+        raise UnreadableInput(
+            f"'{shown(suffix)}' is not a known model format", where=where, hint=hint
+        )
     try:
-        vertices, faces = _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
+        vertices, faces = (
+            _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
+        )
     except _FOREIGN as error:
         reason = shown(str(error) or type(error).__name__)[:120]
         raise UnreadableInput(
@@ -260,7 +311,9 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     vertices = frozen(vertices, -1, 3)
     faces, reversed_ = mesh.outward(vertices, mesh.with_area(vertices, faces))
     if not cloud_ok and not len(faces):
-        raise UnreadableInput("every triangle has zero area", where=where, hint="check the units of the model")
+        raise UnreadableInput(
+            "every triangle has zero area", where=where, hint="check the units of the model"
+        )
     faces.flags.writeable = False
     return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data, reversed_)
 
@@ -290,9 +343,16 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
     _silence_trimesh()
     with np.errstate(all="ignore"):
-        loaded: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+        loaded: Any = trimesh.load(
+            io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options
+        )
     vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
+    if (
+        vertices.ndim != 2
+        or vertices.shape[1] != 3
+        or faces.ndim != 2
+        or (len(faces) and faces.shape[1] != 3)
+    ):
         raise BadFile("no triangles in three dimensions")
     return _merged(vertices, faces)
 
@@ -319,22 +379,33 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
     bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
     if bad:
         hint = "remove them in a mesh editor"
-        raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
+        raise UnreadableInput(
+            f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint
+        )
     if np.abs(vertices).max() > MAX_COORDINATE_M:
-        what = f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is {MAX_COORDINATE_M:.0g} m"
+        what = (
+            f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is"
+            f" {MAX_COORDINATE_M:.0g} m"
+        )
         raise UnreadableInput(what, where=where, hint="check the units of the model")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")
+        raise UnreadableInput(
+            "a face refers to a vertex that does not exist", where=where, hint="check the file"
+        )
     if not len(faces) and not cloud_ok:
         hint = "give a mesh, or --cloud-model to use its points as the model"
         raise UnreadableInput("the model has no faces", where=where, hint=hint)
     if np.ptp(vertices, axis=0).max() < LEAST_EXTENT_M:
-        what = f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is {LEAST_EXTENT_M:g} m"
+        what = (
+            f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is"
+            f" {LEAST_EXTENT_M:g} m"
+        )
         raise UnreadableInput(what, where=where, hint="check the units of the model")
 
 
 _OCTAHEDRON = np.array(
-    [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]], dtype=np.int32
+    [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]],
+    dtype=np.int32,
 )
 
 

@@ -1,4 +1,7 @@
-"""The index of a log: its topics, chunks and the places of its messages; base class of the log readers; its clouds."""
+"""The index of a log: its topics, chunks and the places of its messages.
+
+Base class of the log readers; its clouds.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,9 @@ from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.point_cloud2 import Cloud, decode_cloud
 
-MAX_NS = (2**31 - 2) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
+MAX_NS = (
+    2**31 - 2
+) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
 POSE_NAMES = (
     "geometry_msgs/msg/PoseStamped",
@@ -36,10 +41,12 @@ def _column() -> array[int]:
 
 @dataclass(slots=True)
 class CloudIndex:
-    """The messages of one cloud or pose topic in file order; one entry for each message in every array.
+    """The messages of one cloud or pose topic in file order; one entry for each message in every
+    array.
 
     Attributes:
-        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns].
+        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
+            [ns].
         container, offset, size: where the reader finds the message again.
     """
 
@@ -52,7 +59,9 @@ class CloudIndex:
 
     def add(self, clocks: tuple[int, int, int], container: int, offset: int, size: int) -> None:
         """Append a message with its (log, publish, header) times [ns]."""
-        for column, value in zip((self.log_ns, self.publish_ns, self.header_ns), clocks, strict=True):
+        for column, value in zip(
+            (self.log_ns, self.publish_ns, self.header_ns), clocks, strict=True
+        ):
             column.append(max(-MAX_NS, min(value, MAX_NS)))
         self.container.append(container)
         self.offset.append(offset)
@@ -83,7 +92,8 @@ class _TopicCount:
 
 
 class MessageTable:
-    """Topics with their message counts and the index of every cloud and pose topic, filled by one pass over the log.
+    """Topics with their message counts and the index of every cloud and pose topic, filled by one
+    pass over the log.
 
     Args:
         sinks: called with every message of a topic during the pass.
@@ -98,8 +108,13 @@ class MessageTable:
         """Declare a topic; the first declared type is kept."""
         self._topics.setdefault(topic, _TopicCount(topic, kind, encoding))
 
-    def add(self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]) -> None:
-        """Add a message of a declared topic: (log, publish) times [ns], payload and (container, offset)."""
+    def add(
+        self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]
+    ) -> None:
+        """Add a message of a declared topic.
+
+        (log, publish) times [ns], payload and (container, offset).
+        """
         known = self._topics[topic]
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
@@ -111,7 +126,10 @@ class MessageTable:
 
     def topics(self) -> list[TopicInfo]:
         """Return all topics, sorted by name."""
-        infos = (TopicInfo(t.name, t.type, t.encoding, t.count, t.first_ns, t.last_ns) for t in self._topics.values())
+        infos = (
+            TopicInfo(t.name, t.type, t.encoding, t.count, t.first_ns, t.last_ns)
+            for t in self._topics.values()
+        )
         return sorted(infos, key=lambda t: t.name)
 
     def clouds(self, topic: str) -> CloudIndex:
@@ -131,7 +149,8 @@ def _stamp(payload: memoryview, encoding: str) -> int:
 
 
 class ChunkStore:
-    """The readable chunks of a file by number, in file order; the last two decompressed ones are kept in memory.
+    """The readable chunks of a file by number, in file order; the last two decompressed ones are
+    kept in memory.
 
     Args:
         file: the file.
@@ -147,28 +166,45 @@ class ChunkStore:
         return len(self._offset)
 
     def check(self, at: int, head: ChunkHead) -> bytes:
-        """Return the decompressed chunk at offset ``at``. Raises BadMessage if it is damaged or over the limit."""
+        """Return the decompressed chunk at offset ``at``.
+
+        Raises BadMessage if it is damaged or over the limit.
+        """
         if max(head.size, head.data_size) > self._limit:
             raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
-        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
+        data = inflate(
+            self._file.read(at + head.data_at, head.data_size), head.compression, head.size
+        )
         if head.crc and zlib.crc32(data) != head.crc:
             raise BadMessage("the checksum of a chunk is wrong")
         return data
 
     def add(self, at: int, head: ChunkHead) -> int:
         """Add a checked chunk and return its number."""
-        values = (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size)
-        for column, value in zip((self._offset, self._packed, self._compression, self._size), values, strict=True):
+        values = (
+            at + head.data_at,
+            head.data_size,
+            _COMPRESSIONS.index(head.compression),
+            head.size,
+        )
+        for column, value in zip(
+            (self._offset, self._packed, self._compression, self._size), values, strict=True
+        ):
             column.append(value)
         return len(self._offset) - 1
 
     def __getitem__(self, number: int) -> bytes:
-        """Return the decompressed chunk. Raises BadMessage if the file has changed since it was indexed."""
+        """Return the decompressed chunk.
+
+        Raises BadMessage if the file has changed since it was indexed.
+        """
         if number not in self._cache:
             if len(self._cache) >= _KEPT:
                 self._cache.pop(next(iter(self._cache)))
             packed = self._file.read(self._offset[number], self._packed[number])
-            self._cache[number] = inflate(packed, _COMPRESSIONS[self._compression[number]], self._size[number])
+            self._cache[number] = inflate(
+                packed, _COMPRESSIONS[self._compression[number]], self._size[number]
+            )
         return self._cache[number]
 
 
@@ -202,7 +238,10 @@ class Recording:
         return self._table.clouds(topic)
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
+        """Return the payload of the cloud message with this index entry.
+
+        Raises BadMessage if it cannot be read.
+        """
         index = self._table.clouds(topic)
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:  # the message is not inside a chunk
@@ -224,7 +263,8 @@ class MessageClouds:
     Attributes:
         kind: the format in words.
         topic: the cloud topic, None if there is none to read.
-        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns], one per cloud.
+        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
+            [ns], one per cloud.
     """
 
     def __init__(self, recording: Recording, topic: str | None) -> None:
@@ -246,7 +286,10 @@ class MessageClouds:
         return decode_cloud(*self.payload(place))
 
     def payload(self, place: int) -> tuple[bytes | memoryview, str]:
-        """Return the serialised message and its encoding. Raises BadMessage if it cannot be read."""
+        """Return the serialised message and its encoding.
+
+        Raises BadMessage if it cannot be read.
+        """
         return self._recording.read(self.topic or "", self._places[place]), self._encoding
 
     def topics(self) -> list[TopicInfo]:
@@ -287,12 +330,17 @@ class Merged(Recording):
         out = CloudIndex()
         for number, part in enumerate(self._parts):
             index = part.clouds(topic)
-            for place, clocks in enumerate(zip(index.log_ns, index.publish_ns, index.header_ns, strict=True)):
+            for place, clocks in enumerate(
+                zip(index.log_ns, index.publish_ns, index.header_ns, strict=True)
+            ):
                 out.add(clocks, number, place, index.size[place])
         return out
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
+        """Return the payload of the cloud message with this index entry.
+
+        Raises BadMessage if it cannot be read.
+        """
         for part in self._parts:
             count = len(part.clouds(topic).log_ns)
             if place < count:

@@ -1,8 +1,9 @@
 """Reading of MCAP: one linear pass that verifies every checksum and resumes after damage.
 
-The pass needs neither index nor summary: it reads intact records, lists damaged ones, counts messages per topic, notes
-the position of every cloud and passes poses to their sinks. Clouds are read later by position. An intact summary
-provides the channels whose first chunk is lost and the number of messages that are missing.
+The pass needs neither index nor summary: it reads intact records, lists damaged ones, counts
+messages per topic, notes the position of every cloud and passes poses to their sinks. Clouds are
+read later by position. An intact summary provides the channels whose first chunk is lost and the
+number of messages that are missing.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
 from avsreplay.log.header import MODEL_ENDINGS
 from avsreplay.log.index import MAX_NS, ChunkStore, Recording, Sink
 from avsreplay.log.mcap_format import Channel, Fields, RecordSink, SummarySection, read_summary
-from avsreplay.log.mcap_salvage import ChannelTable, begins_record, first_chunk, hides_chunk, next_record
+from avsreplay.log.mcap_salvage import (
+    ChannelTable,
+    begins_record,
+    first_chunk,
+    hides_chunk,
+    next_record,
+)
 from avsreplay.log.options import Loss
 
 _TIMES = struct.Struct("<QQ")
@@ -84,7 +91,10 @@ class McapFile(Recording):
         return dict(self._channels.by_id)
 
     def data_checksum_holds(self) -> bool:
-        """Return whether the checksum over the whole data section is correct; True if the file has none."""
+        """Return whether the checksum over the whole data section is correct.
+
+        True if the file has none.
+        """
         end, expected = self.data_end
         crc, at = 0, 0
         while expected and at < end:
@@ -93,7 +103,9 @@ class McapFile(Recording):
         return crc == expected
 
     def attachment(self) -> tuple[str, bytes] | None:
-        """Return name and bytes of the first attachment that is a mesh file, None if there is none."""
+        """Return name and bytes of the first attachment that is a mesh file, None if there is
+        none.
+        """
         if self._model is None:
             return None
         name, offset, size = self._model
@@ -101,7 +113,9 @@ class McapFile(Recording):
 
     def _survey(self) -> None:
         if self._size == 0:
-            raise UnreadableInput("the file is empty", where=shown(self.path), hint="record it again")
+            raise UnreadableInput(
+                "the file is empty", where=shown(self.path), hint="record it again"
+            )
         if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
             hint = "give an MCAP, a ROS bag or a folder of scans"
             if self.path.suffix.lower() in (".csv", ".tum", ".txt"):
@@ -114,12 +128,19 @@ class McapFile(Recording):
             at = self._step(at, summary)
         self._settle()
         if len(self.losses) >= _MAX_LOSSES:
-            self._lose(Loss("damaged at too many places: the rest is not read", at, self._size - at))
+            self._lose(
+                Loss("damaged at too many places: the rest is not read", at, self._size - at)
+            )
         elif self.closed_properly:
             self._after_end(self.data_end[0] + 13)
         elif not self._open_end:
             self._lose(
-                Loss("the file was not closed: messages that its recorder had not yet written are lost", self._size, 0)
+                Loss(
+                    "the file was not closed: messages that its recorder had not yet written are"
+                    " lost",
+                    self._size,
+                    0,
+                )
             )
         self._account(summary)
 
@@ -132,7 +153,11 @@ class McapFile(Recording):
         end = at + len(mcap.MAGIC)
         if end + 8 <= self._size and self._file.read(end, 8) == mcap.MAGIC:
             self._lose(
-                Loss("another log follows the end of this one: replay each file by itself", end, self._size - end)
+                Loss(
+                    "another log follows the end of this one: replay each file by itself",
+                    end,
+                    self._size - end,
+                )
             )
 
     def _step(self, at: int, summary: SummarySection) -> int:
@@ -149,7 +174,13 @@ class McapFile(Recording):
             if end > self._size or (summary.start and end > summary.start):
                 raise BadMessage("a record ends past the file")
             if length > self._limit and opcode != mcap.CHUNK and begins_record(self._file, end):
-                self._lose(Loss(f"a record of {length} bytes is over the limit of {self._limit}", at, end - at))
+                self._lose(
+                    Loss(
+                        f"a record of {length} bytes is over the limit of {self._limit}",
+                        at,
+                        end - at,
+                    )
+                )
                 return end
             self._take(opcode, at, end)
         except BadMessage as error:
@@ -163,7 +194,9 @@ class McapFile(Recording):
             handler(self, at, end)
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
-        elif end - at > _LEAST_CHUNK and (hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None):
+        elif end - at > _LEAST_CHUNK and (
+            hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None
+        ):
             raise BadMessage("a chunk with a damaged opcode")
 
     def _content(self, at: int, end: int) -> Fields:
@@ -229,16 +262,22 @@ class McapFile(Recording):
         self.data_end = (at, int.from_bytes(self._file.read(at + 9, 4), "little"))
 
     def _take_chunk(self, at: int, end: int) -> None:
-        head = mcap.chunk_head(self._file.read_at_most(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
+        head = mcap.chunk_head(
+            self._file.read_at_most(at, min(mcap.CHUNK_PREFIX, end - at)), end - at
+        )
         try:
             data = self._chunks.check(at, head)
-            for opcode, begin, stop in mcap.records(memoryview(data)):  # checked before any of it is used
+            for opcode, begin, stop in mcap.records(
+                memoryview(data)
+            ):  # checked before any of it is used
                 if opcode == mcap.MESSAGE and stop - begin < _LEAST_MESSAGE:
                     raise BadMessage("a message shorter than its fixed fields")
         except BadMessage as error:
             start_ns, end_ns = (min(t, MAX_NS) for t in (head.start_ns, head.end_ns))
             self._resume = self._swallowed(at, end)
-            self._bad_chunk = Loss(str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns)
+            self._bad_chunk = Loss(
+                str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns
+            )
             return
         number, self._trusted = self._chunks.add(at, head), end
         self.unchecked += head.crc == 0
@@ -252,7 +291,9 @@ class McapFile(Recording):
                 self._channels.channel(Fields(view[begin:stop]))
 
     def _swallowed(self, at: int, end: int) -> int | None:
-        """Return the offset of an intact chunk inside a damaged record whose declared length is too large."""
+        """Return the offset of an intact chunk inside a damaged record whose declared length is too
+        large.
+        """
         inner = first_chunk(self._file, at + 1, end)
         if inner is None:
             return None
@@ -267,7 +308,9 @@ class McapFile(Recording):
         if end - begin < 22:
             raise BadMessage("a message shorter than its fixed fields")
         channel_id = view[begin] | view[begin + 1] << 8
-        channel = self._channels.by_id.get(channel_id) or self._guessed(channel_id, view[begin + 22 : end])
+        channel = self._channels.by_id.get(channel_id) or self._guessed(
+            channel_id, view[begin + 22 : end]
+        )
         self._seen += 1
         if channel is None:
             self._orphans += 1
@@ -282,16 +325,28 @@ class McapFile(Recording):
             self._copy_to.message(channel, sequence, times, view[begin + 22 : end])
 
     def _guessed(self, number: int, payload: memoryview) -> Channel | None:
-        channel = None if self.summary.definitions else self._channels.guess(number, payload, self.library)
+        channel = (
+            None
+            if self.summary.definitions
+            else self._channels.guess(number, payload, self.library)
+        )
         if channel is not None:
-            self._lose(Loss(f"the definition of a channel, recognised by its messages as {channel.type}", 0, 0))
+            self._lose(
+                Loss(
+                    f"the definition of a channel, recognised by its messages as {channel.type}",
+                    0,
+                    0,
+                )
+            )
         return channel
 
     def _lose(self, loss: Loss) -> None:
         self.losses.append(replace(loss, file=self.path.name))
 
     def _settle(self) -> None:
-        """List the last damaged chunk, after the message indexes behind it have given its message count."""
+        """List the last damaged chunk, after the message indexes behind it have given its message
+        count.
+        """
         if self._bad_chunk is not None:
             self._lose(self._bad_chunk)
             self._bad_chunk = None
@@ -319,14 +374,23 @@ class McapFile(Recording):
     def _account(self, summary: SummarySection) -> None:
         """List the messages that the summary counts and the pass did not find."""
         if self._orphans:
-            self._lose(Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans))
+            self._lose(
+                Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans)
+            )
         known = self._seen + sum(loss.messages or 0 for loss in self.losses if loss.chunks)
         blind = [loss for loss in self.losses if loss.bytes and loss.messages is None]
         missing = 0 if summary.messages is None else summary.messages - known
         if missing > 0 and len(blind) == 1:
             self.losses[self.losses.index(blind[0])] = replace(blind[0], messages=missing)
         elif missing > 0:
-            self._lose(Loss("messages that the summary counts and the file does not contain", 0, 0, messages=missing))
+            self._lose(
+                Loss(
+                    "messages that the summary counts and the file does not contain",
+                    0,
+                    0,
+                    messages=missing,
+                )
+            )
 
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {

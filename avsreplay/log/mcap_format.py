@@ -19,7 +19,10 @@ ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
 CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-_KNOWN, _MOST_FOREIGN = frozenset(range(1, 16)), 10_000  # a chunk of zeros is millions of records of length 0
+_KNOWN, _MOST_FOREIGN = (
+    frozenset(range(1, 16)),
+    10_000,
+)  # a chunk of zeros is millions of records of length 0
 _SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))")
 
 
@@ -38,7 +41,10 @@ class Channel:
 
 @value_class(eq=True)
 class ChunkHead:
-    """The fields before a chunk's data; ``data_at`` is the offset of the data from the record's opcode."""
+    """The fields before a chunk's data.
+
+    ``data_at`` is the offset of the data from the record's opcode.
+    """
 
     start_ns: int
     end_ns: int
@@ -95,7 +101,10 @@ class Fields:
 
 
 def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Yield (opcode, begin, end) of the content of each record. Raises BadMessage if the last one is cut."""
+    """Yield (opcode, begin, end) of the content of each record.
+
+    Raises BadMessage if the last one is cut.
+    """
     at, size, foreign = 0, len(view), 0
     while at + 9 <= size:
         opcode, length = _HEAD.unpack_from(view, at)
@@ -111,7 +120,10 @@ def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> ChunkHead:
-    """Parse a chunk record from its opcode on. Raises BadMessage if its lengths contradict each other."""
+    """Parse a chunk record from its opcode on.
+
+    Raises BadMessage if its lengths contradict each other.
+    """
     if len(view) < 49 or view[0] != CHUNK:
         raise BadMessage("not a chunk")
     _, length = _HEAD.unpack_from(view, 0)
@@ -122,7 +134,9 @@ def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> Chun
     if name not in ("", "zstd", "lz4"):
         raise BadMessage("a chunk with an unknown compression")
     data_size = int.from_bytes(view[41 + name_size : 49 + name_size], "little")
-    if length != 40 + name_size + data_size or (record_size is not None and length + 9 > record_size):
+    if length != 40 + name_size + data_size or (
+        record_size is not None and length + 9 > record_size
+    ):
         raise BadMessage("a chunk's lengths contradict each other")
     if start > end:
         raise BadMessage("a chunk ends before it starts")
@@ -143,9 +157,14 @@ def is_mcap(path: Path) -> bool:
 
 
 class RecordSink(Protocol):
-    """Receives every intact record of a file, in file order; times are (log, publish or creation) [ns]."""
+    """Receives every intact record of a file, in file order.
 
-    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
+    Times are (log, publish or creation) [ns].
+    """
+
+    def message(
+        self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview
+    ) -> None:
         """Receive a message."""
 
     def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
@@ -203,13 +222,20 @@ def _read(file: ByteFile, limit: int) -> SummarySection:
     if moved is not None:
         return replace(
             _walk(*moved),
-            trouble="the offset in the footer is wrong: bytes were inserted or removed before the summary",
+            trouble=(
+                "the offset in the footer is wrong: bytes were inserted or removed before the"
+                " summary"
+            ),
         )
-    raise BadMessage("the checksum of the summary is wrong" if inside else "the footer points outside the file")
+    raise BadMessage(
+        "the checksum of the summary is wrong" if inside else "the footer points outside the file"
+    )
 
 
 def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
-    """Return the summary that follows a data-end record and matches the checksum, if the footer's offset is wrong."""
+    """Return the summary that follows a data-end record and matches the checksum, if the footer's
+    offset is wrong.
+    """
     begin = max(file.size - _SEARCHED, 8)
     window = file.read(begin, file.size - begin)
     end = len(window) - TAIL + 25

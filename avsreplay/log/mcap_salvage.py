@@ -1,8 +1,8 @@
 """Recovery of a damaged MCAP file: the next readable record, and channels whose definition is lost.
 
-A channel is defined in the first chunk and again in the summary; a recording that was killed and then damaged at its
-begin has lost both. A cloud is recognised by its fields. A pose is recognised only in a log written by this package,
-by a message length that no other type has.
+A channel is defined in the first chunk and again in the summary; a recording that was killed and
+then damaged at its begin has lost both. A cloud is recognised by its fields. A pose is recognised
+only in a log written by this package, by a message length that no other type has.
 """
 
 from __future__ import annotations
@@ -42,10 +42,15 @@ class ChannelTable:
         number, schema = fields.number(2), fields.number(2)
         topic, encoding = fields.text(), fields.text()
         name, form, text = self._schemas.get(schema, ("", "", b""))
-        self._take(Channel(number, topic, canonical_type(name), encoding, form, text, fields.mapping()))
+        self._take(
+            Channel(number, topic, canonical_type(name), encoding, form, text, fields.mapping())
+        )
 
     def guess(self, number: int, payload: memoryview, library: str) -> Channel | None:
-        """Add the channel that a message without a definition seems to belong to; return None if it is unknown."""
+        """Add the channel that a message without a definition seems to belong to.
+
+        Return None if it is unknown.
+        """
         channel = guess_channel(number, payload, library)
         if channel is not None:
             self._take(channel)
@@ -93,7 +98,10 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
     return cursor.pos == len(cursor.data)
 
 
-_FIRST_WINDOW, _WINDOW = 1 << 12, 1 << 20  # the next record is usually near; the search grows to the largest window
+_FIRST_WINDOW, _WINDOW = (
+    1 << 12,
+    1 << 20,
+)  # the next record is usually near; the search grows to the largest window
 _MARGIN = 64  # a candidate is recognised by at most so many bytes
 _MAX_CANDIDATES = 1_000_000
 _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
@@ -111,7 +119,11 @@ def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
 def begins_record(file: ByteFile, at: int) -> bool:
     """Return whether a record with a known opcode begins at ``at`` and ends inside the file."""
     head = file.read_at_most(at, 9)
-    return len(head) == 9 and 0 < head[0] < 16 and at + 9 + int.from_bytes(head[1:], "little") <= file.size
+    return (
+        len(head) == 9
+        and 0 < head[0] < 16
+        and at + 9 + int.from_bytes(head[1:], "little") <= file.size
+    )
 
 
 def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
@@ -125,14 +137,25 @@ def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
 
 def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
     """Return the first offset in [at, last) where a chunk may begin, wherever it ends."""
-    return _search(file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size))
+    return _search(
+        file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size)
+    )
 
 
-def next_record(file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool) -> int | None:
-    """Return the offset of the next chunk in [at, stop); without chunks, of the next message of a known channel."""
+def next_record(
+    file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool
+) -> int | None:
+    """Return the offset of the next chunk in [at, stop).
+
+    Without chunks, of the next message of a known channel.
+    """
     if chunked:
-        return _search(file, at, stop, mcap.chunk_candidates, lambda place: is_chunk(file, place, stop))
-    return _search(file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels))
+        return _search(
+            file, at, stop, mcap.chunk_candidates, lambda place: is_chunk(file, place, stop)
+        )
+    return _search(
+        file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels)
+    )
 
 
 def _messages(window: bytes) -> list[int]:

@@ -1,4 +1,7 @@
-"""Opening of a source: detects the format, selects the topic of clouds or poses, attaches ground truth and model."""
+"""Opening of a source.
+
+Detects the format, selects the topic of clouds or poses, attaches ground truth and model.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,14 @@ from avsreplay.errors import UnreadableInput, UsageError, counted
 from avsreplay.geometry import Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
-from avsreplay.log.header import HEADER_RECORD, decode_header, in_metres, octahedron, parse_surface, read_surface
+from avsreplay.log.header import (
+    HEADER_RECORD,
+    decode_header,
+    in_metres,
+    octahedron,
+    parse_surface,
+    read_surface,
+)
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, MessageClouds, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
@@ -24,7 +34,11 @@ from avsreplay.records import LogHeader, Surface
 
 
 def open_source(
-    path: str | Path, options: SourceOptions | None = None, *, inspect: bool = False, upto: int | None = None
+    path: str | Path,
+    options: SourceOptions | None = None,
+    *,
+    inspect: bool = False,
+    upto: int | None = None,
 ) -> Source:
     """Open an MCAP file, a ROS 1 or 2 bag or a folder of scans.
 
@@ -32,20 +46,25 @@ def open_source(
         path: the file or folder.
         options: how it is read.
         upto: number of bytes that are read of an MCAP file that still grows.
-        inspect: also open a log without a cloud topic, or with several of which none was chosen; it has no scans then.
+        inspect: also open a log without a cloud topic, or with several of which none was chosen; it
+            has no scans then.
 
     Returns:
         The source; close it after use.
 
     Raises:
-        UnreadableInput: it does not exist, is of no known format, has no cloud topic, or (``strict``) is damaged.
-        UsageError: there are several cloud topics and none was chosen, or a requested topic or frame does not exist.
+        UnreadableInput: it does not exist, is of no known format, has no cloud topic, or
+            (``strict``) is damaged.
+        UsageError: there are several cloud topics and none was chosen, or a requested topic or
+            frame does not exist.
     """
     path, options = Path(path), options or SourceOptions()
     try:
         source = _opened(path, options, inspect, upto)
     except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+        raise UnreadableInput(
+            error.strerror or "cannot be read", where=shown(path), hint="check the path"
+        ) from None
     try:
         if options.strict:
             refuse_losses(source)
@@ -59,30 +78,48 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
     if (path / "run.json").is_file():
-        raise UnreadableInput("is the result of a run, not a log", where=shown(path), hint="name the log")
+        raise UnreadableInput(
+            "is the result of a run, not a log", where=shown(path), hint="name the log"
+        )
     if options.poses and path.is_file() and not _is_log(path):
         return _open_pose_file(path, options)
     if path.is_dir() and not _is_bag_folder(path):
         return _open_folder(path, options)
     if not path.is_dir() and not path.is_file():
-        raise UnreadableInput("neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans")
+        raise UnreadableInput(
+            "neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans"
+        )
     return _messages(path, options, inspect, upto)
 
 
-def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None, stated: str = "") -> Source:
-    """Open a log of messages; ``stated``: the fixed frame of its header, used where the options name none."""
+def _messages(
+    path: Path, options: SourceOptions, inspect: bool, upto: int | None, stated: str = ""
+) -> Source:
+    """Open a log of messages; ``stated``.
+
+    The fixed frame of its header, used where the options name none.
+    """
     if options.rate_hz is not None:
         hint = "leave out --rate; --every-scan N takes every N-th scan"
-        raise UsageError("the messages of a log have times of their own", where=shown(path), hint=hint)
+        raise UsageError(
+            "the messages of a log have times of their own", where=shown(path), hint=hint
+        )
     collector = streams.TruthCollector(options)
-    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto)
+    recording = _open_recording(
+        path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto
+    )
     try:
         topics = recording.topics()
         collector.check(topics, shown(path), stated)
-        topic = _optional_topic(recording, options, path) if inspect else _cloud_topic(recording, options, path)
+        topic = (
+            _optional_topic(recording, options, path)
+            if inspect
+            else _cloud_topic(recording, options, path)
+        )
         header, lost = _header(recording, options)
         if header.fixed_frame and options.fixed_frame is None and options.sensor_topic is None:
-            recording.close()  # read once more, because the first reading did not collect the transforms
+            # read once more, because the first reading did not collect the transforms
+            recording.close()
             fixed = header.fixed_frame
             return _messages(path, replace(options, fixed_frame=fixed), inspect, upto, fixed)
         ground_truth = collector.ground_truth()
@@ -98,17 +135,25 @@ def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | Non
         raise
     extra = {"profile": recording.profile, "library": recording.library}
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    return Source(path, clouds, header, options, ground_truth, files=files, extra=extra, losses=lost)
+    return Source(
+        path, clouds, header, options, ground_truth, files=files, extra=extra, losses=lost
+    )
 
 
 def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
     chosen = [t for t in topics if not types or t.type in types]
-    return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in chosen[:12]) + (", ..." if len(chosen) > 12 else "")
+    return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in chosen[:12]) + (
+        ", ..." if len(chosen) > 12 else ""
+    )
 
 
 def _optional_topic(recording: Recording, options: SourceOptions, path: Path) -> str | None:
     clouds = [t for t in recording.topics() if t.type in _kinds(options) and t.count]
-    return _cloud_topic(recording, options, path) if options.topic is not None or len(clouds) == 1 else None
+    return (
+        _cloud_topic(recording, options, path)
+        if options.topic is not None or len(clouds) == 1
+        else None
+    )
 
 
 def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> str:
@@ -121,7 +166,11 @@ def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> st
     if not clouds:
         raise _no_clouds(recording, path, what)
     if wanted is None and len(clouds) > 1:
-        raise UsageError(f"{len(clouds)} {what} topics", where=shown(path), hint=f"choose a --topic: {_named(clouds)}")
+        raise UsageError(
+            f"{len(clouds)} {what} topics",
+            where=shown(path),
+            hint=f"choose a --topic: {_named(clouds)}",
+        )
     chosen = next(t for t in clouds if wanted in (None, t.name))
     if chosen.encoding not in ("cdr", "ros1"):
         what = f"topic '{shown(chosen.name)}' has the unknown encoding '{shown(chosen.encoding)}'"
@@ -165,7 +214,10 @@ def _model(options: SourceOptions, carried: Surface | None = None) -> Surface | 
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
-    """Return the model in the log; if it cannot be read it is a loss, and another model can be given."""
+    """Return the model in the log.
+
+    If it cannot be read it is a loss, and another model can be given.
+    """
     try:
         found = recording.attachment()
         return (None if found is None else parse_surface(found[1], found[0])), []
@@ -174,8 +226,13 @@ def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
 
 
 def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
-    """The header of a source of measured poses; without a model an octahedron of the stated extent is the target."""
-    return replace(header, surface=octahedron(options.extent_m)) if header.surface is None else header
+    """The header of a source of measured poses.
+
+    Without a model an octahedron of the stated extent is the target.
+    """
+    return (
+        replace(header, surface=octahedron(options.extent_m)) if header.surface is None else header
+    )
 
 
 def _head(path: Path) -> bytes:
@@ -183,7 +240,9 @@ def _head(path: Path) -> bytes:
         with path.open("rb") as file:
             return file.read(16)
     except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+        raise UnreadableInput(
+            error.strerror or "cannot be read", where=shown(path), hint="check the path"
+        ) from None
 
 
 def _is_log(path: Path) -> bool:
@@ -206,18 +265,24 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     )
     truth = streams.GroundTruth()
     if options.truth_file is not None:
-        truth = streams.GroundTruth(*streams.file_truth(read_poses(options.truth_file), options.truth_gap_s))
+        truth = streams.GroundTruth(
+            *streams.file_truth(read_poses(options.truth_file), options.truth_gap_s)
+        )
     return Source(path, poses, _pose_header(header, options), options, truth, files=[path])
 
 
 def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
     for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
         if value is not None:
-            raise UsageError(f"{what} has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+            raise UsageError(
+                f"{what} has no topics", where=f"{shown(path)}, {flag}", hint="leave it out"
+            )
 
 
 _STORAGE = (".mcap", ".db3")
-_LISTED = re.compile(r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
+_LISTED = re.compile(
+    r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
+)
 
 
 def _is_bag_folder(path: Path) -> bool:
@@ -225,7 +290,9 @@ def _is_bag_folder(path: Path) -> bool:
     return path.is_dir() and any(p.suffix in (*_STORAGE, ".zstd") for p in path.iterdir())
 
 
-def _open_recording(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
+def _open_recording(
+    path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None
+) -> Recording:
     """Open a log file, whose first bytes tell the format, or all files of the folder of a bag.
 
     Raises UnreadableInput if it does not exist, is empty or is not a log.
@@ -244,13 +311,27 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = Non
 
         return Db3File(path, limit, sinks)
     if head.startswith(b"#ROSBAG"):
-        raise UnreadableInput("a ROS bag older than format 2.0", where=shown(path), hint="migrate it with rosbag fix")
+        raise UnreadableInput(
+            "a ROS bag older than format 2.0", where=shown(path), hint="migrate it with rosbag fix"
+        )
     if head.startswith(b"\x28\xb5\x2f\xfd"):
-        raise UnreadableInput("a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d")
-    if not head.startswith(MAGIC) and path.suffix.lower() in (".ply", ".pcd", ".bin", ".npy", ".npz"):
-        raise UnreadableInput("a single scan, not a log", where=shown(path), hint="give the folder it is in")
+        raise UnreadableInput(
+            "a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d"
+        )
+    if not head.startswith(MAGIC) and path.suffix.lower() in (
+        ".ply",
+        ".pcd",
+        ".bin",
+        ".npy",
+        ".npz",
+    ):
+        raise UnreadableInput(
+            "a single scan, not a log", where=shown(path), hint="give the folder it is in"
+        )
     if not head.startswith(MAGIC) and path.suffix == ".toml":
-        raise UnreadableInput("a scenario, not a log", where=shown(path), hint="make a log of it: avsreplay record")
+        raise UnreadableInput(
+            "a scenario, not a log", where=shown(path), hint="make a log of it: avsreplay record"
+        )
     return McapFile(path, limit, sinks, upto=upto)
 
 
@@ -264,13 +345,19 @@ def _folder(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
             part.close()
         raise
     if not parts:
-        raise UnreadableInput("none of the files of the bag exists", where=shown(path), hint="check its metadata.yaml")
+        raise UnreadableInput(
+            "none of the files of the bag exists", where=shown(path), hint="check its metadata.yaml"
+        )
     return Merged(parts, "ros2 bag", losses)
 
 
 def _files(path: Path) -> tuple[list[Path], list[Loss]]:
-    """Return the files of a bag in order, and a loss for each file in its metadata that is missing."""
-    there = sorted((p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name))
+    """Return the files of a bag in order, and a loss for each file in its metadata that is
+    missing.
+    """
+    there = sorted(
+        (p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name)
+    )
     metadata = path / "metadata.yaml"
     if not metadata.is_file():
         return there, []
@@ -278,9 +365,14 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     listed = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
     named = [path / name for name in listed if (path / name).is_file()]
     missing = [name for name in listed if path / name not in named]
-    losses = [Loss("a file named in the metadata of the bag is missing", 0, 0, file=name) for name in missing]
+    losses = [
+        Loss("a file named in the metadata of the bag is missing", 0, 0, file=name)
+        for name in missing
+    ]
     if packed := [file for file in named if file.suffix == ".zstd"]:
-        raise UnreadableInput("a zstd-compressed bag file", where=shown(packed[0]), hint="unpack it: zstd -d")
+        raise UnreadableInput(
+            "a zstd-compressed bag file", where=shown(packed[0]), hint="unpack it: zstd -d"
+        )
     return (named or there), losses
 
 
@@ -291,9 +383,9 @@ _STAMPED = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
 def _open_folder(path: Path, options: SourceOptions) -> Source:
     """Open a folder of scans.
 
-    Scans are ordered by the numbers in their names; with a ``.conf`` file only those that it names are used. Their
-    times are taken from the first of: ``times.txt`` (one time [s] per line), file names that are times, a pose file
-    with one line per scan, ``rate_hz``.
+    Scans are ordered by the numbers in their names; with a ``.conf`` file only those that it names
+    are used. Their times are taken from the first of: ``times.txt`` (one time [s] per line), file
+    names that are times, a pose file with one line per scan, ``rate_hz``.
 
     Raises:
         UnreadableInput: there are no scans, or a pose or time file cannot be read.
@@ -308,16 +400,31 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     clouds = streams.FolderClouds(files, options.scan_rate_hz, options.max_message_mib << 20, times)
     surface = _model(options)
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
-    besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
-    header = LogHeader(surface=surface, notes={"source": "folder", "times": options.times_note(times is not None)})
+    besides = [
+        p
+        for p in (pose_file, path / _TIME_FILE)
+        if p is not None and p.is_file() and p.is_relative_to(path)
+    ]
+    header = LogHeader(
+        surface=surface, notes={"source": "folder", "times": options.times_note(times is not None)}
+    )
     return Source(path, clouds, header, options, ground_truth, files=[*files, *besides])
 
 
 def _pose_file(path: Path) -> Path | None:
-    found = sorted({p for pattern in ("*.conf", "*.tum", "poses.txt") for p in path.glob(pattern) if p.is_file()})
+    found = sorted(
+        {
+            p
+            for pattern in ("*.conf", "*.tum", "poses.txt")
+            for p in path.glob(pattern)
+            if p.is_file()
+        }
+    )
     if len(found) > 1:
         names = ", ".join(shown(p.name) for p in found)
-        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth")
+        raise UsageError(
+            f"several pose files: {names}", where=shown(path), hint="choose one with --truth"
+        )
     return found[0] if found else None
 
 
@@ -332,11 +439,19 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
     if all(_STAMPED.match(p.stem) for p in files):
         stamps = [seconds_to_ns(p.stem if "." in p.stem else f"{p.stem}e-9") for p in files]
         return [t_ns or 0 for t_ns in stamps] if None not in stamps else None
-    return list(found.t_ns) if found is not None and found.t_ns is not None and len(found.t_ns) == len(files) else None
+    return (
+        list(found.t_ns)
+        if found is not None and found.t_ns is not None and len(found.t_ns) == len(files)
+        else None
+    )
 
 
 def _ground_truth(
-    files: list[Path], times: list[int], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
+    files: list[Path],
+    times: list[int],
+    by_name: dict[str, Pose],
+    found: TimedPoses | None,
+    options: SourceOptions,
 ) -> streams.GroundTruth:
     if found is None and by_name:
         named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]

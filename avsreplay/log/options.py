@@ -40,19 +40,26 @@ class Unit(Enum):
 class SourceOptions(Settings):
     """How to read a source: topics, frames, the part that is replayed, and clock."""
 
-    topic: str | None = setting(None, "Topic of the clouds, or of the measured poses.", unset="the only one")
-    poses: bool = setting(False, "The source holds measured poses in place of clouds; '--backend poses' sets this.")
+    topic: str | None = setting(
+        None, "Topic of the clouds, or of the measured poses.", unset="the only one"
+    )
+    poses: bool = setting(
+        False, "The source holds measured poses in place of clouds; '--backend poses' sets this."
+    )
     pose_sigma: tuple[float, float] | None = setting(
         None,
-        "1 sigma of a measured pose: position along each axis [mm] and attitude about each axis [deg]; it replaces"
-        " the covariance of the messages.",
+        "1 sigma of a measured pose: position along each axis [mm] and attitude about each axis"
+        " [deg]; it replaces the covariance of the messages.",
         above=0.0,
-        unset="the covariance of the message, else estimator.r0_pos_m and r0_rot_deg, adapted to the residuals",
+        unset=(
+            "the covariance of the message, else estimator.r0_pos_m and r0_rot_deg, adapted to the"
+            " residuals"
+        ),
     )
     grasp: tuple[float, float, float] | None = setting(
         None,
-        "Grasp point in the frame of the model, or of the measured poses. It becomes the origin of {C}; true poses are"
-        " moved with it, and a start in the log is not used.",
+        "Grasp point in the frame of the model, or of the measured poses. It becomes the origin of"
+        " {C}; true poses are moved with it, and a start in the log is not used.",
         unit="m",
         unset="the origin of that frame",
     )
@@ -64,36 +71,55 @@ class SourceOptions(Settings):
     )
     truth_topic: str | None = setting(
         None,
-        "Topic of the true poses: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.",
+        "Topic of the true poses: PoseStamped, PoseWithCovarianceStamped, Odometry or"
+        " TransformStamped.",
         unset="/truth/pose",
     )
     truth_frame: str | None = setting(
-        None, "Frame of the /tf tree whose pose in the frame of the clouds (or in the fixed frame) is the true pose."
+        None,
+        "Frame of the /tf tree whose pose in the frame of the clouds (or in the fixed frame) is the"
+        " true pose.",
     )
-    truth_file: Path | None = setting(None, "File of true poses beside the log (TUM, KITTI, EuRoC, Stanford .conf).")
+    truth_file: Path | None = setting(
+        None, "File of true poses beside the log (TUM, KITTI, EuRoC, Stanford .conf)."
+    )
     truth_gap_s: float = setting(
-        1.0, "Largest gap between two true poses over which the pose is interpolated.", unit="s", low=0.0, high=1e6
+        1.0,
+        "Largest gap between two true poses over which the pose is interpolated.",
+        unit="s",
+        low=0.0,
+        high=1e6,
     )
     model: Path | None = setting(
-        None, "Model file; 'auto' builds the model from the scans of the log.", unset="the log's own model"
+        None,
+        "Model file; 'auto' builds the model from the scans of the log.",
+        unset="the log's own model",
     )
     cloud_model: bool = setting(False, "Accept a point cloud without faces as the model.")
     model_unit: Unit = setting(Unit.M, "Unit of the coordinates of the model.")
     model_scale: float = setting(
         1.0,
-        "Factor on the size of the model, in addition to its unit: 1.01 for a model that is 1 % too small.",
+        "Factor on the size of the model, in addition to its unit: 1.01 for a model that is 1 % too"
+        " small.",
         above=0.0,
     )
     model_mirror: bool = setting(
-        False, "Use the mirror image of the model: the x coordinates change their sign, and the faces their winding."
+        False,
+        "Use the mirror image of the model: the x coordinates change their sign, and the faces"
+        " their winding.",
     )
     clock: ClockChoice = setting(
         ClockChoice.HEADER,
-        "Clock of the scans: stamps of the messages (header), reception by the recorder (log) or publication.",
+        "Clock of the scans: stamps of the messages (header), reception by the recorder (log) or"
+        " publication.",
     )
     start_s: float | None = setting(None, "Begin at this time after the first scan.", unit="s")
-    end_s: float | None = setting(None, "End before this time after the first scan.", unit="s", unset="the last scan")
-    duration_s: float | None = setting(None, "Length of the part that is used.", unit="s", unset="up to the end")
+    end_s: float | None = setting(
+        None, "End before this time after the first scan.", unit="s", unset="the last scan"
+    )
+    duration_s: float | None = setting(
+        None, "Length of the part that is used.", unit="s", unset="up to the end"
+    )
     n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")
     every: int = setting(1, "Take every n-th scan, each at its own time.", low=1)
     crop_box: tuple[float, float, float, float, float, float] | None = setting(
@@ -111,8 +137,8 @@ class SourceOptions(Settings):
     )
     scan_duration_s: float | None = setting(
         None,
-        "Time in which the points of a cloud are measured, in their order and from the stamp on, where they have no "
-        "times; negative if the last one is measured first.",
+        "Time in which the points of a cloud are measured, in their order and from the stamp on,"
+        " where they have no times; negative if the last one is measured first.",
         unit="s",
         low=-1e3,
         high=1e3,
@@ -122,7 +148,8 @@ class SourceOptions(Settings):
         None, "Frame of the /tf tree into which each cloud is transformed at its own time."
     )
     sensor_topic: str | None = setting(
-        None, "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame."
+        None,
+        "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame.",
     )
     rate_hz: float | None = setting(
         None,
@@ -132,7 +159,8 @@ class SourceOptions(Settings):
         high=1e6,
     )
     strict: bool = setting(
-        False, "Treat any loss of data, also a scan that cannot be decoded, as an error (exit code 3)."
+        False,
+        "Treat any loss of data, also a scan that cannot be decoded, as an error (exit code 3).",
     )
     max_message_mib: int = setting(
         128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096
@@ -141,7 +169,9 @@ class SourceOptions(Settings):
     def check(self) -> None:
         """Raise ValueError if a crop is empty."""
         box = self.crop_box
-        if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        if box is not None and not all(
+            low < high for low, high in zip(box[:3], box[3:], strict=True)
+        ):
             raise ValueError(f"crop_box {box} is empty")
         if self.crop_range is not None and not self.crop_range[0] < self.crop_range[1]:
             raise ValueError(f"crop_range {self.crop_range} is empty")
@@ -159,7 +189,11 @@ class SourceOptions(Settings):
         """
         if given:
             return "of the files"
-        return f"{NO_TIMES}: {ASSUMED_HZ:g} Hz is assumed" if self.rate_hz is None else f"{self.rate_hz:g} Hz, as given"
+        return (
+            f"{NO_TIMES}: {ASSUMED_HZ:g} Hz is assumed"
+            if self.rate_hz is None
+            else f"{self.rate_hz:g} Hz, as given"
+        )
 
     @property
     def model_factor(self) -> float:
@@ -200,7 +234,9 @@ class Loss:
 
 @value_class(eq=True)
 class TopicInfo:
-    """A topic of a log with its message type, encoding and count, and its first and last time on the log clock [ns]."""
+    """A topic of a log with its message type, encoding and count, and its first and last time on
+    the log clock [ns].
+    """
 
     name: str
     type: str
@@ -212,7 +248,12 @@ class TopicInfo:
     @property
     def rate_hz(self) -> float | None:
         """Return the mean rate [Hz], None with fewer than two messages or no time span."""
-        if self.count < 2 or self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
+        if (
+            self.count < 2
+            or self.first_ns is None
+            or self.last_ns is None
+            or self.last_ns <= self.first_ns
+        ):
             return None
         return (self.count - 1) / ((self.last_ns - self.first_ns) * 1e-9)
 
@@ -226,7 +267,8 @@ class ClockSummary:
         scans: number of scans.
         offset_s: median of header clock minus log clock [s].
         period_s: median time between scans [s].
-        unset, jumps, equal, back: number of scans whose time was taken from the log clock, by cause.
+        unset, jumps, equal, back: number of scans whose time was taken from the log clock, by
+            cause.
         header_steps, log_steps: number of permanent steps of either clock that were compensated.
         note: a remark on the choice of the clock.
     """
@@ -249,7 +291,9 @@ class ClockSummary:
         return self.unset + self.jumps + self.equal + self.back
 
 
-def lost_text(losses: Sequence[Loss], damaged: Mapping[int, str], scans: int, count: int | None = None) -> str:
+def lost_text(
+    losses: Sequence[Loss], damaged: Mapping[int, str], scans: int, count: int | None = None
+) -> str:
     """Return in words what of a log could not be read, "" if everything could.
 
     Args:
@@ -260,7 +304,9 @@ def lost_text(losses: Sequence[Loss], damaged: Mapping[int, str], scans: int, co
     """
     count, found = len(damaged) if count is None else count, []
     if losses:
-        found.append(f"{counted(len(losses), 'damaged place')} left out, the first: {losses[0].what}")
+        found.append(
+            f"{counted(len(losses), 'damaged place')} left out, the first: {losses[0].what}"
+        )
     if count:
         first = f", the first: scan {min(damaged)}: {damaged[min(damaged)]}" if damaged else ""
         found.append(f"{count} of {counted(scans, 'scan')} cannot be used{first}")

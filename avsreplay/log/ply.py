@@ -1,7 +1,9 @@
-"""Reading of PLY files: ascii and both binary byte orders; unknown elements and properties are skipped.
+"""Reading of PLY files: ascii and both binary byte orders; unknown elements and properties are
+skipped.
 
-No library is used. The Stanford scans have a ``range_grid`` element that mesh readers do not support, and every
-declared count must be compared with the bytes of the file before memory is allocated.
+No library is used. The Stanford scans have a ``range_grid`` element that mesh readers do not
+support, and every declared count must be compared with the bytes of the file before memory is
+allocated.
 """
 
 from __future__ import annotations
@@ -16,10 +18,23 @@ from avsreplay.binary_files import BadFile
 from avsreplay.errors import value_class
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _MAX_HEADER = 1 << 16
 
 
@@ -54,7 +69,10 @@ class Ply:
     faces: NDArray[np.int64]
 
     def points(self) -> NDArray[Any]:
-        """Return the (n, 3) coordinates in the type of the file. Raises BadFile if x, y or z is missing."""
+        """Return the (n, 3) coordinates in the type of the file.
+
+        Raises BadFile if x, y or z is missing.
+        """
         missing = [axis for axis in "xyz" if axis not in self.vertex]
         if missing:
             raise BadFile(f"its vertices have no '{missing[0]}'")
@@ -163,9 +181,14 @@ class _Text:
             return {p.name: table[:, i].astype(p.kind) for i, p in enumerate(element.properties)}
 
     def lists(self, element: _Element) -> _Lists:
-        """Return the first list of each line; lists of equal length, the common case, are converted at once."""
+        """Return the first list of each line.
+
+        Lists of equal length, the common case, are converted at once.
+        """
         rows = [line.split() for line in self._take(element)]
-        if not all(words and words[0].isdigit() and len(words) > int(words[0][:9]) for words in rows):
+        if not all(
+            words and words[0].isdigit() and len(words) > int(words[0][:9]) for words in rows
+        ):
             raise BadFile("a face line is shorter than its own count")
         try:
             lists = [words[1 : 1 + int(words[0])] for words in rows]
@@ -208,7 +231,10 @@ class _Binary:
         return {p.name: table[p.name].astype(p.kind) for p in element.properties}
 
     def lists(self, element: _Element) -> _Lists:
-        """Return the first list of each element; lists of equal length, the common case, are read at once."""
+        """Return the first list of each element.
+
+        Lists of equal length, the common case, are read at once.
+        """
         same = self._uniform(element)
         if same is not None:
             return same

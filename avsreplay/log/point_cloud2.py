@@ -1,4 +1,7 @@
-"""Decoding of sensor_msgs/PointCloud2 with any layout; without a copy where the layout allows it."""
+"""Decoding of sensor_msgs/PointCloud2 with any layout.
+
+Without a copy where the layout allows it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,9 @@ from avsreplay.log.options import SourceOptions
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256
 _KNOTS = 17  # instants of a scan at which the pose of a moving sensor is looked up
-MAX_COORDINATE_M = 1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
+MAX_COORDINATE_M = (
+    1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
+)
 _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity")
 _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
 
@@ -59,20 +64,26 @@ class Layout:
     data: memoryview
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return a (height, width) view of one field. Raises BadMessage if the cloud has no such field."""
+        """Return a (height, width) view of one field.
+
+        Raises BadMessage if the cloud has no such field.
+        """
         field = next((f for f in self.fields if f.name == name), None)
         if field is None:
-            raise BadMessage(f"no field '{name}' among {', '.join(f.name for f in self.fields) or 'none'}")
+            raise BadMessage(
+                f"no field '{name}' among {', '.join(f.name for f in self.fields) or 'none'}"
+            )
         strides = (self.row_step, self.point_step)
         return np.ndarray(self.shape, self.order + field.kind, self.data, field.offset, strides)
 
 
 @value_class
 class Cloud:
-    """A decoded cloud: finite points (n, 3) [m] in ``frame``, their times [s] after the stamp and intensities, or None.
+    """A decoded cloud: finite points (n, 3) [m] in ``frame``, their times [s] after the stamp and
+    intensities, or None.
 
-    ``places`` (n,) is the share of the message that stands before each point, for points without times. ``pose`` is set
-    instead of the points where the source holds measured poses.
+    ``places`` (n,) is the share of the message that stands before each point, for points without
+    times. ``pose`` is set instead of the points where the source holds measured poses.
     """
 
     stamp_ns: int
@@ -88,11 +99,14 @@ class Cloud:
         """Return the cloud with some of its points."""
         each = (self.times_s, self.intensities, self.places)
         times, seen, places = (None if column is None else column[kept] for column in each)
-        return replace(self, points=self.points[kept], times_s=times, intensities=seen, places=places)
+        return replace(
+            self, points=self.points[kept], times_s=times, intensities=seen, places=places
+        )
 
 
 def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
-    """Return a cloud after the crop, with the times of its points if their order and the duration of a scan give them.
+    """Return a cloud after the crop, with the times of its points if their order and the duration
+    of a scan give them.
 
     Args:
         cloud: as decoded.
@@ -102,7 +116,10 @@ def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
         low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
         cloud = cloud.keep(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
     if options.crop_range is not None:
-        distance, (least, most) = np.linalg.norm(cloud.points.astype(np.float64), axis=1), options.crop_range
+        distance, (least, most) = (
+            np.linalg.norm(cloud.points.astype(np.float64), axis=1),
+            options.crop_range,
+        )
         cloud = cloud.keep((distance >= least) & (distance <= most))
     if options.scan_duration_s is None or cloud.places is None:
         return cloud
@@ -110,7 +127,8 @@ def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
 
 
 def at_stamp(cloud: Cloud, sensor_at: Callable[[int], Pose]) -> Cloud:
-    """Return a cloud in the frame that its sensor has at the stamp; each point is moved from the frame at its own time.
+    """Return a cloud in the frame that its sensor has at the stamp; each point is moved from the
+    frame at its own time.
 
     Args:
         cloud: in the frame of the moving sensor.
@@ -128,7 +146,9 @@ def at_stamp(cloud: Cloud, sensor_at: Callable[[int], Pose]) -> Cloud:
     T_sa = sensor_at(0).inverse()
     steps = [T_sa @ sensor_at(round(1e9 * after)) for after in knots.tolist()]
     R, t = np.stack([step.R for step in steps]), np.stack([step.t for step in steps])
-    return replace(cloud, points=geometry.moved_in_time(cloud.points.astype(np.float64), times, knots, R, t))
+    return replace(
+        cloud, points=geometry.moved_in_time(cloud.points.astype(np.float64), times, knots, R, t)
+    )
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
@@ -145,24 +165,38 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
     points, times, intensities = _points(layout), _times(layout), _intensities(layout)
-    places = np.arange(len(points), dtype=np.float32) / np.float32(len(points)) if times is None else None
-    cloud = Cloud(layout.stamp_ns, layout.frame, points, times, 0, intensities=intensities, places=places)
+    places = (
+        np.arange(len(points), dtype=np.float32) / np.float32(len(points))
+        if times is None
+        else None
+    )
+    cloud = Cloud(
+        layout.stamp_ns, layout.frame, points, times, 0, intensities=intensities, places=places
+    )
     kept = usable(points)
     dropped = 0 if kept is None else len(points) - int(np.count_nonzero(kept))
     return cloud if kept is None or not dropped else replace(cloud.keep(kept), dropped=dropped)
 
 
 def usable(points: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return which of the points (n, 3) are finite and within ``MAX_COORDINATE_M``; None if all are."""
+    """Return which of the points (n, 3) are finite and within ``MAX_COORDINATE_M``.
+
+    None if all are.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
-        if np.einsum("ij,ij->", points, points) < MAX_COORDINATE_M**2:  # fast: no point can be outside
+        if (
+            np.einsum("ij,ij->", points, points) < MAX_COORDINATE_M**2
+        ):  # fast: no point can be outside
             return None
         kept: NDArray[np.bool_] = (np.abs(points) <= MAX_COORDINATE_M).all(axis=1)
     return kept
 
 
 def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
-    """Parse and check a message without decoding its points. Raises BadMessage if it is malformed."""
+    """Parse and check a message without decoding its points.
+
+    Raises BadMessage if it is malformed.
+    """
     cursor = Cursor(payload, encoding)
     stamp_ns, frame = cursor.header()
     height, width = cursor.u32(), cursor.u32()
@@ -194,21 +228,30 @@ def _fields(cursor: Cursor) -> tuple[Field, ...]:
 def _check(layout: Layout) -> None:
     height, width = layout.shape
     if layout.row_step < width * layout.point_step:
-        raise BadMessage(f"row_step {layout.row_step} is shorter than {width} points of {layout.point_step}")
+        raise BadMessage(
+            f"row_step {layout.row_step} is shorter than {width} points of {layout.point_step}"
+        )
     needed = (height - 1) * layout.row_step + width * layout.point_step
     if needed > len(layout.data):
-        raise BadMessage(f"{height} x {width} points of {layout.point_step} bytes in {len(layout.data)} bytes")
+        raise BadMessage(
+            f"{height} x {width} points of {layout.point_step} bytes in {len(layout.data)} bytes"
+        )
     for field in layout.fields:
         size = int(field.kind[1]) * max(field.count, 1)
         if field.offset + size > layout.point_step:
             raise BadMessage(f"field '{field.name}' ends past point_step {layout.point_step}")
-    spans = sorted((f.offset, f.offset + int(f.kind[1])) for f in layout.fields if f.name in ("x", "y", "z"))
+    spans = sorted(
+        (f.offset, f.offset + int(f.kind[1])) for f in layout.fields if f.name in ("x", "y", "z")
+    )
     if any(before[1] > after[0] for before, after in pairwise(spans)):
         raise BadMessage("the fields x, y and z overlap")
 
 
 def _points(layout: Layout) -> NDArray[Any]:
-    """Return the points (n, 3), float32 or float64; a view if x, y and z are adjacent and in native byte order."""
+    """Return the points (n, 3), float32 or float64.
+
+    A view if x, y and z are adjacent and in native byte order.
+    """
     x, y, z = (layout.column(axis) for axis in "xyz")
     size = x.dtype.itemsize
     bases = [next(f.offset for f in layout.fields if f.name == axis) for axis in "xyz"]
@@ -217,16 +260,25 @@ def _points(layout: Layout) -> NDArray[Any]:
     if native and rows_meet and bases == [bases[0], bases[0] + size, bases[0] + 2 * size]:
         count = layout.shape[0] * layout.shape[1]
         return np.ndarray((count, 3), x.dtype, layout.data, bases[0], (layout.point_step, size))
-    kind = np.float32 if all(c.dtype.kind == "f" and c.dtype.itemsize == 4 for c in (x, y, z)) else np.float64
+    kind = (
+        np.float32
+        if all(c.dtype.kind == "f" and c.dtype.itemsize == 4 for c in (x, y, z))
+        else np.float64
+    )
     return np.stack([c.reshape(-1) for c in (x, y, z)], axis=1).astype(kind)
 
 
 def _times(layout: Layout) -> NDArray[np.float32] | None:
-    """Return times [s] after the stamp: floats are seconds, integers nanoseconds, large doubles absolute seconds."""
+    """Return times [s] after the stamp.
+
+    Floats are seconds, integers nanoseconds, large doubles absolute seconds.
+    """
     names = {f.name for f in layout.fields}
     if {"time_sec", "time_nsec"} <= names:
         seconds = layout.column("time_sec").reshape(-1).astype(np.int64) * 1_000_000_000
-        return _relative(seconds + layout.column("time_nsec").reshape(-1).astype(np.int64), layout.stamp_ns)
+        return _relative(
+            seconds + layout.column("time_nsec").reshape(-1).astype(np.int64), layout.stamp_ns
+        )
     name = next((n for n in _TIME_NAMES if n in names), None)
     if name is None:
         return None

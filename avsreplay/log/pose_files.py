@@ -1,8 +1,10 @@
-"""Pose files: TUM, KITTI, EuRoC, CSV with a header, and the ``.conf`` of the Stanford scans; each pose is T_ac.
+"""Pose files: TUM, KITTI, EuRoC, CSV with a header, and the ``.conf`` of the Stanford scans; each
+pose is T_ac.
 
-TUM: ``t tx ty tz qx qy qz qw`` with t in seconds.  KITTI: the twelve numbers of [R | t] by row, without times.
-EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``, scalar first.  ``.conf``: ``bmesh name tx ty tz qx qy qz qw`` where the
-quaternion is conjugate to the usual convention, p_model = R(q)' p_scan + t, so that T_ac = (R(q), -R(q) t).
+TUM: ``t tx ty tz qx qy qz qw`` with t in seconds.  KITTI: the twelve numbers of [R | t] by row,
+without times. EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``, scalar first.  ``.conf``: ``bmesh name tx
+ty tz qx qy qz qw`` where the quaternion is conjugate to the usual convention, p_model = R(q)'
+p_scan + t, so that T_ac = (R(q), -R(q) t).
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ class TimedPoses:
 
 
 def read_poses(path: Path) -> TimedPoses:
-    """Read a pose file; the columns of a line determine its format. Raises UnreadableInput with file and line."""
+    """Read a pose file; the columns of a line determine its format.
+
+    Raises UnreadableInput with file and line.
+    """
     poses, times = list[Pose](), list[int]()
     for where, words, commas in _lines(path):
         t_ns, pose = _line(words, commas, where)
@@ -43,14 +48,21 @@ def read_poses(path: Path) -> TimedPoses:
         if t_ns is not None:
             times.append(t_ns)
     if not poses:
-        raise UnreadableInput("no pose in this file", where=shown(path), hint="give TUM, KITTI or EuRoC poses")
+        raise UnreadableInput(
+            "no pose in this file", where=shown(path), hint="give TUM, KITTI or EuRoC poses"
+        )
     if times and len(times) != len(poses):
-        raise UnreadableInput("some lines have a time and others do not", where=shown(path), hint="check the file")
+        raise UnreadableInput(
+            "some lines have a time and others do not", where=shown(path), hint="check the file"
+        )
     return TimedPoses(tuple(poses), tuple(times) or None)
 
 
 def read_times(path: Path) -> list[int]:
-    """Read a file with one time [s] per line; return [ns]. Raises UnreadableInput with file and line."""
+    """Read a file with one time [s] per line; return [ns].
+
+    Raises UnreadableInput with file and line.
+    """
     out = []
     for where, words, _ in _lines(path):
         t_ns = seconds_to_ns(words[0])
@@ -61,16 +73,24 @@ def read_times(path: Path) -> list[int]:
 
 
 def seconds_to_ns(text: str) -> int | None:
-    """Convert decimal seconds to nanoseconds without rounding to a binary fraction; None if it is not a number."""
+    """Convert decimal seconds to nanoseconds without rounding to a binary fraction.
+
+    None if it is not a number.
+    """
     try:
         value = Decimal(text)
-        return int((value * 1_000_000_000).to_integral_value()) if abs(value) < _MAX_SECONDS else None
+        return (
+            int((value * 1_000_000_000).to_integral_value()) if abs(value) < _MAX_SECONDS else None
+        )
     except (InvalidOperation, ValueError):
         return None
 
 
 def _whole_ns(word: str) -> int:
-    """A time in whole nanoseconds. Raises ValueError where it is none, or is beyond what 64 bits can hold."""
+    """A time in whole nanoseconds.
+
+    Raises ValueError where it is none, or is beyond what 64 bits can hold.
+    """
     t_ns = int(word)
     if abs(t_ns) >= _MAX_SECONDS * 1_000_000_000:
         raise ValueError
@@ -78,8 +98,12 @@ def _whole_ns(word: str) -> int:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
-    """Yield (file and line, words, whether "," or ";" separates them) of each line that is not empty or a comment."""
-    text = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True).decode("utf-8", "backslashreplace")
+    """Yield (file and line, words, whether "," or ";" separates them) of each line that is not
+    empty or a comment.
+    """
+    text = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True).decode(
+        "utf-8", "backslashreplace"
+    )
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
@@ -107,7 +131,12 @@ def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]
 
 
 def _pose(t: list[float], q: list[float]) -> Pose:
-    if len(t) != 3 or len(q) != 4 or not all(abs(v) < _MAX_METRES for v in (*t, *q)) or not 0.5 < math.hypot(*q) < 2.0:
+    if (
+        len(t) != 3
+        or len(q) != 4
+        or not all(abs(v) < _MAX_METRES for v in (*t, *q))
+        or not 0.5 < math.hypot(*q) < 2.0
+    ):
         raise ValueError
     return Pose(np.array(q), np.array(t))
 
@@ -115,7 +144,11 @@ def _pose(t: list[float], q: list[float]) -> Pose:
 def _from_rows(values: list[float]) -> Pose:
     T = np.vstack([np.array(values).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     R = T[:3, :3]
-    if not (np.abs(T) < _MAX_METRES).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+    if (
+        not (np.abs(T) < _MAX_METRES).all()
+        or np.abs(R @ R.T - np.eye(3)).max() > 1e-2
+        or np.linalg.det(R) < 0
+    ):
         raise ValueError
     return Pose.from_matrix(T)
 
@@ -124,13 +157,18 @@ _MAX_CONF_BYTES = 16 << 20
 
 
 def read_conf(path: Path) -> dict[str, Pose]:
-    """Read a ``.conf`` file: T_ac of each scan by file name. Raises UnreadableInput with file and line."""
+    """Read a ``.conf`` file: T_ac of each scan by file name.
+
+    Raises UnreadableInput with file and line.
+    """
     raw = read_limited(path, _MAX_CONF_BYTES, "name a file of poses", pipe=True)
     poses: dict[str, Pose] = {}
     for number, line in enumerate(raw.decode("utf-8", "backslashreplace").splitlines(), 1):
         words = line.split()
         if words[:1] == ["bmesh"]:
-            poses[words[1] if len(words) > 1 else ""] = _bmesh_pose(words, f"{shown(path)}:{number}")
+            poses[words[1] if len(words) > 1 else ""] = _bmesh_pose(
+                words, f"{shown(path)}:{number}"
+            )
     return poses
 
 
@@ -139,7 +177,11 @@ def _bmesh_pose(words: list[str], where: str) -> Pose:
         values = [float(w) for w in words[2:9]]
     except ValueError:
         values = []
-    if len(values) != 7 or not all(abs(v) < _MAX_METRES for v in values) or math.hypot(*values[3:]) < 0.5:
+    if (
+        len(values) != 7
+        or not all(abs(v) < _MAX_METRES for v in values)
+        or math.hypot(*values[3:]) < 0.5
+    ):
         hint = "write: bmesh name tx ty tz qx qy qz qw"
         raise UnreadableInput("not a bmesh line", where=where, hint=hint)
     q_ac = normalise(values[3:])
@@ -160,7 +202,9 @@ class MeasuredFile:
 
 
 _NOT_A_NAME = re.compile(r"[^a-z0-9]+")
-_TIME = re.compile(r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ms|msec|us|usec|ns|nsec))?$")
+_TIME = re.compile(
+    r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ms|msec|us|usec|ns|nsec))?$"
+)
 _POSITION = re.compile(r"(?:p|t|pos|position|translation)?_?([xyz])(?:_?(m|cm|mm))?$")
 _QUATERNION = re.compile(r"(?:q|quat|quaternion|orientation|rot|rotation)_?([xyzw])$")
 _EXPONENTS = {"m": "e-3", "u": "e-6", "n": "e-9"}  # by the first letter of a unit of time
@@ -175,14 +219,15 @@ _FORMATS = (
 def read_measured(path: Path) -> MeasuredFile:
     """Read a file of measured poses: TUM, KITTI, EuRoC, or CSV whose first line names the columns.
 
-    A pose with a missing or invalid value stays in its place with the reason, because trackers write such lines while
-    they see too few markers.
+    A pose with a missing or invalid value stays in its place with the reason, because trackers
+    write such lines while they see too few markers.
 
     Args:
         path: the file.
 
     Raises:
-        UnreadableInput: the file cannot be read, a line has another form, or no pose is valid; with file and line.
+        UnreadableInput: the file cannot be read, a line has another form, or no pose is valid; with
+            file and line.
     """
     poses, times, first = list[MeasuredPose | str](), list[int](), ""
     columns: _Columns | None = None
@@ -197,15 +242,22 @@ def read_measured(path: Path) -> MeasuredFile:
         if t_ns is not None:
             times.append(t_ns)
     if not any(isinstance(pose, MeasuredPose) for pose in poses):
-        raise UnreadableInput(f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS)
+        raise UnreadableInput(
+            f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS
+        )
     if times and len(times) != len(poses):
-        raise UnreadableInput("some lines have a time and others do not", where=shown(path), hint="check the file")
+        raise UnreadableInput(
+            "some lines have a time and others do not", where=shown(path), hint="check the file"
+        )
     return MeasuredFile(tuple(poses), tuple(times) or None)
 
 
 @value_class(eq=True)
 class _Columns:
-    """Where a CSV with a header has time and pose; the exponent of its unit of time, and its unit of length [m]."""
+    """Where a CSV with a header has time and pose.
+
+    The exponent of its unit of time, and its unit of length [m].
+    """
 
     time: int
     exponent: str
@@ -213,9 +265,14 @@ class _Columns:
     metres: float
 
     def read(self, words: list[str], where: str) -> tuple[int, MeasuredPose | str]:
-        """Time [ns] and pose of a line. Raises UnreadableInput if it has no time or too few columns."""
+        """Time [ns] and pose of a line.
+
+        Raises UnreadableInput if it has no time or too few columns.
+        """
         if len(words) <= max(self.time, *self.pose):
-            raise UnreadableInput(f"only {len(words)} columns", where=where, hint="one value for each named column")
+            raise UnreadableInput(
+                f"only {len(words)} columns", where=where, hint="one value for each named column"
+            )
         text = words[self.time]
         t_ns = seconds_to_ns(text + self.exponent)
         if t_ns is None:
@@ -226,7 +283,10 @@ class _Columns:
 
 
 def _columns(names: list[str], where: str) -> _Columns:
-    """The columns that a header line names. Raises UnreadableInput if one of the eight is missing or named twice."""
+    """The columns that a header line names.
+
+    Raises UnreadableInput if one of the eight is missing or named twice.
+    """
     found: dict[str, tuple[int, str]] = {}  # place and unit of each
     for place, name in enumerate(_NOT_A_NAME.sub("_", n.lower()).strip("_") for n in names):
         if time := _TIME.match(name):
@@ -243,7 +303,9 @@ def _columns(names: list[str], where: str) -> _Columns:
     return _Columns(place, _EXPONENTS.get(unit[0], ""), pose, _METRES[found["px"][1]])
 
 
-def _measured_line(words: list[str], commas: bool, where: str) -> tuple[int | None, MeasuredPose | str]:
+def _measured_line(
+    words: list[str], commas: bool, where: str
+) -> tuple[int | None, MeasuredPose | str]:
     """A line without named columns; its number of columns determines the format."""
     try:
         if commas:

@@ -24,9 +24,11 @@ _ROW = struct.Struct("13d")  # pose and twist of a track
 
 @value_class(eq=True)
 class Transform:
-    """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an Odometry message.
+    """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an
+    Odometry message.
 
-    ``covariance`` holds 36 numbers by row, of position in ``parent`` [m] and rotation about its axes [rad].
+    ``covariance`` holds 36 numbers by row, of position in ``parent`` [m] and rotation about its
+    axes [rad].
     """
 
     t_ns: int
@@ -43,7 +45,10 @@ def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> 
 
 
 def checked(out: Transform) -> Transform:
-    """Return the transform. Raises BadMessage if it is not finite or its quaternion is far from unit length."""
+    """Return the transform.
+
+    Raises BadMessage if it is not finite or its quaternion is far from unit length.
+    """
     if not all(abs(v) < _MAX_VALUE for v in out.pose) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
         raise BadMessage("a pose that is not finite or has no unit quaternion")
     return out
@@ -85,10 +90,14 @@ def _transform(cursor: Cursor) -> Transform:
 POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = dict(
     zip(POSE_NAMES, (_pose, _with_covariance, _odometry, _transform), strict=True)
 )
-_UNIT_WITHIN = 0.01  # a measured quaternion whose length is off by more is not a rounded unit quaternion
+_UNIT_WITHIN = (
+    0.01  # a measured quaternion whose length is off by more is not a rounded unit quaternion
+)
 
 
-def decode_measured(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> tuple[int, str, MeasuredPose]:
+def decode_measured(
+    kind: str, payload: bytes | memoryview, encoding: str = "cdr"
+) -> tuple[int, str, MeasuredPose]:
     """Decode a pose message as a measurement.
 
     Args:
@@ -97,8 +106,9 @@ def decode_measured(kind: str, payload: bytes | memoryview, encoding: str = "cdr
         encoding: ``cdr`` or ``ros1``.
 
     Returns:
-        Header stamp [ns], header frame, and the pose with the covariance of the message; a covariance that is zero,
-        negative or not positive definite states nothing, as is usual in ROS.
+        Header stamp [ns], header frame, and the pose with the covariance of the message; a
+        covariance that is zero, negative or not positive definite states nothing, as is usual in
+        ROS.
 
     Raises:
         BadMessage: the message is cut, or its pose is not finite or has no unit quaternion.
@@ -107,7 +117,11 @@ def decode_measured(kind: str, payload: bytes | memoryview, encoding: str = "cdr
     pose = pose_of_numbers(found.pose)
     if found.covariance is None:
         return found.t_ns, found.parent, pose
-    return found.t_ns, found.parent, MeasuredPose(pose.T_ac, _in_fixture(found.covariance, pose.T_ac))
+    return (
+        found.t_ns,
+        found.parent,
+        MeasuredPose(pose.T_ac, _in_fixture(found.covariance, pose.T_ac)),
+    )
 
 
 def pose_of_numbers(values: Sequence[float]) -> MeasuredPose:
@@ -125,7 +139,10 @@ def pose_of_numbers(values: Sequence[float]) -> MeasuredPose:
 
 
 def _in_fixture(covariance: tuple[float, ...], T_ac: Pose) -> Array | None:
-    """Covariance of d = [theta; v] in {C} from that of (position, rotation vector) in {A}; None where it is not one."""
+    """Covariance of d = [theta; v] in {C} from that of (position, rotation vector) in {A}.
+
+    None where it is not one.
+    """
     given = np.array(covariance).reshape(6, 6)
     if not np.isfinite(given).all():
         return None
@@ -140,7 +157,8 @@ def _in_fixture(covariance: tuple[float, ...], T_ac: Pose) -> Array | None:
 
 
 class PoseTrack:
-    """Poses and, if known, twists by time; exact at the stamps, interpolated within a maximum gap, None elsewhere.
+    """Poses and, if known, twists by time; exact at the stamps, interpolated within a maximum gap,
+    None elsewhere.
 
     Args:
         gap_s: widest gap between two poses across which is interpolated [s].
@@ -159,7 +177,8 @@ class PoseTrack:
         return len(self._times)
 
     def uncovered(self, times_ns: Sequence[int]) -> tuple[str, bool]:
-        """Return why none of some times has a pose, and whether that is the width of the gaps between the poses.
+        """Return why none of some times has a pose, and whether that is the width of the gaps
+        between the poses.
 
         Args:
             times_ns: at least one time without a pose [ns], ascending.
@@ -170,7 +189,10 @@ class PoseTrack:
         if any(first <= t_ns <= last for t_ns in times_ns):
             return f": gaps between the true poses exceed {self._gap_ns * 1e-9:g} s", True
         if first > times_ns[0]:
-            return f": they begin {(first - times_ns[0]) * 1e-9:.6g} s after the first of them", False
+            return (
+                f": they begin {(first - times_ns[0]) * 1e-9:.6g} s after the first of them",
+                False,
+            )
         return f": they end {(times_ns[0] - last) * 1e-9:.6g} s before the first of them", False
 
     def take(self, kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
@@ -184,7 +206,9 @@ class PoseTrack:
         unset = found.t_ns == 0 and log_ns > self._gap_ns
         self.add(log_ns if self._by_log or unset else found.t_ns, found.pose, found.twist)
 
-    def add(self, t_ns: int, pose: tuple[float, ...], twist: tuple[float, ...] | None = None) -> None:
+    def add(
+        self, t_ns: int, pose: tuple[float, ...], twist: tuple[float, ...] | None = None
+    ) -> None:
         """Add a pose x y z qx qy qz qw and, if known, a twist (linear, angular)."""
         self._times.append(t_ns)
         self._values.extend((*pose, *(twist or (float("nan"),) * 6)))
@@ -200,7 +224,10 @@ class PoseTrack:
         return self.pose(t_ns)
 
     def body(self, t_ns: int, constants: State) -> State | None:
-        """Return the full state from poses of {B} in {A} and twists in {B}; ``constants`` gives sigma, c_b and q_bc."""
+        """Return the full state from poses of {B} in {A} and twists in {B}.
+
+        ``constants`` gives sigma, c_b and q_bc.
+        """
         row = self._at(t_ns)
         if row is None or not (np.abs(row[7:]) < _MAX_VALUE).all():
             return None
@@ -232,7 +259,9 @@ class PoseTrack:
         a, b, fraction = self._row(right - 1), self._row(right), (t_ns - before) / (after - before)
         out = a + fraction * (b - a)
         turn = geometry.multiply(geometry.conjugate(a[3:7]), b[3:7])
-        out[3:7] = geometry.normalise(geometry.multiply(a[3:7], geometry.exp(fraction * geometry.log(turn))))
+        out[3:7] = geometry.normalise(
+            geometry.multiply(a[3:7], geometry.exp(fraction * geometry.log(turn)))
+        )
         return out
 
 
@@ -292,7 +321,9 @@ class TfBuffer:
         return frame if moves else None
 
     def pose(self, parent: str, child: str, t_ns: int) -> Pose | None:
-        """Return T_parent_child at ``t_ns``, None if the frames are not connected or the gap is too wide."""
+        """Return T_parent_child at ``t_ns``, None if the frames are not connected or the gap is too
+        wide.
+        """
         up, down = self._to_root(parent.lstrip("/"), t_ns), self._to_root(child.lstrip("/"), t_ns)
         for frame, to_frame in up:
             for other, from_frame in down:
@@ -301,7 +332,9 @@ class TfBuffer:
         return None
 
     def _to_root(self, frame: str, t_ns: int) -> list[tuple[str, Pose]]:
-        """Return (ancestor, T_ancestor_frame) from the frame itself to the root, or to the first missing transform."""
+        """Return (ancestor, T_ancestor_frame) from the frame itself to the root, or to the first
+        missing transform.
+        """
         out, pose = [(frame, Pose.identity())], Pose.identity()
         while frame in self._parents and len(out) <= len(self._parents):
             step = self._static[frame] if frame in self._static else self._moving[frame].pose(t_ns)

@@ -1,11 +1,12 @@
 """The result of a run as a log for viewers: MCAP, profile ros2, CDR only.
 
-Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
-estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
-model; its field ``residual`` is the distance to it [m]. ``/plan/cone`` holds the cones in which the planned approach
-stays. ``/rows`` holds the numeric columns that no other message holds, one message per scan, with a field for each
-column; a column without a value is NaN. Chunks are compressed by LZ4: clouds of points hardly become smaller, and zstd
-takes three times as long.
+Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under
+``camera`` at each estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if
+the estimate is right, it lies on the model; its field ``residual`` is the distance to it [m].
+``/plan/cone`` holds the cones in which the planned approach stays. ``/rows`` holds the numeric
+columns that no other message holds, one message per scan, with a field for each column; a column
+without a value is NaN. Chunks are compressed by LZ4: clouds of points hardly become smaller, and
+zstd takes three times as long.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ class ResultFrame:
         estimate: T_ac.
         covariance: (6, 6) of (position in {A} [m], rotation vector in {A} [rad]), the order of ROS.
         registration, truth: T_ac or None.
-        path: times (m,) [s from now] and positions (m, 3) in {A} [m] of a new plan; None if the plan is unchanged.
+        path: times (m,) [s from now] and positions (m, 3) in {A} [m] of a new plan; None if the
+            plan is unchanged.
         healthy: gamma.
         message: the reason.
         values: scalars by name.
@@ -80,7 +82,10 @@ class ResultFrame:
 
 
 class ResultLog:
-    """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
+    """Writer of ``result.mcap``; ``close`` finishes the file.
+
+    The bytes depend only on what is written.
+    """
 
     def __init__(
         self,
@@ -96,7 +101,8 @@ class ResultLog:
             path: the file.
             surface: the target model, written as a marker.
             metadata: of the run, by name, for example its configuration as JSON.
-            cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None without a cone.
+            cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None
+                without a cone.
             columns: names of the numeric columns of a row.
 
         Raises:
@@ -110,7 +116,9 @@ class ResultLog:
             self._stream = path.open("wb")
         except OSError as error:
             what = error.strerror or "cannot be written"
-            raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
+            raise UnreadableInput(
+                what, where=str(path), hint="check the folder and its rights"
+            ) from None
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
@@ -119,7 +127,9 @@ class ResultLog:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._fields = tuple(columns)
-        self._row = struct.Struct(f"<xBxx{len(columns)}d")  # encapsulation of little-endian CDR, then the values
+        self._row = struct.Struct(
+            f"<xBxx{len(columns)}d"
+        )  # encapsulation of little-endian CDR, then the values
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
@@ -139,18 +149,27 @@ class ResultLog:
             self._append("/truth/model", t, _model_marker(t, TRUE, self._surface))
             if self._cone is not None:
                 width_m = 0.002 * self._surface.extent
-                self._append("/plan/cone", t, _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m))
+                self._append(
+                    "/plan/cone",
+                    t,
+                    _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m),
+                )
         self._count += 1
         self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
         pose = Packer().header(t, CAMERA).pose(frame.estimate).doubles(frame.covariance)
         self._append("/estimate/pose", t, pose.bytes())
-        for topic, known in (("/registration/pose", frame.registration), ("/truth/pose", frame.truth)):
+        for topic, known in (
+            ("/registration/pose", frame.registration),
+            ("/truth/pose", frame.truth),
+        ):
             if known is not None:
                 self._append(topic, t, pose_stamped(t, CAMERA, known))
         if frame.truth is not None:
             self._append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
         aligned = frame.estimate.inverse().apply(frame.points)
-        cloud = point_cloud2(t, TARGET, aligned, None, intensities=frame.intensities, residuals=frame.residuals)
+        cloud = point_cloud2(
+            t, TARGET, aligned, None, intensities=frame.intensities, residuals=frame.residuals
+        )
         self._append("/points_aligned", t, cloud)
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
@@ -160,13 +179,16 @@ class ResultLog:
             self._append("/rosout", t, _said(frame))
         self._state = frame.message
 
-    def copy(self, written: Path, state: str, changed: Mapping[int, Sequence[float]] | None = None) -> None:
+    def copy(
+        self, written: Path, state: str, changed: Mapping[int, Sequence[float]] | None = None
+    ) -> None:
         """Append all messages of another log of this kind, so that this one continues it.
 
         Args:
             written: the other log.
             state: message of its last scan.
-            changed: numeric columns of the rows that have other values than in that log, by the index of the scan.
+            changed: numeric columns of the rows that have other values than in that log, by the
+                index of the scan.
 
         Raises:
             UnreadableInput: the other log is damaged.
@@ -178,7 +200,9 @@ class ResultLog:
             raise
         except Exception as error:  # the library has no common class of errors
             hint = "start anew with --overwrite"
-            raise UnreadableInput(f"is damaged: {error}"[:200], where=str(written), hint=hint) from None
+            raise UnreadableInput(
+                f"is damaged: {error}"[:200], where=str(written), hint=hint
+            ) from None
 
     def _copy(self, written: Path, changed: Mapping[int, Sequence[float]]) -> None:
         from mcap.reader import NonSeekingReader
@@ -204,7 +228,9 @@ class ResultLog:
                     text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[kind], qos
+            )
         return self._channels[topic]
 
 
@@ -241,13 +267,22 @@ def _model_marker(t_ns: int, frame: str, surface: Surface) -> bytes:
 
 
 def _marker(
-    t_ns: int, frame: str, kind: int, points: Array, colour: tuple[float, float, float, float], scale: float
+    t_ns: int,
+    frame: str,
+    kind: int,
+    points: Array,
+    colour: tuple[float, float, float, float],
+    scale: float,
 ) -> bytes:
     """Return a visualization_msgs Marker of points (m, 3) in a frame."""
     name = "cone" if kind == _LINES else "model"
     packer = Packer().header(t_ns, frame).string(name).i32(0).i32(kind)
-    packer.i32(0).pose(Pose.identity()).f64s(scale, scale, scale).f32s(*colour)  # action, pose, scale, colour
+    packer.i32(0).pose(Pose.identity()).f64s(scale, scale, scale).f32s(
+        *colour
+    )  # action, pose, scale, colour
     packer.i32(0).u32(0).u8(1)  # lifetime (none), locked to its frame
     packer.u32(len(points)).doubles(points).u32(0)  # points, no colours per point
     packer.string("").header(t_ns, "").string("").octets(b"").u32(0)  # no texture
-    return packer.string("").string("").string("").octets(b"").u8(0).bytes()  # text, mesh resource, mesh file
+    return (
+        packer.string("").string("").string("").octets(b"").u8(0).bytes()
+    )  # text, mesh resource, mesh file

@@ -1,7 +1,9 @@
-"""Reading of ROS 1 bags (format 2.0) by one linear pass, so that a bag without an index or cut short is read as well.
+"""Reading of ROS 1 bags (format 2.0) by one linear pass, so that a bag without an index or cut
+short is read as well.
 
-The rosbags library is not used because it requires an intact index and allocates the lengths that the file declares.
-The format has no checksums: damage shows as inconsistent lengths or as a chunk that cannot be decompressed.
+The rosbags library is not used because it requires an intact index and allocates the lengths that
+the file declares. The format has no checksums: damage shows as inconsistent lengths or as a chunk
+that cannot be decompressed.
 """
 
 from __future__ import annotations
@@ -86,16 +88,26 @@ class Ros1Bag(Recording):
         if stop is None:
             self._lose(
                 Loss(
-                    "the bag was not closed: messages that its recorder had not yet written are lost",
+                    "the bag was not closed: messages that its recorder had not yet written are"
+                    " lost",
                     self._file.size,
                     0,
                 )
             )
         if self._orphans:
-            self._lose(Loss("messages of a connection whose definition is lost", 0, 0, messages=self._orphans))
+            self._lose(
+                Loss(
+                    "messages of a connection whose definition is lost",
+                    0,
+                    0,
+                    messages=self._orphans,
+                )
+            )
 
     def _index_at(self) -> int | None:
-        """Return the offset of the index, None if the bag was not closed or its header is damaged."""
+        """Return the offset of the index, None if the bag was not closed or its header is
+        damaged.
+        """
         try:
             head = self._record(len(ROS1_MAGIC))
             place = head.number("index_pos") if head.op == _BAG else 0
@@ -144,7 +156,15 @@ class Ros1Bag(Recording):
         name = record.fields.get("compression", b"").decode("ascii", "replace")
         if name not in _COMPRESSIONS:
             raise BadMessage("a chunk with an unknown compression")
-        head = ChunkHead(0, 0, record.number("size"), 0, _COMPRESSIONS[name], record.data_at - at, record.data_size)
+        head = ChunkHead(
+            0,
+            0,
+            record.number("size"),
+            0,
+            _COMPRESSIONS[name],
+            record.data_at - at,
+            record.data_size,
+        )
         try:
             data = memoryview(self._chunks.check(at, head))
             for _ in _records(data):  # checked before any of it is used
@@ -177,7 +197,9 @@ class Ros1Bag(Recording):
 
     def _data(self, record: _Record) -> memoryview:
         if record.data_size > self._limit:
-            raise BadMessage(f"a record of {record.data_size} bytes is over the limit of {self._limit}")
+            raise BadMessage(
+                f"a record of {record.data_size} bytes is over the limit of {self._limit}"
+            )
         return memoryview(self._file.read(record.data_at, record.data_size))
 
     def _record(self, at: int) -> _Record:

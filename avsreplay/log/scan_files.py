@@ -1,7 +1,9 @@
-"""Scans stored as files: PLY, PCD, KITTI ``.bin``, ``.npy``, ``.npz``, ``.las`` and ``.laz``; the reader of PCD.
+"""Scans stored as files: PLY, PCD, KITTI ``.bin``, ``.npy``, ``.npz``, ``.las`` and ``.laz``; the
+reader of PCD.
 
-PCD files (ascii, binary and binary_compressed by LZF, with any fields) are not read by a library. Every size that they
-declare is compared with the bytes of the file before memory is allocated, also inside the compressed part.
+PCD files (ascii, binary and binary_compressed by LZF, with any fields) are not read by a library.
+Every size that they declare is compared with the bytes of the file before memory is allocated, also
+inside the compressed part.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from avsreplay.log.ply import read_ply
 
 
 def read_points(path: Path, limit: int) -> NDArray[Any]:
-    """Return the (n, 3) points of a file [m], float32 or float64, NaN where the sensor had no return.
+    """Return the (n, 3) points of a file [m], float32 or float64, NaN where the sensor had no
+    return.
 
     Args:
         path: the file; its extension selects the format.
@@ -67,7 +70,9 @@ def _columns(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _npz(data: bytes, limit: int) -> NDArray[Any]:
-    members = {name: member for name, member in read_members(data, limit).items() if name.endswith(".npy")}
+    members = {
+        name: member for name, member in read_members(data, limit).items() if name.endswith(".npy")
+    }
     named = [name for name in members if name in ("points.npy", "xyz.npy")] or list(members)
     if len(named) != 1:
         raise BadFile(f"{len(members)} arrays; name one of them 'points'")
@@ -78,14 +83,25 @@ def _las(data: bytes, limit: int) -> NDArray[Any]:
     try:
         import laspy
     except ImportError:
-        raise MissingBackend("LAS needs laspy", where=".las", hint="pip install 'avsreplay[las]'") from None
+        raise MissingBackend(
+            "LAS needs laspy", where=".las", hint="pip install 'avsreplay[las]'"
+        ) from None
     module: Any = laspy  # its type stubs are incomplete
     try:
         with module.open(io.BytesIO(data)) as reader:
             if reader.header.point_count * 24 > limit:
-                raise BadFile(f"{reader.header.point_count} points are over the limit of {limit} bytes")
+                raise BadFile(
+                    f"{reader.header.point_count} points are over the limit of {limit} bytes"
+                )
             return np.asarray(reader.read().xyz, dtype=np.float64)
-    except (laspy.errors.LaspyException, OSError, ValueError, RuntimeError, LookupError, MemoryError) as error:
+    except (
+        laspy.errors.LaspyException,
+        OSError,
+        ValueError,
+        RuntimeError,
+        LookupError,
+        MemoryError,
+    ) as error:
         raise BadFile(f"not a readable LAS: {str(error)[:80]}") from None
 
 
@@ -111,7 +127,8 @@ def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = Non
     Args:
         folder: the folder.
         names: the files to use; if empty, all files of the most frequent known format.
-        model: file of the model, which is not a scan if it lies in the folder and ``names`` is empty.
+        model: file of the model, which is not a scan if it lies in the folder and ``names`` is
+            empty.
 
     Raises:
         UnreadableInput: there are no scans, or a named file does not exist.
@@ -164,14 +181,21 @@ class _Header:
     def row(self) -> np.dtype[Any]:
         """Return the numpy type of one point of a binary file."""
         fields = [
-            (f"{name}_{i}" if name not in "xyz" else name, "<" + kind, (count,) if count > 1 else ())
-            for i, (name, kind, count) in enumerate(zip(self.names, self.kinds, self.counts, strict=True))
+            (
+                f"{name}_{i}" if name not in "xyz" else name,
+                "<" + kind,
+                (count,) if count > 1 else (),
+            )
+            for i, (name, kind, count) in enumerate(
+                zip(self.names, self.kinds, self.counts, strict=True)
+            )
         ]
         return np.dtype([(n, k, s) for n, k, s in fields])
 
 
 def read_pcd(data: bytes) -> NDArray[Any]:
-    """Return the (n, 3) points of a PCD file, float32 or float64, NaN where the sensor had no return.
+    """Return the (n, 3) points of a PCD file, float32 or float64, NaN where the sensor had no
+    return.
 
     Raises BadFile if the file is malformed; the text states why.
     """
@@ -179,7 +203,9 @@ def read_pcd(data: bytes) -> NDArray[Any]:
     for axis in "xyz":
         if header.names.count(axis) != 1 or header.counts[header.names.index(axis)] != 1:
             raise BadFile(f"its points have no single '{axis}'")
-    columns = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.form](data, header)
+    columns = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.form](
+        data, header
+    )
     kind = np.float32 if all(c.dtype == np.float32 for c in columns) else np.float64
     return np.stack(columns, axis=1).astype(kind, copy=False)
 
@@ -239,7 +265,10 @@ def _ascii(data: bytes, header: _Header) -> list[NDArray[Any]]:
     words = data[header.data_at :].split()
     width = sum(header.counts)
     if len(words) != header.points * width:
-        raise BadFile(f"{len(words)} numbers where {header.points} points of {width} need {header.points * width}")
+        raise BadFile(
+            f"{len(words)} numbers where {header.points} points of {width} need"
+            f" {header.points * width}"
+        )
     out = []
     for axis in "xyz":
         place = header.names.index(axis)
@@ -254,7 +283,9 @@ def _ascii(data: bytes, header: _Header) -> list[NDArray[Any]]:
 def _binary(data: bytes, header: _Header) -> list[NDArray[Any]]:
     row = header.row
     if header.points * row.itemsize > len(data) - header.data_at:
-        raise BadFile(f"{header.points} points of {row.itemsize} bytes in {len(data) - header.data_at} bytes")
+        raise BadFile(
+            f"{header.points} points of {row.itemsize} bytes in {len(data) - header.data_at} bytes"
+        )
     table = np.frombuffer(data, row, header.points, header.data_at)
     return [table[axis].astype(_float(table[axis].dtype.str[1:])) for axis in "xyz"]
 

@@ -34,7 +34,8 @@ class Source:
         path: the log or folder.
         header: the header of the log, with the requested model in place of its own.
         options: how the source is read.
-        damaged: why scans that were read so far could not be decoded, by their number among the selected ones.
+        damaged: why scans that were read so far could not be decoded, by their number among the
+            selected ones.
     """
 
     def __init__(
@@ -66,14 +67,19 @@ class Source:
         self.path, self.header, self.options = path, header, options
         self._clouds, self._ground_truth, self._files = clouds, ground_truth, tuple(files)
         self._extra = extra or {}
-        self._placed, self._clock = place(clouds.log_ns, clouds.publish_ns, clouds.header_ns, options.clock)
+        self._placed, self._clock = place(
+            clouds.log_ns, clouds.publish_ns, clouds.header_ns, options.clock
+        )
         self._lost, self.damaged = losses, dict[int, str]()
 
     def __enter__(self) -> Source:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -100,21 +106,33 @@ class Source:
         return self._clock
 
     def truth_poses(self) -> list[tuple[int, Pose]]:
-        """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in ascending order."""
+        """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in
+        ascending order.
+        """
         truth = self._ground_truth.truth
         if truth is None:
             return []
         valid = [(p.t_ns, place) for place, p in enumerate(self._placed) if not p.note]
         found = {t_ns: truth(t_ns, place, "") for t_ns, place in valid}
-        return [(t_ns, pose) for t_ns, pose in sorted(found.items(), key=lambda item: item[0]) if pose is not None]
+        return [
+            (t_ns, pose)
+            for t_ns, pose in sorted(found.items(), key=lambda item: item[0])
+            if pose is not None
+        ]
 
     @cached_property
     def sha256(self) -> str:
-        """Return the SHA-256 of the file; for a folder or split log, of the names and bytes of its files in order."""
+        """Return the SHA-256 of the file.
+
+        For a folder or split log, of the names and bytes of its files in order.
+        """
         digest = hashlib.sha256()
         for path in self._files:
             if self.path.is_dir():
-                digest.update(path.relative_to(self.path).as_posix().encode("utf-8", "surrogateescape") + b"\0")
+                digest.update(
+                    path.relative_to(self.path).as_posix().encode("utf-8", "surrogateescape")
+                    + b"\0"
+                )
             with path.open("rb") as file:
                 while block := file.read(_BLOCK):
                     digest.update(block)
@@ -129,17 +147,20 @@ class Source:
         """Yield the selected scans.
 
         Args:
-            prefetch: number of scans decoded ahead on a second thread; 0 decodes each when it is requested.
+            prefetch: number of scans decoded ahead on a second thread; 0 decodes each when it is
+                requested.
             first: number of the first scan among the selected ones.
 
         Returns:
-            An iterator; a scan that cannot be decoded is yielded without points and with the status DAMAGED.
+            An iterator; a scan that cannot be decoded is yielded without points and with the status
+            DAMAGED.
         """
         scans = (self._scan(seq, self._selected[seq]) for seq in range(first, len(self)))
         return ahead(scans, prefetch) if prefetch else scans
 
     def scan_at(self, seq: int) -> Scan:
-        """Return one selected scan, without points and with the status DAMAGED if it cannot be decoded.
+        """Return one selected scan, without points and with the status DAMAGED if it cannot be
+        decoded.
 
         Args:
             seq: index among the selected scans, from 0.
@@ -160,33 +181,61 @@ class Source:
             scan: a scan of this source.
 
         Returns:
-            The true pose T_ac, the full state and the injected fault, each None where it is not known.
+            The true pose T_ac, the full state and the injected fault, each None where it is not
+            known.
         """
         lookup, place = self._ground_truth.truth, self._selected[scan.seq]
         pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
 
     def truth_problem(self, scans: Sequence[Scan]) -> tuple[str, str] | None:
-        """Return why none of some scans has a true pose, or why the errors would refer to another frame.
+        """Return why none of some scans has a true pose, or why the errors would refer to another
+        frame.
 
         Args:
             scans: scans of this source.
 
         Returns:
-            The problem and the option that may solve it, "" if there is none; None without a problem.
+            The problem and the option that may solve it, "" if there is none; None without a
+            problem.
         """
         track, options = self._ground_truth.track, self.options
         if all(self.truth_of(scan).pose is None for scan in scans):
-            why, gap = ("", False) if track is None or not scans else track.uncovered([scan.t_ns for scan in scans])
-            stamps = why and not gap and options.truth_file is None and options.clock is ClockChoice.HEADER
+            why, gap = (
+                ("", False)
+                if track is None or not scans
+                else track.uncovered([scan.t_ns for scan in scans])
+            )
+            stamps = (
+                why
+                and not gap
+                and options.truth_file is None
+                and options.clock is ClockChoice.HEADER
+            )
             option = "--truth-gap SECONDS" if gap else "--clock log" if stamps else ""
-            return (f"no examined scan of {len(scans)} has a true pose{why}", option) if scans else None
-        at = "" if track is None or options.truth_file or options.sensor_topic else track.frame.lstrip("/")
-        clouds, frames = (options.fixed_frame or scans[0].frame).lstrip("/"), self._ground_truth.frames
-        transforms = any(topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics())
+            return (
+                (f"no examined scan of {len(scans)} has a true pose{why}", option)
+                if scans
+                else None
+            )
+        at = (
+            ""
+            if track is None or options.truth_file or options.sensor_topic
+            else track.frame.lstrip("/")
+        )
+        clouds, frames = (
+            (options.fixed_frame or scans[0].frame).lstrip("/"),
+            self._ground_truth.frames,
+        )
+        transforms = any(
+            topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics()
+        )
         if at in ("", clouds) or not clouds or not (at in frames if frames else transforms):
             return None
-        return f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'", f"--fixed-frame {shown(at)}"
+        return (
+            f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'",
+            f"--fixed-frame {shown(at)}",
+        )
 
     def in_own_frame(self, scan: Scan) -> NDArray[Any]:
         """Return the points (n, 3) of a scan in the frame of its cloud, to which crops refer [m].
@@ -197,7 +246,8 @@ class Source:
         return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
     def moving_in(self, frame: str) -> str | None:
-        """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected.
+        """Return the root frame in which a frame moves; None if it is fixed or the transforms were
+        not collected.
 
         Args:
             frame: name of the frame of a cloud.
@@ -252,7 +302,10 @@ class Source:
 
     @cached_property
     def _selected(self) -> list[int]:
-        """Return the positions of the selected scans: the window first, then every n-th, then at most ``n_scans``."""
+        """Return the positions of the selected scans.
+
+        The window first, then every n-th, then at most ``n_scans``.
+        """
         if not self._placed:
             return []
         (start, end), first = self.options.window_s, self._placed[0].t_ns
@@ -285,7 +338,9 @@ class Source:
             pose=None if cloud is None else cloud.pose,
             intensities=None if cloud is None else cloud.intensities,
             places=None if cloud is None else cloud.places,
-            sensor=None if cloud is None or cloud.pose else self._place_of_sensor(placed.t_ns, cloud.frame),
+            sensor=None
+            if cloud is None or cloud.pose
+            else self._place_of_sensor(placed.t_ns, cloud.frame),
         )
 
     def _body_at(self, t_ns: int) -> State | None:
@@ -293,12 +348,18 @@ class Source:
         return None if track is None or constants is None else track.body(t_ns, constants)
 
     def _fault(self, log_ns: int) -> str | None:
-        """Return the kind of the fault active at ``log_ns``; if there are several, the one that began last."""
+        """Return the kind of the fault active at ``log_ns``.
+
+        If there are several, the one that began last.
+        """
         inside = [label for label in self.header.labels if label.start_ns <= log_ns < label.end_ns]
         return max(inside, key=lambda label: label.start_ns).kind if inside else None
 
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
-        """Select points and transform them to the fixed frame. Raises BadMessage if the sensor's pose is unknown."""
+        """Select points and transform them to the fixed frame.
+
+        Raises BadMessage if the sensor's pose is unknown.
+        """
         if cloud.pose is not None:
             return replace(cloud, pose=self._measured(cloud.pose, t_ns, cloud.frame))
         cloud = selected(cloud, self.options)
@@ -309,7 +370,10 @@ class Source:
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
 
     def _place_of_sensor(self, t_ns: int, frame: str) -> Pose | None:
-        """Return the pose of the sensor in the fixed frame; None if the clouds stay in their own frame."""
+        """Return the pose of the sensor in the fixed frame.
+
+        None if the clouds stay in their own frame.
+        """
         return None if self._ground_truth.sensor is None else self._sensor(t_ns, frame)
 
     def _sensor(self, t_ns: int, frame: str) -> Pose:
@@ -321,10 +385,14 @@ class Source:
         return pose
 
     def _measured(self, found: MeasuredPose, t_ns: int, frame: str) -> MeasuredPose:
-        """Return a measured pose of the grasp point in the fixed frame with its covariance or that of the settings."""
+        """Return a measured pose of the grasp point in the fixed frame with its covariance or that
+        of the settings.
+        """
         options, C = self.options, found.covariance
         offset = np.zeros(3) if options.grasp is None else np.array(options.grasp)
-        if C is not None and options.grasp is not None:  # covariance at the new origin: v' = v + theta x offset
+        if (
+            C is not None and options.grasp is not None
+        ):  # covariance at the new origin: v' = v + theta x offset
             J = np.eye(6)
             J[3:, :3] = -geometry.skew(offset)
             C = J @ C @ J.T
@@ -346,4 +414,6 @@ def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:
 def refuse_losses(source: Source) -> None:
     """Raise UnreadableInput if any part, or a scan that was read, was lost (``--strict``)."""
     if text := lost_text(source.losses, source.damaged, len(source)):
-        raise UnreadableInput(text, where=shown(source.path), hint="leave out --strict to use the intact part")
+        raise UnreadableInput(
+            text, where=shown(source.path), hint="leave out --strict to use the intact part"
+        )

@@ -1,4 +1,5 @@
-"""Clouds or measured poses of a source in order, and its true poses, states and sensor poses by time.
+"""Clouds or measured poses of a source in order, and its true poses, states and sensor poses by
+time.
 
 The clouds are decoded ahead on a second thread if requested.
 """
@@ -36,7 +37,8 @@ EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero
 
 
 class PoseMessages(MessageClouds):
-    """The measured poses of one topic; same interface as MessageClouds, with poses in place of points.
+    """The measured poses of one topic; same interface as MessageClouds, with poses in place of
+    points.
 
     Attributes:
         type: message type of the topic.
@@ -84,7 +86,9 @@ class PoseFile(_Files):
         self._poses = found.poses
         self.timed = found.t_ns is not None
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
-        self.log_ns = self.publish_ns = self.header_ns = steady if found.t_ns is None else list(found.t_ns)
+        self.log_ns = self.publish_ns = self.header_ns = (
+            steady if found.t_ns is None else list(found.t_ns)
+        )
 
     def load(self, place: int) -> Cloud:
         """Return one pose. Raises BadMessage if its line has no valid pose."""
@@ -106,7 +110,9 @@ class FolderClouds(_Files):
 
     kind = "folder"
 
-    def __init__(self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None) -> None:
+    def __init__(
+        self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None
+    ) -> None:
         self._files, self._limit = files, limit
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
@@ -132,7 +138,8 @@ CloudStream = MessageClouds | FolderClouds | PoseFile
 
 
 def ahead(items: Iterator[T], count: int) -> Generator[T]:
-    """Yield the same items in the same order, at most ``count`` of them computed ahead on a second thread.
+    """Yield the same items in the same order, at most ``count`` of them computed ahead on a second
+    thread.
 
     An exception of ``items`` is raised in the calling thread.
     """
@@ -169,7 +176,9 @@ def ahead(items: Iterator[T], count: int) -> Generator[T]:
         thread.join()
 
 
-def _drained(queue: Queue[tuple[bool, T | BaseException | None]], thread: threading.Thread) -> Iterator[T]:
+def _drained(
+    queue: Queue[tuple[bool, T | BaseException | None]], thread: threading.Thread
+) -> Iterator[T]:
     while True:
         try:
             more, item = queue.get(timeout=_WAIT_S)
@@ -191,9 +200,11 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 
 @value_class(eq=True)
 class GroundTruth:
-    """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track.
+    """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is
+    a single track.
 
-    Where the transforms were collected, ``moving_in`` gives the root in which a frame moves, and ``frames`` all names.
+    Where the transforms were collected, ``moving_in`` gives the root in which a frame moves, and
+    ``frames`` all names.
     """
 
     truth: TruthLookup | None = None
@@ -204,8 +215,11 @@ class GroundTruth:
     frames: Sequence[str] = ()
 
 
-def about_grasp(grasp: Array, header: LogHeader, known: GroundTruth) -> tuple[LogHeader, GroundTruth]:
-    """Return model and truth with the origin of {C} at a grasp point; the start of the log is about the old origin.
+def about_grasp(
+    grasp: Array, header: LogHeader, known: GroundTruth
+) -> tuple[LogHeader, GroundTruth]:
+    """Return model and truth with the origin of {C} at a grasp point; the start of the log is about
+    the old origin.
 
     Args:
         grasp: (3,) in the frame of the model, or of the measured poses [m].
@@ -213,7 +227,9 @@ def about_grasp(grasp: Array, header: LogHeader, known: GroundTruth) -> tuple[Lo
         known: its ground truth.
     """
     surface, body, lookup = header.surface, header.truth, known.truth
-    if surface is not None and surface.sha256:  # not the octahedron that stands for a target without a model
+    if (
+        surface is not None and surface.sha256
+    ):  # not the octahedron that stands for a target without a model
         surface = with_vertices(surface, surface.vertices - grasp)
     if body is not None:
         body = replace(body, c_b=body.c_b + geometry.matrix(body.q_bc) @ grasp)
@@ -248,32 +264,55 @@ class TruthCollector:
         self._tf = TfBuffer(gap, by_log)
 
     def sinks(self, *, transforms: bool = False) -> dict[str, Sink]:
-        """Return the sink of each topic; ``transforms``: collect those of the log also if no option names a frame."""
-        out = {self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth), BODY_TOPIC: _poses_only(self._body)}
+        """Return the sink of each topic; ``transforms``.
+
+        Collect those of the log also if no option names a frame.
+        """
+        out = {
+            self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth),
+            BODY_TOPIC: _poses_only(self._body),
+        }
         if self.options.sensor_topic is not None:
             out[self.options.sensor_topic] = _poses_only(self._sensor)
         if self._wants_tf or transforms:
-            out.update({"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)})
+            out.update(
+                {"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)}
+            )
         return out
 
     def check(self, topics: Sequence[TopicInfo], where: str, stated: str = "") -> None:
-        """Raise UsageError if a requested topic or frame does not exist. ``stated``: the frame that the log names."""
-        for role, name in (("truth", self.options.truth_topic), ("sensor", self.options.sensor_topic)):
+        """Raise UsageError if a requested topic or frame does not exist. ``stated``.
+
+        The frame that the log names.
+        """
+        for role, name in (
+            ("truth", self.options.truth_topic),
+            ("sensor", self.options.sensor_topic),
+        ):
             found = next((t for t in topics if t.name == name), None)
             if name is not None and (found is None or found.type not in POSE_TYPES):
-                what = f"no such {role} topic" if found is None else f"{role} topic of type {shown(found.type)}"
+                what = (
+                    f"no such {role} topic"
+                    if found is None
+                    else f"{role} topic of type {shown(found.type)}"
+                )
                 hint = f"pose topics here: {_poses_of(topics) or 'none'}"
                 raise UsageError(f"{what}: '{shown(name)}'", where=where, hint=hint)
         for frame in (self.options.truth_frame, self.options.fixed_frame):
             if frame is not None and frame != stated and frame.lstrip("/") not in self._tf.frames():
-                hint = f"frames of its {TF_TYPE}: {', '.join(map(shown, self._tf.frames()[:20])) or 'none'}"
+                hint = (
+                    f"frames of its {TF_TYPE}:"
+                    f" {', '.join(map(shown, self._tf.frames()[:20])) or 'none'}"
+                )
                 raise UsageError(f"no frame '{shown(frame)}'", where=where, hint=hint)
 
     def ground_truth(self) -> GroundTruth:
         """Return the lookups, after the log was read."""
         truth, track = self._truth_lookup()
         body = self._body if len(self._body) else None
-        return GroundTruth(truth, track, body, self._sensor_lookup(), self._tf.moving_in, self._tf.frames())
+        return GroundTruth(
+            truth, track, body, self._sensor_lookup(), self._tf.moving_in, self._tf.frames()
+        )
 
     @property
     def _wants_tf(self) -> bool:
@@ -297,7 +336,10 @@ class TruthCollector:
 
 
 def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack | None]:
-    """Return a lookup in a pose file and its track: by time if the file has times, else by line without a track."""
+    """Return a lookup in a pose file and its track.
+
+    By time if the file has times, else by line without a track.
+    """
     if found.t_ns is None:
         poses = found.poses
         return (lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None), None

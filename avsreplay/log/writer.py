@@ -1,4 +1,5 @@
-"""Writing of a log: MCAP, profile ros2, CDR only, in small chunks with checksums, with the model and the scenario.
+"""Writing of a log: MCAP, profile ros2, CDR only, in small chunks with checksums, with the model
+and the scenario.
 
 The bytes depend only on what is written: no clock, path or library version is in the file.
 """
@@ -18,12 +19,24 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import STDOUT, check_output, is_stream
 from avsreplay.geometry import Pose
 from avsreplay.locks import open_alone
-from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
+from avsreplay.log.cdr import (
+    diagnostic,
+    odometry,
+    point_cloud2,
+    pose_stamped,
+    schema_text,
+    transform,
+)
 from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS
 from avsreplay.records import Label, LogHeader, Scan, State
 
-CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
+CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = (
+    "/points",
+    "/truth/pose",
+    "/truth/body",
+    "/faults",
+)
 CAMERA_TOPIC = "/camera/pose"
 CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"
 LIBRARY = "avsreplay"
@@ -38,8 +51,9 @@ _TYPES = {
 }
 _INFINITE = "{sec: 9223372036, nsec: 854775807}"
 _LATCHED = (  # keep last, reliable, transient local; complete, because readers require every key
-    f"- {{history: 1, depth: 1, reliability: 1, durability: 1, deadline: {_INFINITE}, lifespan: {_INFINITE}, "
-    f"liveliness: 1, liveliness_lease_duration: {_INFINITE}, avoid_ros_namespace_conventions: false}}\n"
+    f"- {{history: 1, depth: 1, reliability: 1, durability: 1, deadline: {_INFINITE}, lifespan:"
+    f" {_INFINITE}, liveliness: 1, liveliness_lease_duration: {_INFINITE},"
+    " avoid_ros_namespace_conventions: false}\n"
 )
 
 
@@ -73,9 +87,9 @@ class _Pipe(io.BufferedIOBase):
 class LogWriter:
     """Writer of one log; a context manager.
 
-    The file is written under ``<name>.partial`` and renamed when it is complete. An exception inside the ``with``
-    removes it. If the disk is full, the complete chunks are kept under the partial name and the error states this. A
-    pipe receives each chunk when it is complete.
+    The file is written under ``<name>.partial`` and renamed when it is complete. An exception
+    inside the ``with`` removes it. If the disk is full, the complete chunks are kept under the
+    partial name and the error states this. A pipe receives each chunk when it is complete.
 
     Attributes:
         bytes: number of bytes written so far.
@@ -97,13 +111,15 @@ class LogWriter:
 
         Args:
             path: the output; ``-`` is standard output.
-            header: scenario, seed, labels and model; the model is attached. If it names a fixed frame, the log holds no
-                static transform of the camera, and ``write_camera`` gives its poses.
+            header: scenario, seed, labels and model; the model is attached. If it names a fixed
+                frame, the log holds no static transform of the camera, and ``write_camera`` gives
+                its poses.
             overwrite: replace an existing output.
             compression: ``zstd``, ``lz4`` or ``none``.
             chunk_bytes: a chunk is written when it reaches this size.
             chunk_s: a chunk is also written when it reaches this span of the log clock [s].
-            streaming: write under the final name from the first byte, for a reader that follows the file.
+            streaming: write under the final name from the first byte, for a reader that follows the
+                file.
             point_type: type of the stored coordinates, ``float32`` or ``float64``.
 
         Raises:
@@ -121,8 +137,14 @@ class LogWriter:
         self._path, self._overwrite = STDOUT if self._stdout else Path(path).resolve(), overwrite
         self._pipe = is_stream(self._path)
         self._direct = streaming or self._pipe
-        self._partial = self._path if self._direct else self._path.with_name(self._path.name + ".partial")
-        self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
+        self._partial = (
+            self._path if self._direct else self._path.with_name(self._path.name + ".partial")
+        )
+        self._point_type, self._chunk_bytes, self._chunk_ns = (
+            point_type,
+            chunk_bytes,
+            round(chunk_s * 1e9),
+        )
         self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
         self._root = header.fixed_frame or CAMERA_FRAME
         self._channels: dict[str, int] = {}
@@ -136,7 +158,10 @@ class LogWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         if kind is None:
             self.close()
@@ -147,12 +172,15 @@ class LogWriter:
         """Append the cloud of a scan with the stamp ``scan.t_ns`` at the log time ``scan.log_ns``.
 
         Args:
-            scan: its points in the camera frame {A} [m], and the times of the points [s] if it has them, are stored.
+            scan: its points in the camera frame {A} [m], and the times of the points [s] if it has
+                them, are stored.
 
         Raises:
             UnreadableInput: the output cannot be written, or a time is outside the range of a log.
         """
-        payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type, scan.intensities)
+        payload = point_cloud2(
+            scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type, scan.intensities
+        )
         self._message(CLOUD_TOPIC, scan.log_ns, payload)
 
     def write_truth(self, log_ns: int, t_ns: int, pose: Pose, body: State | None = None) -> None:
@@ -172,7 +200,8 @@ class LogWriter:
             self._message(BODY_TOPIC, log_ns, odometry(t_ns, self._root, BODY_FRAME, body))
 
     def write_camera(self, log_ns: int, t_ns: int, pose: Pose) -> None:
-        """Append the pose of a moving camera in the fixed frame, as a pose topic and as a transform.
+        """Append the pose of a moving camera in the fixed frame, as a pose topic and as a
+        transform.
 
         Args:
             log_ns: time on the log clock [ns].
@@ -196,7 +225,11 @@ class LogWriter:
         try:
             if self._partial != self._path:
                 if self._path.exists() and not self._overwrite:
-                    raise UsageError("appeared while recording", where=str(self._path), hint=f"see {self._partial}")
+                    raise UsageError(
+                        "appeared while recording",
+                        where=str(self._path),
+                        hint=f"see {self._partial}",
+                    )
                 if os.name == "nt":  # Windows does not rename a file that is open
                     self._stream.close()
                 self._partial.replace(self._path)  # before the lock ends
@@ -205,21 +238,35 @@ class LogWriter:
 
     def _create(self) -> BinaryIO:
         if not self._direct and self._partial.exists() and not self._overwrite:
-            raise UsageError("already exists", where=str(self._partial), hint="choose another name, or add --overwrite")
+            raise UsageError(
+                "already exists",
+                where=str(self._partial),
+                hint="choose another name, or add --overwrite",
+            )
         try:
             if self._pipe:
-                return cast(BinaryIO, _Pipe(os.fdopen(os.dup(1), "wb") if self._stdout else self._partial.open("wb")))
+                return cast(
+                    BinaryIO,
+                    _Pipe(os.fdopen(os.dup(1), "wb") if self._stdout else self._partial.open("wb")),
+                )
             return open_alone(self._partial)
         except OSError as error:
             raise UnreadableInput(
-                f"cannot be written: {error.strerror}", where=str(self._path), hint="name another output"
+                f"cannot be written: {error.strerror}",
+                where=str(self._path),
+                hint="name another output",
             ) from None
 
     def _begin(self, header: LogHeader, compression: str) -> None:
         from mcap.writer import CompressionType, Writer
 
-        kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-        # The library closes a chunk only after it exceeds its size; sizes and spans are therefore checked here.
+        kinds = {
+            "zstd": CompressionType.ZSTD,
+            "lz4": CompressionType.LZ4,
+            "none": CompressionType.NONE,
+        }
+        # The library closes a chunk only after it exceeds its size; sizes and spans are therefore
+        # checked here.
         self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
 
         try:
@@ -227,14 +274,18 @@ class LogWriter:
         except ValueError:
             self._discard()
             hint = "check the numbers of the scenario"
-            raise UsageError("a state of the scenario is not finite", where=str(self._path), hint=hint) from None
+            raise UsageError(
+                "a state of the scenario is not finite", where=str(self._path), hint=hint
+            ) from None
 
         def begin() -> None:
             self._writer.start(profile="ros2", library=LIBRARY)
             self._writer.add_metadata(HEADER_RECORD, record)
             if header.surface is not None:
                 data = surface_bytes(header.surface)
-                self._writer.add_attachment(0, 0, header.surface.name, "application/octet-stream", data)
+                self._writer.add_attachment(
+                    0, 0, header.surface.name, "application/octet-stream", data
+                )
             self._stream.flush()
 
         self._guarded(begin)
@@ -243,7 +294,11 @@ class LogWriter:
     def _message(self, topic: str, log_ns: int, payload: bytes) -> None:
         if not 0 <= log_ns < 2**63:
             hint = "the clock of a log begins at 0; give later times"
-            raise UnreadableInput(f"a time of {log_ns * 1e-9:g} s cannot be recorded", where=str(self._path), hint=hint)
+            raise UnreadableInput(
+                f"a time of {log_ns * 1e-9:g} s cannot be recorded",
+                where=str(self._path),
+                hint=hint,
+            )
         self._guarded(lambda: self._append_with_labels(topic, log_ns, payload))
 
     def _append_with_labels(self, topic: str, log_ns: int, payload: bytes) -> None:
@@ -255,7 +310,9 @@ class LogWriter:
     def _static(self, log_ns: int) -> None:
         if self._root != CAMERA_FRAME:
             return
-        self._append("/tf_static", log_ns, transform(log_ns, ROOT_FRAME, CAMERA_FRAME, Pose.identity()))
+        self._append(
+            "/tf_static", log_ns, transform(log_ns, ROOT_FRAME, CAMERA_FRAME, Pose.identity())
+        )
 
     def _labels_until(self, log_ns: int | None) -> None:
         while self._labels and (log_ns is None or self._labels[0][0] <= log_ns):
@@ -263,9 +320,18 @@ class LogWriter:
             written_ns = (
                 at_ns if log_ns is not None else min(at_ns, self._last_ns)
             )  # a fault may last longer than the log
-            stamp_ns = min(max(at_ns, 0), MAX_NS)  # the header record of a foreign log may state any time
+            stamp_ns = min(
+                max(at_ns, 0), MAX_NS
+            )  # the header record of a foreign log may state any time
             written_ns = min(max(written_ns, 0), MAX_NS)
-            self._guarded(partial(self._append, FAULT_TOPIC, written_ns, diagnostic(stamp_ns, label, place % 2 == 0)))
+            self._guarded(
+                partial(
+                    self._append,
+                    FAULT_TOPIC,
+                    written_ns,
+                    diagnostic(stamp_ns, label, place % 2 == 0),
+                )
+            )
 
     def _append(self, topic: str, log_ns: int, payload: bytes) -> None:
         start = self._chunk_start_ns
@@ -313,9 +379,15 @@ class LogWriter:
 
     def _broken(self, why: str) -> None:
         self._keep_complete()
-        kept = f"{self._complete} complete bytes are kept in {self._partial}" if self._complete else "nothing is kept"
+        kept = (
+            f"{self._complete} complete bytes are kept in {self._partial}"
+            if self._complete
+            else "nothing is kept"
+        )
         hint = "check its reader" if self._pipe else kept
-        raise UnreadableInput(f"cannot be written: {why}", where=str(self._path), hint=hint) from None
+        raise UnreadableInput(
+            f"cannot be written: {why}", where=str(self._path), hint=hint
+        ) from None
 
     def _keep_complete(self) -> None:
         """Keep the file up to its last complete chunk."""
@@ -336,6 +408,8 @@ class LogWriter:
 
 
 def _edges(labels: tuple[Label, ...]) -> list[tuple[int, int, Label]]:
-    """Return (time, number, label) of the begin (even number) and end (odd number) of every label."""
+    """Return (time, number, label) of the begin (even number) and end (odd number) of every
+    label.
+    """
     ends = [(max(label.start_ns, 0), 2 * i, label) for i, label in enumerate(labels)]
     return ends + [(max(label.end_ns, 0), 2 * i + 1, label) for i, label in enumerate(labels)]

@@ -1,9 +1,11 @@
-"""Consistency of the estimate with its covariance, and the instant t_1 from which on the estimate may be used.
+"""Consistency of the estimate with its covariance, and the instant t_1 from which on the estimate
+may be used.
 
-Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every correct estimate. They
-need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit.
-``predictive`` tests position, velocity and attitude of the grasp point over the planner's horizon, which the capture
-needs; a body with unobservable parameters may pass it. Either must hold for the dwell time, with a consistent estimate.
+Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every
+correct estimate. They need no ground truth. Convergence: ``covariance`` is the paper's test, every
+parameter and motion block below its limit. ``predictive`` tests position, velocity and attitude of
+the grasp point over the planner's horizon, which the capture needs; a body with unobservable
+parameters may pass it. Either must hold for the dwell time, with a consistent estimate.
 """
 
 from __future__ import annotations
@@ -31,25 +33,27 @@ class ConsistencyParams(Settings):
 
     window: int = setting(
         50,
-        "Number of the last healthy scans whose mean NIS is tested. A larger value finds smaller deviations, later.",
+        "Number of the last healthy scans whose mean NIS is tested. A larger value finds smaller"
+        " deviations, later.",
         low=2,
     )
     least: int = setting(
         15,
-        "Smallest number of healthy scans for which this test is made; with fewer, converged stays false.",
+        "Smallest number of healthy scans for which this test is made; with fewer, converged stays"
+        " false.",
         low=2,
     )
     level: float = setting(
         0.9999,
-        "Probability of the two-sided band in which the mean NIS of a correct filter lies. A larger value accepts"
-        " larger deviations.",
+        "Probability of the two-sided band in which the mean NIS of a correct filter lies. A larger"
+        " value accepts larger deviations.",
         above=0.0,
         below=1.0,
     )
     slack: float = setting(
         2.0,
-        "Factor by which the mean NIS may exceed the band, because registration errors are correlated. A larger"
-        " value accepts larger deviations.",
+        "Factor by which the mean NIS may exceed the band, because registration errors are"
+        " correlated. A larger value accepts larger deviations.",
         low=1.0,
     )
 
@@ -72,8 +76,9 @@ class ConvergenceParams(Settings):
 
     criterion: Criterion = setting(
         Criterion.PREDICTIVE,
-        "Test that decides: the covariance of every block alone, as in the paper (covariance), or the predicted 1 sigma"
-        " of the grasp point over the horizon and the consistency of the innovations (predictive).",
+        "Test that decides: the covariance of every block alone, as in the paper (covariance), or"
+        " the predicted 1 sigma of the grasp point over the horizon and the consistency of the"
+        " innovations (predictive).",
     )
     dwell_s: float = setting(
         2.0,
@@ -83,8 +88,8 @@ class ConvergenceParams(Settings):
     )
     horizon_s: float = setting(
         30.0,
-        "With predictive: time over which the grasp point is predicted. A larger value requires a more"
-        " precise estimate.",
+        "With predictive: time over which the grasp point is predicted. A larger value requires a"
+        " more precise estimate.",
         unit="s",
         low=0.0,
     )
@@ -92,18 +97,34 @@ class ConvergenceParams(Settings):
         6, "With predictive: number of instants of the horizon that are tested.", low=1, high=1000
     )
     grasp_pos_m: float | None = setting(
-        None, "With predictive: largest 1 sigma of the grasp point's position.", unit="m", low=0.0, of_extent=0.01
+        None,
+        "With predictive: largest 1 sigma of the grasp point's position.",
+        unit="m",
+        low=0.0,
+        of_extent=0.01,
     )
     grasp_vel_mps: float | None = setting(
-        None, "With predictive: largest 1 sigma of the grasp point's velocity.", unit="m/s", low=0.0, of_extent=0.002
+        None,
+        "With predictive: largest 1 sigma of the grasp point's velocity.",
+        unit="m/s",
+        low=0.0,
+        of_extent=0.002,
     )
     grasp_rot_deg: float = setting(
         3.0, "With predictive: largest 1 sigma of the grasp point's attitude.", unit="deg", low=0.0
     )
-    attitude_deg: float = setting(3.0, "With covariance: largest 1 sigma of the attitude of {B}.", unit="deg", low=0.0)
-    rate_radps: float = setting(0.003, "With covariance: largest 1 sigma of the angular rate.", unit="rad/s", low=0.0)
+    attitude_deg: float = setting(
+        3.0, "With covariance: largest 1 sigma of the attitude of {B}.", unit="deg", low=0.0
+    )
+    rate_radps: float = setting(
+        0.003, "With covariance: largest 1 sigma of the angular rate.", unit="rad/s", low=0.0
+    )
     position_m: float | None = setting(
-        None, "With covariance: largest 1 sigma of the position of the mass centre.", unit="m", low=0.0, of_extent=0.01
+        None,
+        "With covariance: largest 1 sigma of the position of the mass centre.",
+        unit="m",
+        low=0.0,
+        of_extent=0.01,
     )
     velocity_mps: float | None = setting(
         None,
@@ -112,7 +133,9 @@ class ConvergenceParams(Settings):
         low=0.0,
         of_extent=0.001,
     )
-    sigma: float = setting(0.05, "With covariance: largest 1 sigma of the two inertia ratios.", low=0.0)
+    sigma: float = setting(
+        0.05, "With covariance: largest 1 sigma of the two inertia ratios.", low=0.0
+    )
     varrho_m: float | None = setting(
         None, "With covariance: largest 1 sigma of varrho.", unit="m", low=0.0, of_extent=0.01
     )
@@ -120,12 +143,17 @@ class ConvergenceParams(Settings):
 
     @property
     def times_s(self) -> Array:
-        """Instants (n,) after now at which the grasp point is predicted, ascending to the horizon [s]."""
+        """Instants (n,) after now at which the grasp point is predicted, ascending to the horizon
+        [s].
+        """
         return np.linspace(0.0, self.horizon_s, self.horizon_steps + 1)[1:]
 
     @property
     def block_limits(self) -> dict[str, float]:
-        """Limit of each block in the covariance's own units (half angles); auto values must be filled in."""
+        """Limit of each block in the covariance's own units (half angles).
+
+        Auto values must be filled in.
+        """
         half = math.radians(0.5)
         return {
             "attitude": half * self.attitude_deg,
@@ -161,20 +189,25 @@ def violations(
         pose_covariance: (6, 6) of its pose, metres in {A} and half angles in {B}.
         residual: (6,) measured minus estimated pose, in the same units.
         R: (6, 6) noise of the measured pose.
-        inflation: (2,) factor on R, attitude and position, by which the update allowed for correlated errors.
+        inflation: (2,) factor on R, attitude and position, by which the update allowed for
+            correlated errors.
         gate: 99.99 % point of the squared residual in the metric of R plus ``pose_covariance``.
 
     Returns:
-        Names of the failed checks: ``covariance`` (not positive semidefinite, or not finite), ``sigma`` (an inertia
-        ratio outside its physical range), ``worse_than_measured`` (1 sigma of position or attitude above that of the
-        measurement), ``outside_gate`` (the measurement is an outlier for the estimate).
+        Names of the failed checks: ``covariance`` (not positive semidefinite, or not finite),
+        ``sigma`` (an inertia ratio outside its physical range), ``worse_than_measured`` (1 sigma of
+        position or attitude above that of the measurement), ``outside_gate`` (the measurement is an
+        outlier for the estimate).
     """
     found = [] if definite else ["covariance"]
     if not all(abs(ratio) < 1.0 for ratio in belief.x.sigma.tolist()):
         found.append("sigma")
     claimed, measured = pose_covariance.diagonal().tolist(), R.diagonal().tolist()
     blocks = (slice(0, 3), float(inflation[1])), (slice(3, 6), float(inflation[0]))
-    if not all(sum(claimed[b]) <= max(factor, 1.0) * _NOT_WORSE**2 * sum(measured[b]) for b, factor in blocks):
+    if not all(
+        sum(claimed[b]) <= max(factor, 1.0) * _NOT_WORSE**2 * sum(measured[b])
+        for b, factor in blocks
+    ):
         found.append("worse_than_measured")
     if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= gate:
         found.append("outside_gate")
@@ -185,8 +218,8 @@ def violations(
 class ConsistencyTrack:
     """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first.
 
-    Each has its Cauchy weight, and the length that its NIS has as a chi-square value. ``share`` is the claimed part of
-    the variance of the last pose that near views have in common.
+    Each has its Cauchy weight, and the length that its NIS has as a chi-square value. ``share`` is
+    the claimed part of the variance of the last pose that near views have in common.
     """
 
     white: Array
@@ -199,7 +232,8 @@ class ConsistencyReport:
 
     Attributes:
         consistent: neither the mean NIS nor the sum of the innovations is above its band.
-        nis_mean: mean NIS.  band: its two-sided chi-square band.
+        nis_mean: mean NIS.
+        band: its two-sided chi-square band.
         autocorrelation: of the whitened innovations one healthy epoch apart, 0 where white.
     """
 
@@ -224,7 +258,9 @@ class Consistency:
         """Return an empty window."""
         return ConsistencyTrack(frozen(np.zeros((0, 6))))
 
-    def observe(self, track: ConsistencyTrack, innovation: Innovation | None, gamma: int) -> ConsistencyTrack:
+    def observe(
+        self, track: ConsistencyTrack, innovation: Innovation | None, gamma: int
+    ) -> ConsistencyTrack:
         """Return the window with one more scan; faulty scans are left out.
 
         Args:
@@ -234,7 +270,9 @@ class Consistency:
         """
         if innovation is None or gamma == 0:
             return track
-        share = innovation.weight * (innovation.chi2 / innovation.nis if innovation.nis > 0.0 else 1.0)
+        share = innovation.weight * (
+            innovation.chi2 / innovation.nis if innovation.nis > 0.0 else 1.0
+        )
         white = np.sqrt(share) * _root.whitened(innovation.S, innovation.alpha)
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])), innovation.share)
@@ -242,9 +280,10 @@ class Consistency:
     def judge(self, track: ConsistencyTrack, common: float = 1.0) -> ConsistencyReport:
         """Test the window: a mean NIS above its band (times the slack) is inconsistent.
 
-        A mean below the band results from a covariance that is too large, which is safe. A sum of the innovations that
-        is not zero by chance is inconsistent as well: an error of the estimate that is small beside that of one pose
-        shifts all innovations alike. Errors that the poses have in common enlarge the variance of the sum.
+        A mean below the band results from a covariance that is too large, which is safe. A sum of
+        the innovations that is not zero by chance is inconsistent as well: an error of the estimate
+        that is small beside that of one pose shifts all innovations alike. Errors that the poses
+        have in common enlarge the variance of the sum.
 
         Args:
             track: the window.
@@ -271,7 +310,8 @@ class ConvergenceTrack:
     """The state of the test.
 
     Attributes:
-        converged: the planner may use the estimate now.  t1_ns: the epoch from which it first held, None before.
+        converged: the planner may use the estimate now.
+        t1_ns: the epoch from which it first held, None before.
         since_ns: start of the present unbroken stretch, None outside one.
         covariance_converged, predictive_converged: the two tests at this epoch, before the dwell.
         unknown: blocks above their covariance limit.
@@ -289,7 +329,8 @@ class Convergence:
     """Determines t_1.
 
     Args:
-        params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].
+        params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal
+            [m].
 
     Attributes:
         times_s: instants (n,) after now at which the grasp point is predicted [s].
@@ -299,7 +340,11 @@ class Convergence:
         self.params = params.resolved(extent_m)
         self._limits, p = self.params.block_limits, self.params
         self.times_s = p.times_s
-        self._grasp_limits = (given(p.grasp_pos_m), given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
+        self._grasp_limits = (
+            given(p.grasp_pos_m),
+            given(p.grasp_vel_mps),
+            math.radians(p.grasp_rot_deg),
+        )
 
     def initial(self) -> ConvergenceTrack:
         """Return the state before the first scan."""
@@ -313,20 +358,26 @@ class Convergence:
         consistent: bool = True,
         possible: Forecast | None = None,
     ) -> ConvergenceTrack:
-        """Return the state after one more scan. By the predictive criterion an inconsistent estimate is not converged.
+        """Return the state after one more scan. By the predictive criterion an inconsistent
+        estimate is not converged.
 
         Args:
             track: the state so far.
             belief: the estimate after the scan.
             forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
             consistent: of the consistency tests.
-            possible: the forecast with a change that the last scans make possible. While it exceeds a limit,
-                convergence is not claimed. The dwell goes on: once later scans exclude the change, the test has held.
+            possible: the forecast with a change that the last scans make possible. While it exceeds
+                a limit, convergence is not claimed. The dwell goes on: once later scans exclude the
+                change, the test has held.
         """
         one_sigma = block_1s(belief.P)
-        unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
+        unknown = tuple(
+            name for name, limit in self._limits.items() if not one_sigma[name] <= limit
+        )
         predictive = forecast is not None and self._predicted(forecast)
-        printed = self.params.criterion is Criterion.COVARIANCE  # the paper's test looks at the covariance only
+        printed = (
+            self.params.criterion is Criterion.COVARIANCE
+        )  # the paper's test looks at the covariance only
         holds = not unknown if printed else predictive and consistent
         if not holds:
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
@@ -338,4 +389,7 @@ class Convergence:
 
     def _predicted(self, forecast: Forecast) -> bool:
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return all(float(values.max()) <= limit for values, limit in zip(predicted, self._grasp_limits, strict=True))
+        return all(
+            float(values.max()) <= limit
+            for values, limit in zip(predicted, self._grasp_limits, strict=True)
+        )

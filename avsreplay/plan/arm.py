@@ -1,8 +1,9 @@
-"""A manipulator described by a URDF: the joint path of the last metres, through pinocchio (the extra ``arm``).
+"""A manipulator described by a URDF: the joint path of the last metres, through pinocchio (the
+extra ``arm``).
 
-The arm carries the gripper along a plan that was made for its end-effector. Its joints follow by inverse kinematics
-from the capture backwards. A plan that exceeds limits of joints, rates or torques is replaced by a later or slower one.
-There is no gravity.
+The arm carries the gripper along a plan that was made for its end-effector. Its joints follow by
+inverse kinematics from the capture backwards. A plan that exceeds limits of joints, rates or
+torques is replaced by a later or slower one. There is no gravity.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan.joint_path import JointPath, last_metres_s, share_of, shoulder_and_wrist, sum_of_links
+from avsreplay.plan.joint_path import (
+    JointPath,
+    last_metres_s,
+    share_of,
+    shoulder_and_wrist,
+    sum_of_links,
+)
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
@@ -34,7 +41,8 @@ POSE_ERROR = 1e-8  # largest error of the inverse kinematics [m, rad]
 DAMPING = 1e-3
 CAPTURES = 16  # plans that are tried until the joints can fly one
 GRID_S = 0.25  # spacing of the instants at which the reach is bounded
-CLOSE_S = 0.1  # interval between a capture that the joints miss and one that they follow at which the search ends
+# interval between a capture that the joints miss and one that they follow at which the search ends
+CLOSE_S = 0.1
 STEP_S = 1.0  # spacing of the capture instants
 APPROACH = 9  # poses on the axis of the corridor at which a capture instant is tried
 QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins
@@ -54,52 +62,73 @@ class Arm:
             frame: Frame of the gripper; the last frame of the file where None.
 
         Raises:
-            UsageError: pinocchio is not installed, the frame is unknown, or a joint turns without an end.
+            UsageError: pinocchio is not installed, the frame is unknown, or a joint turns without
+                an end.
             UnreadableInput: The file cannot be read as a URDF.
         """
         try:
             self._pin: Any = importlib.import_module("pinocchio")
         except ModuleNotFoundError:
-            hint = "pip install 'avsreplay[arm]', or leave robot.urdf out and give robot.reach_max_m"
+            hint = (
+                "pip install 'avsreplay[arm]', or leave robot.urdf out and give robot.reach_max_m"
+            )
             what = "a manipulator needs pinocchio, which is not installed"
             raise UsageError(what, where="robot.urdf", hint=hint) from None
         if not urdf.is_file():
-            hint = "a relative path refers to the file that states it; name the robot again with --robot"
+            hint = (
+                "a relative path refers to the file that states it; name the robot again with"
+                " --robot"
+            )
             raise UnreadableInput("no such URDF", where=str(urdf), hint=hint)
         try:
             self._model = self._pin.buildModelFromXML(urdf.read_text(encoding="utf-8"))
         except (OSError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise UnreadableInput(f"no URDF: {reason}", where=str(urdf), hint="check the file") from None
+            raise UnreadableInput(
+                f"no URDF: {reason}", where=str(urdf), hint="check the file"
+            ) from None
         model = self._model
         if model.nq != model.nv or model.nq == 0:
-            raise UsageError("joints without limits are not supported", where=str(urdf), hint="give them as revolute")
+            raise UsageError(
+                "joints without limits are not supported",
+                where=str(urdf),
+                hint="give them as revolute",
+            )
         frame = frame or model.frames[model.nframes - 1].name
         if not model.existFrame(frame):
             names = ", ".join(f.name for f in list(model.frames)[1:])
-            raise UsageError(f"there is no frame '{frame}'", where=str(urdf), hint=f"frames: {names}")
+            raise UsageError(
+                f"there is no frame '{frame}'", where=str(urdf), hint=f"frames: {names}"
+            )
         model.gravity = self._pin.Motion.Zero()
         self._data, self._frame = model.createData(), model.getFrameId(frame)
         self._reach = shoulder_and_wrist(self._pin, model, self._data, self._frame)
 
     @property
     def reach_m(self) -> float:
-        """Upper bound of the distance from the base to the gripper: the sum of the lengths of all links [m]."""
+        """Upper bound of the distance from the base to the gripper.
+
+        The sum of the lengths of all links [m].
+        """
         return sum_of_links(self._model, self._frame)
 
     def missing_m(self, target: Pose) -> float:
-        """Return by how much a pose is certainly out of reach [m]; at most 0 where it may be in reach.
+        """Return by how much a pose is certainly out of reach [m]; at most 0 where it may be in
+        reach.
 
         Args:
             target: Pose of the gripper in the frame of the base.
         """
         shoulder, wrist, length = self._reach
-        return float(np.linalg.norm(target.t + geometry.matrix(target.q) @ wrist - shoulder)) - length
+        return (
+            float(np.linalg.norm(target.t + geometry.matrix(target.q) @ wrist - shoulder)) - length
+        )
 
     def never_reaches(self, scene: Scene, limits: Limits, horizon_s: float) -> bool:
         """Return whether the pose of the fixture is certainly out of reach at all times.
 
-        Between two instants the distance changes by at most half the spacing times its largest rate, times 1.5.
+        Between two instants the distance changes by at most half the spacing times its largest
+        rate, times 1.5.
 
         Args:
             scene: The target after the instant of planning, with its attitude.
@@ -107,11 +136,17 @@ class Arm:
             horizon_s: Latest capture [s after the instant of planning].
         """
         times = np.arange(0.0, horizon_s + GRID_S, GRID_S)
-        missing = np.array([self.missing_m(pose) for pose in self._poses(scene, limits, times, scene.goal(times)[0])])
+        missing = np.array(
+            [
+                self.missing_m(pose)
+                for pose in self._poses(scene, limits, times, scene.goal(times)[0])
+            ]
+        )
         return bool(missing.min() > 0.5 * MOTION_FACTOR * np.abs(np.diff(missing)).max())
 
     def inverse(self, target: Pose, start: Array) -> Array | None:
-        """Return joints (k,) that bring the gripper to a pose, by damped Gauss-Newton steps; None where it fails.
+        """Return joints (k,) that bring the gripper to a pose, by damped Gauss-Newton steps; None
+        where it fails.
 
         Args:
             target: Pose of the gripper in the frame of the base.
@@ -136,8 +171,11 @@ class Arm:
             q = np.clip(q + step, model.lowerPositionLimit, model.upperPositionLimit)
         return None
 
-    def last_metres(self, path: RobotPath, scene: Scene, limits: Limits, starts: Array | None = None) -> JointPath:
-        """Return the joints along the end of a plan; of several branches at the capture the one that reaches farthest.
+    def last_metres(
+        self, path: RobotPath, scene: Scene, limits: Limits, starts: Array | None = None
+    ) -> JointPath:
+        """Return the joints along the end of a plan; of several branches at the capture the one
+        that reaches farthest.
 
         The gripper has the attitude of the fixture.
 
@@ -145,7 +183,8 @@ class Arm:
             path: Path of the end-effector in {A}.
             scene: The target after the instant of planning, with its attitude.
             limits: Resolved limits: the pose of the base, and the length of the final approach.
-            starts: (m, k) joints from which the inverse kinematics of the capture begins; None: over their whole range.
+            starts: (m, k) joints from which the inverse kinematics of the capture begins; None:
+                over their whole range.
 
         Raises:
             ValueError: The scene has no attitude.
@@ -154,7 +193,12 @@ class Arm:
         r = path.at(times)[0]
         poses = self._poses(scene, limits, times, r)
         best = self._farthest(poses, self._starts() if starts is None else starts)
-        return self._graded(times[len(times) - len(best) :], best, r[len(times) - len(best) :], len(best) == len(times))
+        return self._graded(
+            times[len(times) - len(best) :],
+            best,
+            r[len(times) - len(best) :],
+            len(best) == len(times),
+        )
 
     def fitted(
         self,
@@ -166,10 +210,12 @@ class Arm:
         horizon_s: float,
         hint_s: float = 0.0,
     ) -> tuple[Plan, JointPath | None]:
-        """Return the earliest plan found whose last metres the joints can fly within all of their limits.
+        """Return the earliest plan found whose last metres the joints can fly within all of their
+        limits.
 
-        If rates or torques are too large, the acceleration is reduced. If the pose of the capture or the way to it is
-        out of reach, the next capture instant is tried whose pose the arm reaches.
+        If rates or torques are too large, the acceleration is reduced. If the pose of the capture
+        or the way to it is out of reach, the next capture instant is tried whose pose the arm
+        reaches.
 
         Args:
             make: Plans for an earliest capture [s] with a share of the largest acceleration.
@@ -181,8 +227,9 @@ class Arm:
             hint_s: Capture of an earlier plan that the joints delayed; it is tried first.
 
         Returns:
-            The plan and its joints. Without one a plan with the status ``none_found`` and the joints of the first plan,
-            or ``infeasible_within_horizon`` without joints where the fixture is certainly out of the arm's reach.
+            The plan and its joints. Without one a plan with the status ``none_found`` and the
+            joints of the first plan, or ``infeasible_within_horizon`` without joints where the
+            fixture is certainly out of the arm's reach.
         """
         if self.never_reaches(scene, limits, horizon_s):
             made = make(first_s, 1.0)
@@ -199,7 +246,9 @@ class Arm:
             if joints is not None and joints.possible:
                 if first is None:
                     return made, joints
-                made, joints = self._earlier(make, path, scene, limits, (missed_s, share), (made, joints))
+                made, joints = self._earlier(
+                    make, path, scene, limits, (missed_s, share), (made, joints)
+                )
                 return _later(made, first[0].lower_bound_s), joints
             first = first or (made, joints)
             least = 1.0 if joints is None else joints.slower
@@ -215,7 +264,10 @@ class Arm:
             earliest_s, share = after_s, 1.0
         assert first is not None
         made, joints = first
-        none = replace(no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s), delayed_by="arm")
+        none = replace(
+            no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s),
+            delayed_by="arm",
+        )
         return (none if made.found else made), joints
 
     def _earlier(
@@ -227,14 +279,21 @@ class Arm:
         missed: tuple[float, float],
         best: tuple[Plan, JointPath],
     ) -> tuple[Plan, JointPath]:
-        """Return an earlier capture with the same branch of the joints; ``missed``: a capture that they miss, share."""
+        """Return an earlier capture with the same branch of the joints; ``missed``.
+
+        A capture that they miss, share.
+        """
         missed_s, share = missed
         while best[0].t_go_s - missed_s > CLOSE_S:
             middle_s = 0.5 * (missed_s + best[0].t_go_s)
             made = make(middle_s, share)
             if made.found and made.t_go_s >= best[0].t_go_s:  # no capture is earlier
                 break
-            joints = self.last_metres(path(made), scene, limits, best[1].joints[-1:]) if made.found else None
+            joints = (
+                self.last_metres(path(made), scene, limits, best[1].joints[-1:])
+                if made.found
+                else None
+            )
             if joints is not None and joints.possible:
                 best = made, joints
             else:
@@ -244,10 +303,12 @@ class Arm:
     def _next_capture(
         self, scene: Scene, limits: Limits, after_s: float, horizon_s: float, lead_s: float
     ) -> float | None:
-        """Return the first instant later than ``after_s``, in steps of STEP_S, at which the arm reaches the fixture.
+        """Return the first instant later than ``after_s``, in steps of STEP_S, at which the arm
+        reaches the fixture.
 
-        It reaches the pose of the capture and, with the same branch of the joints, the axis of the corridor ahead of
-        it during the time ``lead_s`` before, with a distance that decreases with the square of the time to the capture.
+        It reaches the pose of the capture and, with the same branch of the joints, the axis of the
+        corridor ahead of it during the time ``lead_s`` before, with a distance that decreases with
+        the square of the time to the capture.
         """
         times = np.arange(after_s + STEP_S, horizon_s, STEP_S)
         goal = scene.goal(times)[0]
@@ -259,14 +320,21 @@ class Arm:
             assert scene.attitude is not None
             ahead = ((limits.final_range_m or 0.0) * left**2)[:, None]
             r = scene.goal(instants)[0] + ahead * (geometry.matrix(scene.attitude(instants)) @ axis)
-            if len(self._farthest(self._poses(scene, limits, instants, r), self._starts()[:QUICK])) == APPROACH:
+            if (
+                len(self._farthest(self._poses(scene, limits, instants, r), self._starts()[:QUICK]))
+                == APPROACH
+            ):
                 return float(times[k])
         return None
 
     def _poses(self, scene: Scene, limits: Limits, times: Array, r: Array) -> list[Pose]:
-        """Return the poses of the gripper at r (n, 3) in {A}, with the attitude of the fixture, in the base's frame."""
+        """Return the poses of the gripper at r (n, 3) in {A}, with the attitude of the fixture, in
+        the base's frame.
+        """
         if scene.attitude is None:
-            raise ValueError("the joints of an arm need the fixture's attitude, and the scene has none")
+            raise ValueError(
+                "the joints of an arm need the fixture's attitude, and the scene has none"
+            )
         turn = np.array(limits.base_attitude_xyzw)
         back = geometry.conjugate(turn / np.linalg.norm(turn))
         q, r_base = (
@@ -278,10 +346,14 @@ class Arm:
     def _starts(self) -> Array:
         low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
         rng = np.random.Generator(np.random.PCG64(0))
-        return np.concatenate([0.5 * (low + high)[None], low + (high - low) * rng.random((STARTS - 1, len(low)))])
+        return np.concatenate(
+            [0.5 * (low + high)[None], low + (high - low) * rng.random((STARTS - 1, len(low)))]
+        )
 
     def _farthest(self, poses: list[Pose], starts: Array) -> list[Array]:
-        """Return the joints at the last poses, of the branch at the last pose that reaches farthest back."""
+        """Return the joints at the last poses, of the branch at the last pose that reaches farthest
+        back.
+        """
         best, ends = list[Array](), list[Array]()
         for start in starts:
             end = self.inverse(poses[-1], start)
@@ -312,7 +384,9 @@ class Arm:
         q = np.array(joints)
         rate = np.gradient(q, times, axis=0)
         bend = np.gradient(rate, times, axis=0)
-        torque = np.array([self._pin.rnea(model, self._data, *row) for row in zip(q, rate, bend, strict=True)])
+        torque = np.array(
+            [self._pin.rnea(model, self._data, *row) for row in zip(q, rate, bend, strict=True)]
+        )
         middle = 0.5 * (model.lowerPositionLimit + model.upperPositionLimit)
         half = 0.5 * (model.upperPositionLimit - model.lowerPositionLimit)
         J = [self._pin.computeFrameJacobian(model, self._data, row, self._frame) for row in q]
@@ -334,7 +408,8 @@ def _later(made: Plan, lower_bound_s: float) -> Plan:
 
 
 def with_arm(robot: RobotParams) -> tuple[RobotParams, Arm | None]:
-    """Return the robot and its arm, None without; the arm's reach is the workspace where none is given.
+    """Return the robot and its arm, None without; the arm's reach is the workspace where none is
+    given.
 
     Args:
         robot: The robot.
@@ -346,4 +421,6 @@ def with_arm(robot: RobotParams) -> tuple[RobotParams, Arm | None]:
     if robot.urdf is None:
         return robot, None
     arm = Arm(Path(robot.urdf), robot.urdf_frame)
-    return (robot if robot.reach_max_m is not None else replace(robot, reach_max_m=arm.reach_m)), arm
+    return (
+        robot if robot.reach_max_m is not None else replace(robot, reach_max_m=arm.reach_m)
+    ), arm

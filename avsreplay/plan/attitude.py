@@ -1,8 +1,10 @@
-"""Attitude of the gripper: it turns to the attitude and the rate of the fixture within an angular acceleration.
+"""Attitude of the gripper: it turns to the attitude and the rate of the fixture within an angular
+acceleration.
 
-The turn is planned in the rotation vector from the attitude at its begin: q(t) = q0 o exp(psi(t)). For a turn about one
-axis psi'' is the angular acceleration, so the time-optimal rendezvous of psi with the fixture is exact. For a general
-turn the bound on psi'' is reduced until the angular acceleration itself keeps its bound.
+The turn is planned in the rotation vector from the attitude at its begin: q(t) = q0 o exp(psi(t)).
+For a turn about one axis psi'' is the angular acceleration, so the time-optimal rendezvous of psi
+with the fixture is exact. For a general turn the bound on psi'' is reduced until the angular
+acceleration itself keeps its bound.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ class Turn:
     Attributes:
         t_ns: Begin of the turn.
         q0: (4,) attitude of the gripper at t_ns, q_ag.
-        path: Rotation vector in the gripper's axes at t_ns [rad] as a path; None: the attitude is kept.
+        path: Rotation vector in the gripper's axes at t_ns [rad] as a path; None: the attitude is
+            kept.
         target: Attitude of the fixture, in seconds after t_ns.
     """
 
@@ -64,7 +67,9 @@ class Turn:
         """
         if self.path is None or self.target is None:
             return np.tile(self.q0, (len(times), 1))
-        turning = geometry.multiply(self.q0, geometry.exp(self.path.at(np.minimum(times, self.path.t_go_s))[0]))
+        turning = geometry.multiply(
+            self.q0, geometry.exp(self.path.at(np.minimum(times, self.path.t_go_s))[0])
+        )
         return np.where((times >= self.path.t_go_s)[:, None], self.target(times), turning)
 
     def rate(self, t: float) -> Array:
@@ -77,8 +82,11 @@ class Turn:
         return rate
 
 
-def turn_to(target: Attitude, q0: Array, rate0: Array, accel: float, params: PlanParams, t_ns: int) -> Turn | None:
-    """Plan the turn of the gripper to the attitude and the rate of the fixture; None if none is found.
+def turn_to(
+    target: Attitude, q0: Array, rate0: Array, accel: float, params: PlanParams, t_ns: int
+) -> Turn | None:
+    """Plan the turn of the gripper to the attitude and the rate of the fixture; None if none is
+    found.
 
     Args:
         target: Attitude of the fixture, in seconds after t_ns.
@@ -92,15 +100,25 @@ def turn_to(target: Attitude, q0: Array, rate0: Array, accel: float, params: Pla
     for winding in (0, -1):
         goal, end_s = _relative(target, q0, params.horizon_s, winding)
         if end_s > params.latency_s:
-            found.append(_within(goal, target, q0, rate0, accel, replace(params, horizon_s=end_s), t_ns))
+            found.append(
+                _within(goal, target, q0, rate0, accel, replace(params, horizon_s=end_s), t_ns)
+            )
     turns = [turn for turn in found if turn is not None]
     return min(turns, key=lambda turn: turn.ready_s(math.inf), default=None)
 
 
 def _within(
-    goal: Trajectory, target: Attitude, q0: Array, rate0: Array, accel: float, params: PlanParams, t_ns: int
+    goal: Trajectory,
+    target: Attitude,
+    q0: Array,
+    rate0: Array,
+    accel: float,
+    params: PlanParams,
+    t_ns: int,
 ) -> Turn | None:
-    """Return the turn to one branch of the relative attitude whose angular acceleration keeps its bound."""
+    """Return the turn to one branch of the relative attitude whose angular acceleration keeps its
+    bound.
+    """
     bound = accel
     for _ in range(REDUCTIONS):
         late = PlanParams(bound, params.horizon_s, params.latency_s, grid_s=params.grid_s)
@@ -116,12 +134,15 @@ def _within(
 
 
 def angular_acceleration(turn: Turn) -> float:
-    """Return the largest angular acceleration of a turn [rad/s2], by difference quotients at many instants.
+    """Return the largest angular acceleration of a turn [rad/s2], by difference quotients at many
+    instants.
 
     Args:
         turn: The turn; it must have a path.
     """
-    edge_s = 6.0 * STEP_S  # the quotients at the ends are those just inside the turn, where the largest often is
+    edge_s = (
+        6.0 * STEP_S
+    )  # the quotients at the ends are those just inside the turn, where the largest often is
     times = np.linspace(edge_s, max(turn.ready_s(0.0) - edge_s, edge_s), INSTANTS)
     rates = _rates(turn.at, np.concatenate([times - 5.0 * STEP_S, times + 5.0 * STEP_S]))
     before, after = rates[: len(times)], rates[len(times) :]
@@ -134,16 +155,25 @@ def _rates(attitude: Attitude, times: Array) -> Array:
     return np.asarray(geometry.log(step) / (2.0 * STEP_S))
 
 
-def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tuple[Trajectory, float]:
-    """Return the rotation vector from q0 to the fixture with its derivative, and the time up to which it is continuous.
+def _relative(
+    target: Attitude, q0: Array, horizon_s: float, winding: int
+) -> tuple[Trajectory, float]:
+    """Return the rotation vector from q0 to the fixture with its derivative, and the time up to
+    which it is continuous.
 
-    A rotation by theta about e is also one by theta - 2 pi; ``winding`` selects the branch at the begin.
+    A rotation by theta about e is also one by theta - 2 pi; ``winding`` selects the branch at the
+    begin.
     """
     times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / GRID_S) + 1)
     psi = np.array(geometry.log(geometry.multiply(geometry.conjugate(q0), target(times))))
     size = np.maximum(np.linalg.norm(psi, axis=1, keepdims=True), 1e-12)
-    branches = psi[:, None] + 2.0 * math.pi * np.array([-2, -1, 0, 1, 2])[None, :, None] * (psi / size)[:, None]
-    nearest = np.argmin(np.sum((branches[1:, :, None] - branches[:-1, None]) ** 2, axis=3), axis=1).tolist()
+    branches = (
+        psi[:, None]
+        + 2.0 * math.pi * np.array([-2, -1, 0, 1, 2])[None, :, None] * (psi / size)[:, None]
+    )
+    nearest = np.argmin(
+        np.sum((branches[1:, :, None] - branches[:-1, None]) ** 2, axis=3), axis=1
+    ).tolist()
     branch = [2 + winding]
     for following in nearest:  # of each branch the nearest one at the next instant
         branch.append(following[branch[-1]])
@@ -154,10 +184,14 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
         return (lambda t: (np.zeros((len(t), 3)), np.zeros((len(t), 3)))), 0.0
     nodes = times[: last + 1]
     pieces = _cone.spline(nodes, taken[: last + 1])
-    return (lambda t: (_cone.values(pieces, nodes, t, 0), _cone.values(pieces, nodes, t, 1))), float(times[last])
+    return (
+        lambda t: (_cone.values(pieces, nodes, t, 0), _cone.values(pieces, nodes, t, 1))
+    ), float(times[last])
 
 
-def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Turn | None:
+def next_turn(
+    before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int
+) -> Turn | None:
     """Return the turn to the fixture that begins after the latency; None where none was found.
 
     Args:
@@ -182,7 +216,8 @@ def turn_time(
 
     Args:
         target: Attitude of the fixture, in seconds after t_ns; None where it is not known.
-        gripper: Attitude (4,) of the gripper and its largest angular acceleration [rad/s2]; None: not planned.
+        gripper: Attitude (4,) of the gripper and its largest angular acceleration [rad/s2]; None:
+            not planned.
         params: Horizon, latency and grid.
         t_ns: Instant of planning.
 
@@ -195,10 +230,14 @@ def turn_time(
     return math.inf if turn is None else turn.ready_s(math.inf)
 
 
-def without_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Plan:
-    """Return the answer where no turn was found: impossible if the rate of the fixture is out of reach at all times.
+def without_turn(
+    before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int
+) -> Plan:
+    """Return the answer where no turn was found: impossible if the rate of the fixture is out of
+    reach at all times.
 
-    Between two instants the rate changes by at most half the spacing times its largest derivative, times 1.5.
+    Between two instants the rate changes by at most half the spacing times its largest derivative,
+    times 1.5.
 
     Args:
         before: The turn until the end of the latency.
@@ -212,17 +251,22 @@ def without_turn(before: Turn, target: Attitude, accel_radps2: float, params: Pl
     begun = float(np.linalg.norm(before.rate((t_ns - before.t_ns) * 1e-9 + params.latency_s)))
     missing = rates - begun - accel_radps2 * np.maximum(times - params.latency_s, 0.0)
     never = float(missing.min()) > 0.5 * MOTION_FACTOR * float(np.abs(np.diff(missing)).max())
-    status, bound_s = (PlanStatus.INFEASIBLE, params.horizon_s) if never else (PlanStatus.NOT_FOUND, params.latency_s)
+    status, bound_s = (
+        (PlanStatus.INFEASIBLE, params.horizon_s)
+        if never
+        else (PlanStatus.NOT_FOUND, params.latency_s)
+    )
     return replace(no_plan(t_ns, status, params.a_max_mps2, bound_s), delayed_by="attitude")
 
 
 def with_turn(plan: Plan, turn_s: float | None) -> Plan:
-    """Return the plan with the time of the gripper's turn; it is delayed by the attitude where the turn decides.
+    """Return the plan with the time of the gripper's turn; it is delayed by the attitude where the
+    turn decides.
 
     Args:
         plan: The plan of the flight.
-        turn_s: Time until attitude and rate are those of the fixture [s after the instant of planning]; None where the
-            attitude is not planned.
+        turn_s: Time until attitude and rate are those of the fixture [s after the instant of
+            planning]; None where the attitude is not planned.
     """
     if turn_s is None or not plan.found:
         return plan

@@ -1,9 +1,10 @@
-"""One convex subproblem of the constrained planner: a second-order cone programme with free end time.
+"""One convex subproblem of the constrained planner: a second-order cone programme with free end
+time.
 
-Thrust is constant over each of N equal intervals of length h. In the scaled variables q = h v and w = h^2 u the
-dynamics r' = r + q + w/2, q' = q + w are linear also for free h. The bound |w| <= a_max h^2 is replaced by its tangent
-in h, which lies below, so every solution obeys the true bound and the true dynamics. Only the motion of the target with
-the end time is linearised.
+Thrust is constant over each of N equal intervals of length h. In the scaled variables q = h v and w
+= h^2 u the dynamics r' = r + q + w/2, q' = q + w are linear also for free h. The bound |w| <= a_max
+h^2 is replaced by its tangent in h, which lies below, so every solution obeys the true bound and
+the true dynamics. Only the motion of the target with the end time is linearised.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ class PointRows:
         fraction: (m,) position of the instant within its interval, 0 to 1.
         vector: (m, 3) coefficients c in {A}.
         offset: (m,) value of -c.origin plus the constant of the row [m].
-        rate: (m,) change of the row with the relative change of h, from the motion of the target [m].
+        rate: (m,) change of the row with the relative change of h, from the motion of the target
+            [m].
         slack: (m,) coefficient of the common slack variable.
-        lead: (m,) the rows are those of the position this much later if the robot coasts [s]; None: at the instants.
+        lead: (m,) the rows are those of the position this much later if the robot coasts [s]; None:
+            at the instants.
     """
 
     interval: Index
@@ -60,8 +63,8 @@ class Subproblem:
         earliest: Lower bound of h.
         axes: (3, 3) rows e with |e.u| <= 1; None without bounds per axis.
         planes: Rows that must be at least 0.
-        cones: Sizes of groups of rows, one for all groups or one for each, and the rows; in each group the first row
-            bounds the norm of the others.
+        cones: Sizes of groups of rows, one for all groups or one for each, and the rows; in each
+            group the first row bounds the norm of the others.
     """
 
     n: int
@@ -93,7 +96,9 @@ class Solution:
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows C (r, q, h, slack, w) + d of one interval each, in groups that lie in second-order cones."""
+    """Rows C (r, q, h, slack, w) + d of one interval each, in groups that lie in second-order
+    cones.
+    """
 
     n: int
     origin: Array
@@ -103,14 +108,20 @@ class _Rows:
     sizes: list[Index] = field(default_factory=list)
 
     def put(self, size: int | Index, stage: Index, C: Array, d: Array) -> None:
-        """Add rows of cones of one size, or of the sizes of all; positions in C are those less the start."""
+        """Add rows of cones of one size, or of the sizes of all.
+
+        Positions in C are those less the start.
+        """
         self.stage.append(stage)
         self.C.append(C)
         self.d.append(d + C[:, :3] @ self.origin)
         self.sizes.append(np.full(len(stage) // size, size) if isinstance(size, int) else size)
 
     def solved(self, start: Array, weight: float) -> tuple[float, float, Array, int] | None:
-        """Return h, slack, w (n, 3) and the number of iterations; None where no solution was found."""
+        """Return h, slack, w (n, 3) and the number of iterations.
+
+        None where no solution was found.
+        """
         stage, sizes = (np.concatenate(x).astype(np.int32) for x in (self.stage, self.sizes))
         C, d = np.concatenate(self.C), np.concatenate(self.d)
         found: tuple[float, float, Array, int] | None = _cone.solve(
@@ -121,7 +132,11 @@ class _Rows:
 
 def solve(p: Subproblem) -> Solution | None:
     """Solve a subproblem. Returns None where the method does not converge."""
-    scale = max(float(np.linalg.norm(p.rho - p.r0 - p.v0 * p.n * p.h)), 0.5 * p.a_max * (p.n * p.h) ** 2, 1e-9)
+    scale = max(
+        float(np.linalg.norm(p.rho - p.r0 - p.v0 * p.n * p.h)),
+        0.5 * p.a_max * (p.n * p.h) ** 2,
+        1e-9,
+    )
     rows = _Rows(p.n, p.r0 / scale)
     _bounds(rows, p, scale)
     _thrust(rows, p, scale)
@@ -141,10 +156,17 @@ _Q, _H, _SLACK, _W = 3, 6, 7, 8  # first columns
 
 
 def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:
-    """1 - change <= h/h_ref <= 1 + change, slack >= 0, and |e.w| <= h^2 (tangent) for bounds per axis."""
+    """1 - change <= h/h_ref <= 1 + change, slack >= 0, and |e.w| <= h^2 (tangent) for bounds per
+    axis.
+    """
     C = np.zeros((3, 11))
     C[:, _H], C[2, _SLACK] = (1.0, -1.0, 0.0), 1.0
-    rows.put(1, np.zeros(3, dtype=np.int64), C, np.array([-max(1.0 - p.change, p.earliest / p.h), 1.0 + p.change, 0.0]))
+    rows.put(
+        1,
+        np.zeros(3, dtype=np.int64),
+        C,
+        np.array([-max(1.0 - p.change, p.earliest / p.h), 1.0 + p.change, 0.0]),
+    )
     if p.axes is not None:
         bound = p.h**2 / scale
         C = np.zeros((p.n, 6, 11))
@@ -153,7 +175,10 @@ def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:
 
 
 def _thrust(rows: _Rows, p: Subproblem, scale: float) -> None:
-    """Bound on the thrust, |w| <= bound (2 h/h_ref - 1), the tangent of h^2; on the speed; at contact."""
+    """Bound on the thrust, |w| <= bound (2 h/h_ref - 1), the tangent of h^2; on the speed.
+
+    At contact.
+    """
     n, stage, axis = p.n, np.repeat(np.arange(p.n), 4), np.arange(3)
     C, d = np.zeros((n, 4, 11)), np.zeros((n, 4))
     d[:, 0] = -p.a_max * p.h**2 / scale
@@ -190,7 +215,9 @@ def _end(rows: _Rows, p: Subproblem, scale: float) -> None:
     rows.put(4, last, C, d)
 
 
-def _point_rows(rows: _Rows, p: Subproblem, points: PointRows, scale: float, size: int | Index) -> None:
+def _point_rows(
+    rows: _Rows, p: Subproblem, points: PointRows, scale: float, size: int | Index
+) -> None:
     C, s = np.empty((len(points.interval), 11)), points.fraction[:, None]
     lead = 0.0 if points.lead is None else points.lead[:, None] / p.h
     C[:, :_Q] = points.vector

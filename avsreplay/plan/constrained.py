@@ -1,9 +1,10 @@
 """Time-optimal rendezvous under constraints by successive convexification.
 
-Each iteration linearises the constraints about a reference path and solves a second-order cone programme with free end
-time. Most constraints are alternatives (inside the cone, or outside its range); the reference decides which one holds
-at an instant. Several initial paths with different arrival times and sides lead to different local minima; the earliest
-capture is kept. A plan is accepted only after the true constraints hold at sixteen instants of every interval.
+Each iteration linearises the constraints about a reference path and solves a second-order cone
+programme with free end time. Most constraints are alternatives (inside the cone, or outside its
+range); the reference decides which one holds at an instant. Several initial paths with different
+arrival times and sides lead to different local minima; the earliest capture is kept. A plan is
+accepted only after the true constraints hold at sixteen instants of every interval.
 """
 
 from __future__ import annotations
@@ -44,19 +45,29 @@ from avsreplay.plan.robot import Limits
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
-ROUGH_TOLERANCE = 2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
+ROUGH_TOLERANCE = (
+    2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
+)
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
-LATER, LATER_S = 1.02, 0.1  # a renewed plan that is later than the earlier one by more starts the full search
+LATER, LATER_S = (
+    1.02,
+    0.1,
+)  # a renewed plan that is later than the earlier one by more starts the full search
 KEPT = 1  # earlier iterations whose aborts are required too: the worst moment may alternate
-NEAR_REFERENCE = 0.02  # relative change of the end time below which the excess tightens the constraints
+NEAR_REFERENCE = (
+    0.02  # relative change of the end time below which the excess tightens the constraints
+)
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
 MOVES = 6  # largest number of moves of the entry in one direction
-RETRIED = 3  # initial paths nearest to the earliest draft, tried on the fine grid where no draft can be refined
+# initial paths nearest to the earliest draft, tried on the fine grid where no draft can be refined
+RETRIED = 3
 TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
-STUCK = 4  # from this iteration on an initial path without a plan ends where the slack does not shrink
+STUCK = (
+    4  # from this iteration on an initial path without a plan ends where the slack does not shrink
+)
 
 
 def constrained(
@@ -84,9 +95,10 @@ def constrained(
         earliest_s: Earliest capture allowed [s after t_ns].
 
     Returns:
-        A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the least time without
-        constraints), ``feasible`` (all constraints hold, a local minimum), ``none_found`` (no plan was found, but one
-        may exist) or ``infeasible_within_horizon`` (certified).
+        A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the
+        least time without constraints), ``feasible`` (all constraints hold, a local minimum),
+        ``none_found`` (no plan was found, but one may exist) or ``infeasible_within_horizon``
+        (certified).
 
     Raises:
         ValueError: A value is not valid, or the scene lacks what a constraint needs.
@@ -108,15 +120,18 @@ def constrained(
     span_s = 1.5 * unbound.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     case = Case(sampled, limits, params, r0, v0, 1e-5 * extent_m, earliest_s=earliest_s)
-    return _free_plan(case, free) or _graded(case, free, _best_path(case, free, unbound, warm), t_ns)
+    return _free_plan(case, free) or _graded(
+        case, free, _best_path(case, free, unbound, warm), t_ns
+    )
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
-    """Raise the certified lower bound to the first time at which necessary conditions of a capture hold.
+    """Raise the certified lower bound to the first time at which necessary conditions of a capture
+    hold.
 
-    The distance can be covered at the largest speed, and the grasp point is inside the workspace. Between two samples
-    the goal moves by at most half the spacing times its largest speed, times 1.5. Where no time remains the problem is
-    proven infeasible.
+    The distance can be covered at the largest speed, and the grasp point is inside the workspace.
+    Between two samples the goal moves by at most half the spacing times its largest speed, times
+    1.5. Where no time remains the problem is proven infeasible.
     """
     proven = no_plan(free.t_ns, PlanStatus.INFEASIBLE, free.a_max, params.horizon_s)
     if _closed_off(scene, r0, limits):
@@ -132,19 +147,24 @@ def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: 
 
     from_base = np.linalg.norm(rho - np.array(limits.base_m), axis=1)
     possible = times[1:] >= free.lower_bound_s
-    possible &= least(np.linalg.norm(rho - r0, axis=1)) <= (limits.speed_max_mps or math.inf) * times[1:]
+    possible &= (
+        least(np.linalg.norm(rho - r0, axis=1)) <= (limits.speed_max_mps or math.inf) * times[1:]
+    )
     possible &= least(from_base) <= (limits.reach_max_m or math.inf)
     possible &= least(-from_base) <= -(limits.reach_min_m or 0.0)
     if not possible.any():
         return proven
-    return replace(free, lower_bound_s=max(free.lower_bound_s, float(times[int(possible.argmax())])))
+    return replace(
+        free, lower_bound_s=max(free.lower_bound_s, float(times[int(possible.argmax())]))
+    )
 
 
 def _closed_off(scene: Scene, r0: Array, limits: Limits) -> bool:
-    """Return whether every point of the corridor is closer to the surface than the clearance, so that none leads in.
+    """Return whether every point of the corridor is closer to the surface than the clearance, so
+    that none leads in.
 
-    The distance to the surface changes by at most the distance between two points, and the corridor lies within its
-    range of the grasp point.
+    The distance to the surface changes by at most the distance between two points, and the corridor
+    lies within its range of the grasp point.
     """
     if limits.clearance_m is None or scene.surface is None:
         return False
@@ -154,10 +174,15 @@ def _closed_off(scene: Scene, r0: Array, limits: Limits) -> bool:
 
 
 def _free_plan(case: Case, free: Plan) -> Plan | None:
-    """Return the plan without constraints where it satisfies all of them; None where it does not."""
+    """Return the plan without constraints where it satisfies all of them.
+
+    None where it does not.
+    """
     path, limits = path_of(free, case.r0, case.v0), case.limits
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
-    if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
+    if (
+        margins_at(case, path, times[::BETWEEN]).values.min() < 0.0
+    ):  # few instants show most violations
         return None
     if limits.accel_axes_mps2 is not None and not case.within_axes(path.thrust(times)):
         return None
@@ -183,7 +208,9 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     worst, name = worst_margin(case, found)
     return Plan(
         t_ns=t_ns,
-        status=PlanStatus.OPTIMAL if found.t_go_s - free.lower_bound_s <= SAME_TIME_S else PlanStatus.FEASIBLE,
+        status=PlanStatus.OPTIMAL
+        if found.t_go_s - free.lower_bound_s <= SAME_TIME_S
+        else PlanStatus.FEASIBLE,
         t_go_s=found.t_go_s,
         costate=np.full(6, math.nan),
         a_max=case.a_max,
@@ -200,34 +227,50 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     )
 
 
-def _best_path(case: Case, free: Plan, unbound: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
-    """Return the earliest capture found: that of a warm start where it converges to about the same end time.
+def _best_path(
+    case: Case, free: Plan, unbound: Plan, warm: tuple[RobotPath, float] | None
+) -> StepPath | None:
+    """Return the earliest capture found: that of a warm start where it converges to about the same
+    end time.
 
-    Otherwise all initial paths are searched. Where the earliest capture allowed is before that of every draft, the
-    search without this bound, from the unconstrained plan ``unbound``, has the better initial paths.
+    Otherwise all initial paths are searched. Where the earliest capture allowed is before that of
+    every draft, the search without this bound, from the unconstrained plan ``unbound``, has the
+    better initial paths.
     """
     best: StepPath | None = None
     if warm is not None:
         again = shortened(case, *warm)
         best = _refined(again, *warm, rough=True)
-        if best is not None and best.t_go_s <= LATER * max(expected_s(case, *warm), case.earliest_s) + LATER_S:
+        if (
+            best is not None
+            and best.t_go_s <= LATER * max(expected_s(case, *warm), case.earliest_s) + LATER_S
+        ):
             return best
-    coarse = replace(case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True)
+    coarse = replace(
+        case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
+    )
     drafts = _drafts(coarse, free)
     if case.earliest_s > 0.0 and (not drafts or drafts[0].t_go_s > case.earliest_s + SAME_TIME_S):
-        other = _best_path(replace(case, earliest_s=0.0, sampled=case.sampled.anew()), unbound, unbound, None)
+        other = _best_path(
+            replace(case, earliest_s=0.0, sampled=case.sampled.anew()), unbound, unbound, None
+        )
         if other is not None and other.t_go_s >= case.earliest_s:
             return other
     best = _improved(case, coarse, drafts, best)
     if drafts and best is None:
-        near = sorted(initial_references(case, free), key=lambda reference: abs(reference.t - drafts[0].t_go_s))
+        near = sorted(
+            initial_references(case, free),
+            key=lambda reference: abs(reference.t - drafts[0].t_go_s),
+        )
         for reference in near[:RETRIED]:
             best = best or _converged(case, reference)
     return best if best is None else _moved(case, best)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
-    """Return the different captures found on the coarse grid from the initial paths, in the order of their arrival."""
+    """Return the different captures found on the coarse grid from the initial paths, in the order
+    of their arrival.
+    """
     drafts, earliest_s = list[StepPath](), math.inf
     for reference in initial_references(coarse, free):
         draft = _converged(coarse, reference, 1.1 * earliest_s)
@@ -239,13 +282,23 @@ def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
     return _different(drafts)
 
 
-def _improved(case: Case, coarse: Case, drafts: list[StepPath], best: StepPath | None) -> StepPath | None:
-    """Return the earliest of ``best`` and of the drafts, which are refined in the order of their arrival."""
+def _improved(
+    case: Case, coarse: Case, drafts: list[StepPath], best: StepPath | None
+) -> StepPath | None:
+    """Return the earliest of ``best`` and of the drafts, which are refined in the order of their
+    arrival.
+    """
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
     for draft in sorted(drafts, key=_duration):
         for trust in (TRUST, CAREFUL):
-            if best is None or best.t_go_s > (draft.t_go_s if trust == TRUST else LATER * draft.t_go_s):
-                best = min(filter(None, (best, _refined(case, draft, trust=trust))), key=_duration, default=None)
+            if best is None or best.t_go_s > (
+                draft.t_go_s if trust == TRUST else LATER * draft.t_go_s
+            ):
+                best = min(
+                    filter(None, (best, _refined(case, draft, trust=trust))),
+                    key=_duration,
+                    default=None,
+                )
     return best
 
 
@@ -253,7 +306,9 @@ _duration = attrgetter("t_go_s")
 
 
 def _different(drafts: list[StepPath]) -> list[StepPath]:
-    """Return the drafts in the order of their end times without those that are the same local minimum."""
+    """Return the drafts in the order of their end times without those that are the same local
+    minimum.
+    """
     out: list[StepPath] = []
     for draft in sorted(drafts, key=_duration):
         if not out or draft.t_go_s - out[-1].t_go_s > SAME_PATH * draft.t_go_s:
@@ -262,10 +317,11 @@ def _different(drafts: list[StepPath]) -> list[StepPath]:
 
 
 def _moved(case: Case, path: StepPath) -> StepPath:
-    """Return a path with the entry into cone or corridor moved as long as the capture becomes earlier.
+    """Return a path with the entry into cone or corridor moved as long as the capture becomes
+    earlier.
 
-    The alternative that is required at an instant follows from the reference, so that the iterations alone cannot move
-    the entry by more than they move the path.
+    The alternative that is required at an instant follows from the reference, so that the
+    iterations alone cannot move the entry by more than they move the path.
     """
     at_bound = path.t_go_s <= case.earliest_s + SAME_TIME_S
     if at_bound or (case.limits.cone_deg is None and case.limits.final_deg is None):
@@ -307,15 +363,22 @@ def _converged(
     rough: bool = False,
     rows: tuple[PointRows, ...] = (),
 ) -> StepPath | None:
-    """Iterate from a reference until the end time converges; return the earliest feasible path seen.
+    """Iterate from a reference until the end time converges; return the earliest feasible path
+    seen.
 
-    The iterations end without a result where the end time remains later than ``latest_s``. The first iteration requires
-    ``rows``, the aborts of an earlier path.
+    The iterations end without a result where the end time remains later than ``latest_s``. The
+    first iteration requires ``rows``, the aborts of an earlier path.
     """
     best: StepPath | None = None
-    n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
+    n, tolerance = (
+        case.limits.nodes,
+        ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE,
+    )
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
-    off, gain = np.zeros((2 * n, len(CONSTRAINTS))), np.array(0.6)  # doubled where an excess remains: it reacts weakly
+    off, gain = (
+        np.zeros((2 * n, len(CONSTRAINTS))),
+        np.array(0.6),
+    )  # doubled where an excess remains: it reacts weakly
     change, slack, settled = largest_change(case, reference, trust), math.inf, 0
     for iteration in range(ITERATIONS):
         found = solve(convex_subproblem(case, reference, off, change, rows))
@@ -345,6 +408,11 @@ def _converged(
         elif abs(t - reference.t) <= NEAR_REFERENCE * t:
             gain = np.where(over > 0.0, np.minimum(2.0 * gain, 4.8), 0.6)
             off += gain * over + np.where(over > 0.0, case.buffer_m, 0.0)
-        slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
-        change = max(0.5 * change, 1e-3) if iteration >= 6 else largest_change(case, reference, trust)
+        slack, reference = (
+            found.slack,
+            ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0]),
+        )
+        change = (
+            max(0.5 * change, 1e-3) if iteration >= 6 else largest_change(case, reference, trust)
+        )
     return best

@@ -1,4 +1,6 @@
-"""Reference paths, the linearisation of the constraints about one, and the check of the true constraints."""
+"""Reference paths, the linearisation of the constraints about one, and the check of the true
+constraints.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,15 @@ from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan import _cone
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
-from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, Scene, in_fixture_axes, margins
+from avsreplay.plan.limits import (
+    CONSTRAINTS,
+    THRUST_SHARE,
+    Case,
+    Margins,
+    Scene,
+    in_fixture_axes,
+    margins,
+)
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.robot import Limits
 
@@ -23,8 +33,12 @@ COARSE_NODES = 16  # least number of thrust intervals while initial paths are co
 COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
-RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
-FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
+RESERVE = (
+    3.0  # margin at the checked instants in units of the buffer, for the instants between them
+)
+# a constraint with a larger margin at the reference, in units of the buffer, is left out of the
+# programme
+FAR = 2e4
 ABORT_S = 30.0  # duration of an abort
 ABORTS = 16  # instants at which an abort is tried
 TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the grasp point
@@ -33,7 +47,10 @@ LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fr
 
 @value_class
 class ReferencePath:
-    """A path to linearise about: thrust time t [s] and positions (2 n, 3) at the middle and end of every interval."""
+    """A path to linearise about.
+
+    Thrust time t [s] and positions (2 n, 3) at the middle and end of every interval.
+    """
 
     t: float
     r: Array
@@ -51,13 +68,20 @@ def turn_rate(case: Case, t: float) -> float:
 
 
 def coarse_nodes(case: Case, least_s: float) -> int:
-    """Return the number of intervals while initial paths are compared, for flights of at least a time [s]."""
+    """Return the number of intervals while initial paths are compared, for flights of at least a
+    time [s].
+    """
     t = max(least_s, case.earliest_s)
-    return min(max(COARSE_NODES, math.ceil(turn_rate(case, t) * t / COARSE_TURN_RAD)), case.limits.nodes)
+    return min(
+        max(COARSE_NODES, math.ceil(turn_rate(case, t) * t / COARSE_TURN_RAD)), case.limits.nodes
+    )
 
 
 def initial_references(case: Case, free: Plan) -> list[ReferencePath]:
-    """Initial paths: the free plan, then flights to a point on the fixture's axis and along the axis, ever later."""
+    """Initial paths.
+
+    The free plan, then flights to a point on the fixture's axis and along the axis, ever later.
+    """
     s, wait, least = interval_fractions(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
     out = [ReferencePath(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
     if not case.limits.geometric:
@@ -72,10 +96,15 @@ def initial_references(case: Case, free: Plan) -> list[ReferencePath]:
 
 
 def _via_axis(case: Case, t: float, s: Array) -> Array:
-    """Positions (2 n, 3) of a flight around the target to the fixture's axis, then along it to the goal."""
+    """Positions (2 n, 3) of a flight around the target to the fixture's axis, then along it to the
+    goal.
+    """
     scene, limits = case.scene, case.limits
     axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
-    ranges = [limits.cone_range_m if limits.cone_deg else 0.0, limits.final_range_m if limits.final_deg else 0.0]
+    ranges = [
+        limits.cone_range_m if limits.cone_deg else 0.0,
+        limits.final_range_m if limits.final_deg else 0.0,
+    ]
     length = 1.05 * max(*(r or 0.0 for r in ranges), limits.mouth_m or 0.0)
     last_s = min(1.4 * math.sqrt(2.0 * length / case.params.a_max_mps2), 0.6 * t)
     times = case.wait_s + t * s
@@ -93,7 +122,9 @@ def _via_axis(case: Case, t: float, s: Array) -> Array:
 
 
 def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_]) -> Array:
-    """Move the points (n, 3) that lie inside the sphere around the target outward onto it, where ``free``."""
+    """Move the points (n, 3) that lie inside the sphere around the target outward onto it, where
+    ``free``.
+    """
     limits, scene = case.limits, case.scene
     centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
     radius = limits.keepout_m or 0.0
@@ -109,7 +140,8 @@ def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_])
 def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
     """Return the rest of an earlier path from ``since_s`` after its begin on as a reference.
 
-    Its end is moved to the grasp point, as the estimate has changed since, and its begin to the robot.
+    Its end is moved to the grasp point, as the estimate has changed since, and its begin to the
+    robot.
     """
     t, s = max(path.t_go_s - since_s - case.wait_s, 1e-3), interval_fractions(case.limits.nodes)
     r = path.at(since_s + case.wait_s + t * np.concatenate([[0.0], s]))[0]
@@ -119,7 +151,10 @@ def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath
 
 
 def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
-    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
+    """Return the case with the interval length of an earlier path.
+
+    The rest of its flight needs fewer intervals.
+    """
     if not isinstance(path, StepPath):
         return case
     left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
@@ -128,13 +163,19 @@ def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
 
 
 def expected_s(case: Case, path: RobotPath, since_s: float) -> float:
-    """Return the time to go expected from an earlier path: what is left of it, all of it for a robot off it."""
+    """Return the time to go expected from an earlier path.
+
+    What is left of it, all of it for a robot off it.
+    """
     away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
     return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
 
 
 def largest_change(case: Case, reference: ReferencePath, most: float) -> float:
-    """Return the largest relative change of the end time, at most ``most``: the target may turn by TURN_RAD."""
+    """Return the largest relative change of the end time, at most ``most``.
+
+    The target may turn by TURN_RAD.
+    """
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
     return float(min(most, TURN_RAD / max(turn, 1e-9)))
 
@@ -154,7 +195,9 @@ def margins_at(case: Case, path: RobotPath, times: Array) -> Margins:
 
 
 def entry_fractions(case: Case, path: RobotPath) -> tuple[float, float]:
-    """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
+    """Return the fractions of a flight from which it stays inside the cone and the corridor, each
+    from its range on.
+    """
     s = interval_fractions(case.limits.nodes)
     times = case.wait_s + (path.t_go_s - case.wait_s) * s
     inside = margins_at(case, path, times).inside
@@ -179,7 +222,9 @@ def excess(case: Case, path: StepPath) -> Array:
 
 
 def worst_margin(case: Case, path: RobotPath) -> tuple[float, str]:
-    """Return the smallest margin along a path and the constraint that has it, "" without geometric constraints."""
+    """Return the smallest margin along a path and the constraint that has it, "" without geometric
+    constraints.
+    """
     if not case.limits.geometric:
         return math.inf, ""
     values = dense_margins(case, path)[1].between
@@ -188,20 +233,29 @@ def worst_margin(case: Case, path: RobotPath) -> tuple[float, str]:
 
 
 def feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
-    """Return whether a path ends at the grasp point in time and its excess ``over`` is allowed [m]."""
+    """Return whether a path ends at the grasp point in time and its excess ``over`` is
+    allowed [m].
+    """
     position, velocity = path.terminal_errors(case.scene.goal)
     short = path.t_go_s <= case.params.horizon_s
-    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and case.within_axes(path.u)
+    exact = (
+        position <= 1e-8
+        and velocity <= 1e-8
+        and path.u_max() <= case.a_max
+        and case.within_axes(path.u)
+    )
     return bool(short and exact and over <= allowed)
 
 
 @value_class
 class Abort:
-    """Aborts from instants of a path outside the corridor: the largest acceleration away from the centre of mass.
+    """Aborts from instants of a path outside the corridor: the largest acceleration away from the
+    centre of mass.
 
     Attributes:
         margin: Smallest margin of the clearance during these aborts [m]; NaN without a clearance.
-        short: By how much it is negative, less what the start itself lacks; 0 where aborts are not required [m].
+        short: By how much it is negative, less what the start itself lacks; 0 where aborts are not
+            required [m].
         rows: Rows that require the margin; empty where they are not needed.
     """
 
@@ -211,7 +265,9 @@ class Abort:
 
 
 def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
-    """Return the aborts from instants of a path later than ``since_s`` after its begin, each with its worst moment."""
+    """Return the aborts from instants of a path later than ``since_s`` after its begin, each with
+    its worst moment.
+    """
     limits, scene = case.limits, case.scene
     if limits.clearance_m is None or scene.surface is None:
         return Abort()
@@ -222,17 +278,23 @@ def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
     if not outside.any():
         return Abort()
     begin, r, v = begin[outside], r[outside], v[outside]
-    away = r - rho[outside] - R[outside] @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
+    away = (
+        r - rho[outside] - R[outside] @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
+    )
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
-    positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
+    positions = (
+        r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
+    )
     times = (begin[:, None] + after[0, :, 0]).ravel()
     rho, R = case.sampled.at(times)
     y = in_fixture_axes(R, positions.reshape(-1, 3) - rho)
     foot, gap = scene.surface(y)
     k = gap.reshape(len(begin), -1).argmin(axis=1) + np.arange(len(begin)) * after.size
     margins_m = gap[k] - limits.clearance_m
-    short = max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
+    short = (
+        max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
+    )
     if not limits.abort:
         return Abort(float(margins_m.min()), short)
     normal = (y[k] - foot[k]) / np.where(np.abs(gap[k]) > 1e-9, gap[k], 1e-9)[:, None]
@@ -244,18 +306,26 @@ def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
     rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
     on = margins_m < FAR * case.buffer_m
     ones = np.ones(int(on.sum()))
-    rows = PointRows(interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], ones, lead[on])
+    rows = PointRows(
+        interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], ones, lead[on]
+    )
     return Abort(float(margins_m.min()), short, (rows,))
 
 
 def allowed(start: Array, fraction: Array) -> Array:
-    """Return the violation that is accepted while the robot returns from a violation at the start."""
+    """Return the violation that is accepted while the robot returns from a violation at the
+    start.
+    """
     shrinking = np.maximum(1.0 - fraction / LEAD_BACK, 0.0)
     return np.asarray(np.maximum(-start, 0.0)[None, :] * shrinking[:, None])
 
 
 def convex_subproblem(
-    case: Case, reference: ReferencePath, off: Array, change: float, aborts: tuple[PointRows, ...] = ()
+    case: Case,
+    reference: ReferencePath,
+    off: Array,
+    change: float,
+    aborts: tuple[PointRows, ...] = (),
 ) -> Subproblem:
     """Return the convex subproblem at a reference, with the rows of aborts from paths near it."""
     n, t = case.limits.nodes, reference.t
@@ -282,11 +352,14 @@ def convex_subproblem(
     return replace(problem, planes=(*aborts, planes), cones=((sizes, cones),))
 
 
-def _geometric(case: Case, reference: ReferencePath, off: Array) -> tuple[PointRows, PointRows, Index]:
-    """Return the rows of the geometric constraints at the middle and the end of every interval, tightened by ``off``.
+def _geometric(
+    case: Case, reference: ReferencePath, off: Array
+) -> tuple[PointRows, PointRows, Index]:
+    """Return the rows of the geometric constraints at the middle and the end of every interval,
+    tightened by ``off``.
 
-    They are planes, and cones with the sizes of their groups. ``off`` grows by the distance of the path in {C} from its
-    chord between two points, less the violation that is accepted at the begin.
+    They are planes, and cones with the sizes of their groups. ``off`` grows by the distance of the
+    path in {C} from its chord between two points, less the violation that is accepted at the begin.
     """
     n, limits, scene = case.limits.nodes, case.limits, case.scene
     s = interval_fractions(n)
@@ -303,23 +376,54 @@ def _geometric(case: Case, reference: ReferencePath, off: Array) -> tuple[PointR
     if case.entry is not None:
         inside[:, 0] = s >= case.entry[0] - 1e-9
         inside[:, 1] = inside[:, 3] = s >= case.entry[1] - 1e-9
-    arrays = (y, dy, reference.r, rho, R, found.first, found.second, off, found.foot, found.distance, found.clearance)
-    values = (*_constraint_values(limits, scene.centre_c is not None), FAR * case.buffer_m, TOWARD_AXIS)
+    arrays = (
+        y,
+        dy,
+        reference.r,
+        rho,
+        R,
+        found.first,
+        found.second,
+        off,
+        found.foot,
+        found.distance,
+        found.clearance,
+    )
+    values = (
+        *_constraint_values(limits, scene.centre_c is not None),
+        FAR * case.buffer_m,
+        TOWARD_AXIS,
+    )
     planes, cones = _cone.rows(*arrays, inside, _frame(scene, limits), values)
     return PointRows(*planes[:-1]), PointRows(*cones[:-1]), cones[-1]
 
 
 def _constraint_values(limits: Limits, centred: bool) -> tuple[float, ...]:
     """Return the limits in the order of the extension; NaN where a constraint is not set."""
-    tangents = (math.nan if a is None else math.tan(math.radians(a)) for a in (limits.cone_deg, limits.final_deg))
+    tangents = (
+        math.nan if a is None else math.tan(math.radians(a))
+        for a in (limits.cone_deg, limits.final_deg)
+    )
     lengths = (limits.cone_range_m, limits.final_range_m, limits.mouth_m)
     keepout = limits.keepout_m if centred else None
-    others = (keepout, limits.keepout_release_m, limits.clearance_m, limits.reach_max_m, limits.reach_min_m)
-    return (*tangents, *(x or 0.0 for x in lengths), *(math.nan if x is None else x for x in others))
+    others = (
+        keepout,
+        limits.keepout_release_m,
+        limits.clearance_m,
+        limits.reach_max_m,
+        limits.reach_min_m,
+    )
+    return (
+        *tangents,
+        *(x or 0.0 for x in lengths),
+        *(math.nan if x is None else x for x in others),
+    )
 
 
 def _frame(scene: Scene, limits: Limits) -> Array:
-    """Return the fixture's axis and two directions across it, the centre of mass in {C}, and the base in {A} (5, 3)."""
+    """Return the fixture's axis and two directions across it, the centre of mass in {C}, and the
+    base in {A} (5, 3).
+    """
     axis = (1.0, 0.0, 0.0) if scene.axis_c is None else tuple(np.asarray(scene.axis_c).tolist())
     centre = np.zeros(3) if scene.centre_c is None else scene.centre_c
     return np.concatenate([_axes(axis), [centre, limits.base_m]])

@@ -1,7 +1,8 @@
 """The robot under guidance: supervisor, planner and path in one state, advanced scan by scan.
 
-``Guidance.step`` receives the estimate after a scan, never the ground truth, and returns the decision, the plan in
-force and the motion of the robot. The robot follows its path exactly; only the target is uncertain.
+``Guidance.step`` receives the estimate after a scan, never the ground truth, and returns the
+decision, the plan in force and the motion of the robot. The robot follows its path exactly; only
+the target is uncertain.
 """
 
 from __future__ import annotations
@@ -26,8 +27,11 @@ from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory, resting
 from avsreplay.records import Forecast
 
-SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
-UNCHANGED = 0.01  # share of the capture tolerance: without a measurement, a plan whose end moved by less is not renewed
+# ratio to the time to go of the latest full search from which on all initial paths are searched
+SEARCH_AGAIN = 1.1
+# share of the capture tolerance: without a measurement, a plan whose end moved by less is not
+# renewed
+UNCHANGED = 0.01
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
@@ -37,10 +41,12 @@ class PlannerInput:
     """Input of guidance after a scan.
 
     Attributes:
-        t_ns: Instant of the scan.  gamma: 1 if it is healthy, else 0.
+        t_ns: Instant of the scan.
+        gamma: 1 if it is healthy, else 0.
         converged: Whether the estimate may be used for planning.
         scene: The target in {A} after t_ns.
-        forecast: Times (n,) [s after t_ns] -> 1 sigma of the grasp point if no further measurement arrives.
+        forecast: Times (n,) [s after t_ns] -> 1 sigma of the grasp point if no further measurement
+            arrives.
     """
 
     t_ns: int
@@ -52,7 +58,8 @@ class PlannerInput:
 
 @value_class
 class Segment:
-    """A path that begins at ``t_ns`` from r0, v0; before that instant the robot flies the segment ``previous``.
+    """A path that begins at ``t_ns`` from r0, v0; before that instant the robot flies the segment
+    ``previous``.
 
     Attributes:
         t_ns: Begin of the segment.
@@ -107,7 +114,8 @@ class GuidanceState:
         decision: The latest decision.
         made_ns: When the latest segment of a hold or retreat was planned.
         captured_ns: When the gripper closed.
-        draft: Segment of the latest capture plan that was found, flown or not; the next plan begins with its path.
+        draft: Segment of the latest capture plan that was found, flown or not; the next plan begins
+            with its path.
     """
 
     segment: Segment
@@ -138,8 +146,8 @@ class Guidance:
             supervisor: Supervisor with resolved parameters.
             limits: Constraints of every capture plan; none where None.
             extent_m: Diagonal of the target's bounding box [m].
-            gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration [rad/s2]; None: the
-                attitude is not planned.
+            gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration
+                [rad/s2]; None: the attitude is not planned.
             arm: Manipulator that must be able to fly the last metres; None without.
         """
         self.gripper, self.arm = gripper, arm
@@ -153,7 +161,9 @@ class Guidance:
             t_ns: Instant of the first scan [ns].
         """
         r0, v0 = np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
-        return GuidanceState(Segment(t_ns, r0, v0, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None))
+        return GuidanceState(
+            Segment(t_ns, r0, v0, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None)
+        )
 
     def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:
         """Apply ``step`` to one input after the other; yields each input and the state after it.
@@ -174,7 +184,8 @@ class Guidance:
             known: What is known after this scan.
 
         Returns:
-            The new state with decision, plan and segment. After the capture the state stays the same.
+            The new state with decision, plan and segment. After the capture the state stays the
+            same.
         """
         if state.captured_ns is not None:
             return state
@@ -189,17 +200,29 @@ class Guidance:
             return self._withdraw(state, known)
         if segment is None:  # the approach resumes between two replanning instants
             plan, segment = self._capture_plan(state, known)
-        return replace(state, plan=plan, segment=segment or state.segment, made_ns=None, draft=segment or state.draft)
+        return replace(
+            state,
+            plan=plan,
+            segment=segment or state.segment,
+            made_ns=None,
+            draft=segment or state.draft,
+        )
 
-    def _replan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan | None, Segment | None]:
-        """Return the capture plan in force, renewed where it is due, and the segment that flies it, if any."""
+    def _replan(
+        self, state: GuidanceState, known: PlannerInput
+    ) -> tuple[Plan | None, Segment | None]:
+        """Return the capture plan in force, renewed where it is due, and the segment that flies it,
+        if any.
+        """
         closing = state.decision.action in _CLOSING
         flown = state.segment if closing else None
         if not known.converged or state.decision.action in (Action.CAPTURE, Action.ABORT):
             return state.plan, flown
         age_s = math.inf if state.plan is None else (known.t_ns - state.plan.t_ns) * 1e-9
         left_s = (state.segment.end_ns - known.t_ns) * 1e-9 if closing else math.inf
-        if not self._due(age_s, left_s) or (flown is not None and self._unchanged(state, flown, known)):
+        if not self._due(age_s, left_s) or (
+            flown is not None and self._unchanged(state, flown, known)
+        ):
             return state.plan, flown
         plan, segment = self._capture_plan(state, known)
         if segment is None and flown is not None and self._still_valid(flown, known):
@@ -207,12 +230,23 @@ class Guidance:
         return plan, segment or flown
 
     def _unchanged(self, state: GuidanceState, flown: Segment, known: PlannerInput) -> bool:
-        """Return whether no measurement was used since the latest plan and the robot has not left its path."""
-        made_s, seen_s = -math.inf if state.plan is None else state.plan.t_ns * 1e-9, state.supervisor.seen_s
-        return known.gamma == 0 and (seen_s or 0.0) <= made_s and self._still_valid(flown, known, UNCHANGED)
+        """Return whether no measurement was used since the latest plan and the robot has not left
+        its path.
+        """
+        made_s, seen_s = (
+            -math.inf if state.plan is None else state.plan.t_ns * 1e-9,
+            state.supervisor.seen_s,
+        )
+        return (
+            known.gamma == 0
+            and (seen_s or 0.0) <= made_s
+            and self._still_valid(flown, known, UNCHANGED)
+        )
 
     def _still_valid(self, flown: Segment, known: PlannerInput, share: float = 1.0) -> bool:
-        """Return whether the end of the segment agrees with the estimate within a share of the capture tolerance."""
+        """Return whether the end of the segment agrees with the estimate within a share of the
+        capture tolerance.
+        """
         left_s = (flown.end_ns - known.t_ns) * 1e-9
         if left_s <= 0.0:
             return False
@@ -223,14 +257,22 @@ class Guidance:
         return near and float(np.linalg.norm(v - rate[0])) <= share * (p.capture_speed_mps or 0.0)
 
     def _due(self, age_s: float, left_s: float) -> bool:
-        """Return whether to replan: at the period, at every scan near the end, not where a plan would come too late."""
-        near = left_s <= 2.0 * self.supervisor.params.commit_s
-        return (age_s >= self.params.replan_period_s - 1e-6 or near) and left_s > self.params.latency_s
+        """Return whether to replan.
 
-    def _capture_plan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan, Segment | None]:
+        At the period, at every scan near the end, not where a plan would come too late.
+        """
+        near = left_s <= 2.0 * self.supervisor.params.commit_s
+        return (
+            age_s >= self.params.replan_period_s - 1e-6 or near
+        ) and left_s > self.params.latency_s
+
+    def _capture_plan(
+        self, state: GuidanceState, known: PlannerInput
+    ) -> tuple[Plan, Segment | None]:
         """Plan the capture under the limits; the path of the latest plan is the first initial path.
 
-        All initial paths are searched where there is none, or where the time to go exceeds that of the latest search.
+        All initial paths are searched where there is none, or where the time to go exceeds that of
+        the latest search.
         """
         segment, draft, turn = state.segment, state.draft, self._turn(state.segment, known)
         if isinstance(turn, Plan):
@@ -242,7 +284,9 @@ class Guidance:
             nonlocal searched_s
             if draft is not None and draft.path is not None:
                 since_s = (known.t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
-                plan = constrained(*problem, warm=(draft.path, max(since_s, 0.0)), earliest_s=earliest_s)
+                plan = constrained(
+                    *problem, warm=(draft.path, max(since_s, 0.0)), earliest_s=earliest_s
+                )
                 if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
                     return plan
             plan = constrained(*problem, earliest_s=earliest_s)
@@ -252,14 +296,20 @@ class Guidance:
         def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
             if self.arm is None:
                 return search((scene, r0, v0, params, self.limits, t_ns), earliest_s)
-            delayed = draft is not None and state.plan is not None and state.plan.delayed_by == "arm"
-            hint_s = (draft.end_ns - t_ns) * 1e-9 - self.params.latency_s if draft and delayed else 0.0
+            delayed = (
+                draft is not None and state.plan is not None and state.plan.delayed_by == "arm"
+            )
+            hint_s = (
+                (draft.end_ns - t_ns) * 1e-9 - self.params.latency_s if draft and delayed else 0.0
+            )
 
             def make(after_s: float, share: float) -> Plan:
                 return search((scene, r0, v0, *slowed(params, self.limits, share), t_ns), after_s)
 
             path = partial(path_of, r0=r0, v0=v0)
-            return self.arm.fitted(make, path, scene, self.limits, earliest_s, params.horizon_s, hint_s)[0]
+            return self.arm.fitted(
+                make, path, scene, self.limits, earliest_s, params.horizon_s, hint_s
+            )[0]
 
         plan, made = self._plan(segment, known.scene, known.t_ns, planner)
         if made is None:
@@ -268,18 +318,23 @@ class Guidance:
         return (plan if turn is None else with_turn(plan, earliest_s + self.params.latency_s)), made
 
     def _turn(self, segment: Segment, known: PlannerInput) -> Turn | Plan | None:
-        """Return the next turn of the gripper, the answer where none was found, or None where it is not planned."""
+        """Return the next turn of the gripper, the answer where none was found, or None where it is
+        not planned.
+        """
         if self.gripper is None or segment.turn is None or known.scene.attitude is None:
             return None
         problem = (segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
         return next_turn(*problem) or without_turn(*problem)
 
-    def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
+    def _plan(
+        self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner
+    ) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""
         wait_s = self.params.latency_s
         begin_ns = t_ns + round(wait_s * 1e9)
         r0, v0 = segment.at(begin_ns)
-        # the robot flies the current segment during the latency, so the planner starts at its end without latency
+        # the robot flies the current segment during the latency, so the planner starts at its end
+        # without latency
         late = replace(self.params, latency_s=0.0)
         plan = planner(scene.after(wait_s) if wait_s else scene, r0, v0, late, t_ns)
         if not plan.found:
@@ -288,7 +343,9 @@ class Guidance:
         made = Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous, turn=segment.turn)
         return _counted_from_planning(plan, wait_s), made
 
-    def _facts(self, state: GuidanceState, known: PlannerInput, plan: Plan | None, segment: Segment | None) -> Facts:
+    def _facts(
+        self, state: GuidanceState, known: PlannerInput, plan: Plan | None, segment: Segment | None
+    ) -> Facts:
         planned = plan is not None and plan.found
         t_go = _left_s(plan, segment, known.t_ns)
         sigma = known.forecast(np.array([0.0, t_go]) if planned else np.array([0.0]))
@@ -308,22 +365,41 @@ class Guidance:
         )
 
     def _withdraw(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
-        """Fly a hold, a retreat or an abort. Hold and retreat are replanned at the replanning period."""
+        """Fly a hold, a retreat or an abort.
+
+        Hold and retreat are replanned at the replanning period.
+        """
         action = state.decision.action
-        due = state.made_ns is None or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
-        if action is Action.STAND_STILL or not due or (action is Action.ABORT and state.made_ns is not None):
+        due = (
+            state.made_ns is None
+            or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
+        )
+        if (
+            action is Action.STAND_STILL
+            or not due
+            or (action is Action.ABORT and state.made_ns is not None)
+        ):
             return state
         p, moving = self.supervisor.params, state.segment.at(known.t_ns)
         least_m = (p.standoff_m if action is Action.HOLD else p.retreat_m) or 0.0
         refuge = resting(known.scene, *moving, least_m, self.params.a_max_mps2)
-        _, segment = self._plan(state.segment, refuge, known.t_ns, lambda s, *rest: rendezvous(s.goal, *rest))
+        _, segment = self._plan(
+            state.segment, refuge, known.t_ns, lambda s, *rest: rendezvous(s.goal, *rest)
+        )
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
 
     def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:
-        """Return the margin of the constraints; what the plan in force itself violates at its start is accepted."""
+        """Return the margin of the constraints.
+
+        What the plan in force itself violates at its start is accepted.
+        """
         if not self.limits.any:
             return 1.0
-        accepted = 0.0 if state.plan is None or math.isnan(state.plan.violation_m) else state.plan.violation_m
+        accepted = (
+            0.0
+            if state.plan is None or math.isnan(state.plan.violation_m)
+            else state.plan.violation_m
+        )
         return margin(scene, self.limits, r, v) + accepted
 
 
@@ -332,10 +408,15 @@ _Planner = Callable[[Scene, Array, Array, PlanParams, int], Plan]
 
 
 def _left_s(plan: Plan | None, segment: Segment | None, t_ns: int) -> float:
-    """Return the time to the end of the segment, else of the plan [s], at least 0; NaN without a plan."""
+    """Return the time to the end of the segment, else of the plan [s], at least 0.
+
+    NaN without a plan.
+    """
     if plan is None or not plan.found:
         return math.nan
-    return max((segment.end_ns - t_ns) * 1e-9 if segment else plan.t_go_s - (t_ns - plan.t_ns) * 1e-9, 0.0)
+    return max(
+        (segment.end_ns - t_ns) * 1e-9 if segment else plan.t_go_s - (t_ns - plan.t_ns) * 1e-9, 0.0
+    )
 
 
 def _counted_from_planning(plan: Plan, wait_s: float) -> Plan:

@@ -1,4 +1,6 @@
-"""The joints of a manipulator during the last metres of a plan, the use of their limits, and the reach of its links."""
+"""The joints of a manipulator during the last metres of a plan, the use of their limits, and the
+reach of its links.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,14 @@ class JointPath:
     """The joints during the last metres of a plan.
 
     Attributes:
-        times: (n,) instants [s after the instant of planning]; fewer than INSTANTS where the path is not complete.
+        times: (n,) instants [s after the instant of planning]; fewer than INSTANTS where the path
+            is not complete.
         joints: (n, k) joint positions [rad or m].
         length_m: Length of the end-effector's path that the joints follow [m].
         complete: Whether this is all of the last metres.
         condition: Largest condition number of the Jacobian.
-        range_share, rate_share, torque_share: Largest use of the limits of joint range, rate and torque, 1 at the
-            limit; NaN where the URDF has none.
+        range_share, rate_share, torque_share: Largest use of the limits of joint range, rate and
+            torque, 1 at the limit; NaN where the URDF has none.
     """
 
     times: Array
@@ -47,15 +50,32 @@ class JointPath:
 
     @property
     def slower(self) -> float:
-        """Share of the acceleration with which rates and torques may fit; 1 where another limit is exceeded."""
+        """Share of the acceleration with which rates and torques may fit.
+
+        1 where another limit is exceeded.
+        """
         inside = self.complete and not self.range_share > 1.0 + 1e-9
-        rate, torque = (x if math.isfinite(x) else 0.0 for x in (self.rate_share, self.torque_share))
+        rate, torque = (
+            x if math.isfinite(x) else 0.0 for x in (self.rate_share, self.torque_share)
+        )
         return min(1.0, 0.9 / max(torque, rate * rate, 0.9)) if inside else 1.0
 
     def record(self) -> dict[str, object]:
         """Return the path and its figures for a JSON document."""
-        names = ("length_m", "complete", "possible", "condition", "range_share", "rate_share", "torque_share")
-        return {**{n: getattr(self, n) for n in names}, "t_s": self.times.tolist(), "joints": self.joints.tolist()}
+        names = (
+            "length_m",
+            "complete",
+            "possible",
+            "condition",
+            "range_share",
+            "rate_share",
+            "torque_share",
+        )
+        return {
+            **{n: getattr(self, n) for n in names},
+            "t_s": self.times.tolist(),
+            "joints": self.joints.tolist(),
+        }
 
     def described(self) -> list[tuple[str, str]]:
         """Return what is known about the arm as a name and a text."""
@@ -63,10 +83,20 @@ class JointPath:
             return [("arm", "cannot reach the pose of the capture")]
         used = ", ".join(
             f"{name} {100.0 * share:.0f} %"
-            for name, share in (("range", self.range_share), ("rate", self.rate_share), ("torque", self.torque_share))
+            for name, share in (
+                ("range", self.range_share),
+                ("rate", self.rate_share),
+                ("torque", self.torque_share),
+            )
             if math.isfinite(share)
         )
-        verdict = "can follow" if self.possible else "cannot follow" if self.complete else "loses the path in"
+        verdict = (
+            "can follow"
+            if self.possible
+            else "cannot follow"
+            if self.complete
+            else "loses the path in"
+        )
         text = f"{verdict} the last metres ({self.length_m:.2f} m in joints): {used} of the limits"
         return [("arm", f"{text}; condition {self.condition:.0f}")]
 
@@ -83,7 +113,8 @@ def share_of(values: Array, limits: Array) -> float:
 
 
 def last_metres_s(path: RobotPath, scene: Scene, limits: Limits) -> float:
-    """Return the instant at which the last metres of a plan begin, the length of the corridor before the capture [s].
+    """Return the instant at which the last metres of a plan begin, the length of the corridor
+    before the capture [s].
 
     Args:
         path: Path of the end-effector in {A}.
@@ -97,7 +128,8 @@ def last_metres_s(path: RobotPath, scene: Scene, limits: Limits) -> float:
 
 
 def sum_of_links(model: Any, frame: int) -> float:
-    """Return an upper bound of the distance from the base to the gripper: the sum of the lengths of all links [m].
+    """Return an upper bound of the distance from the base to the gripper: the sum of the lengths of
+    all links [m].
 
     Args:
         model: Model of the manipulator.
@@ -115,10 +147,12 @@ def sum_of_links(model: Any, frame: int) -> float:
 
 
 def shoulder_and_wrist(pin: Any, model: Any, data: Any, frame: int) -> tuple[Array, Array, float]:
-    """Return shoulder (3,), wrist (3,) and the largest distance between them [m], the same for all joint positions.
+    """Return shoulder (3,), wrist (3,) and the largest distance between them [m], the same for all
+    joint positions.
 
-    The shoulder is given in the frame of the base, the wrist in that of the gripper. They are the origins of the
-    first and the last joint, or of the ones next to them where the offset lies on the axis of rotation.
+    The shoulder is given in the frame of the base, the wrist in that of the gripper. They are the
+    origins of the first and the last joint, or of the ones next to them where the offset lies on
+    the axis of rotation.
 
     Args:
         pin: The module pinocchio.
@@ -130,7 +164,9 @@ def shoulder_and_wrist(pin: Any, model: Any, data: Any, frame: int) -> tuple[Arr
     while model.parents[chain[0]] > 0:
         chain.insert(0, int(model.parents[chain[0]]))
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    axes = [pin.getJointJacobian(model, data, j, pin.LOCAL)[:, model.joints[j].idx_v] for j in chain]
+    axes = [
+        pin.getJointJacobian(model, data, j, pin.LOCAL)[:, model.joints[j].idx_v] for j in chain
+    ]
     if len(chain) < 4 or any(np.linalg.norm(axis[3:]) < 0.5 for axis in axes):  # a prismatic joint
         return np.zeros(3), np.zeros(3), sum_of_links(model, frame)
     place = model.jointPlacements

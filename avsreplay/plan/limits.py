@@ -1,7 +1,8 @@
 """Constraints of the approach, and the target as the planner uses it.
 
-The constraints in the fixture's frame {C} are the approach cone (line of sight), the corridor of the last metres, a
-sphere about the centre of mass and the clearance to the surface. A robot at r has y = R_ac' (r - rho) in {C}.
+The constraints in the fixture's frame {C} are the approach cone (line of sight), the corridor of
+the last metres, a sphere about the centre of mass and the clearance to the surface. A robot at r
+has y = R_ac' (r - rho) in {C}.
 """
 
 from __future__ import annotations
@@ -22,8 +23,16 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.records import Trajectory
 
-THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the cone programme; the rest corrects the terminal errors
-CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")  # in the order of the columns of ``margins``
+THRUST_SHARE = (
+    1.0 - 1e-5
+)  # share of a_max used by the cone programme; the rest corrects the terminal errors
+CONSTRAINTS = (
+    "cone",
+    "corridor",
+    "sphere",
+    "body",
+    "workspace",
+)  # in the order of the columns of ``margins``
 
 
 @value_class
@@ -32,12 +41,16 @@ class Scene:
 
     Attributes:
         goal: Trajectory of the grasp point, the origin of {C}, in {A}.
-        attitude: Times (n,) [s] -> q_ac (n, 4) of the fixture; None where only speed and contact are limited.
+        attitude: Times (n,) [s] -> q_ac (n, 4) of the fixture; None where only speed and contact
+            are limited.
         axis_c: (3,) outward axis of the fixture in {C}, unit; cone and corridor open along it.
         centre_c: (3,) centre of mass in {C} [m], the centre of the sphere; None where unknown.
-        surface: Points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see ``Margins``); None: unknown.
-        sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad] of {C}, each (n,).
-        hull_c: (n, 3) points in {C} with the same convex hull as the target's surface [m]; None: unknown.
+        surface: Points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see
+            ``Margins``); None: unknown.
+        sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad]
+            of {C}, each (n,).
+        hull_c: (n, 3) points in {C} with the same convex hull as the target's surface [m]; None:
+            unknown.
     """
 
     goal: Trajectory
@@ -50,7 +63,9 @@ class Scene:
 
     @property
     def radius_m(self) -> float:
-        """Radius of the sphere about the centre of mass that contains the target in every attitude [m]; 0: unknown."""
+        """Radius of the sphere about the centre of mass that contains the target in every attitude
+        [m]; 0: unknown.
+        """
         if self.hull_c is None or self.centre_c is None:
             return 0.0
         return float(np.sqrt(np.max(np.sum((self.hull_c - self.centre_c) ** 2, axis=1))))
@@ -87,22 +102,33 @@ class Scene:
             limits: Resolved limits.
 
         Raises:
-            ValueError: Something is missing, or ``keepout_m`` is too large to reach the grasp point.
+            ValueError: Something is missing, or ``keepout_m`` is too large to reach the grasp
+                point.
         """
         if limits.geometric and self.attitude is None:
-            raise ValueError("cone, corridor, sphere and clearance need the fixture's attitude, and the scene has none")
+            raise ValueError(
+                "cone, corridor, sphere and clearance need the fixture's attitude, and the scene"
+                " has none"
+            )
         if self.axis_c is None and (limits.cone_deg is not None or limits.final_deg is not None):
-            raise ValueError("cone_deg and final_deg need the fixture's axis, and the scene has none")
+            raise ValueError(
+                "cone_deg and final_deg need the fixture's axis, and the scene has none"
+            )
         if limits.clearance_m is not None and self.surface is None:
             raise ValueError("clearance_m needs the target's surface, and the scene has none")
         if limits.clearance_m is not None and limits.final_deg is None:
-            raise ValueError("clearance_m needs final_deg: contact is possible only inside the corridor")
+            raise ValueError(
+                "clearance_m needs final_deg: contact is possible only inside the corridor"
+            )
         if limits.keepout_m is not None:
             if self.centre_c is None:
                 raise ValueError("keepout_m needs the mass centre, and the scene has none")
             most = float(np.linalg.norm(self.centre_c)) + (limits.keepout_release_m or 0.0)
             if limits.keepout_m >= most:
-                raise ValueError(f"keepout_m is {limits.keepout_m}, must be below {most:.3f} to leave the grasp point")
+                raise ValueError(
+                    f"keepout_m is {limits.keepout_m}, must be below {most:.3f} to leave the grasp"
+                    " point"
+                )
 
 
 @value_class
@@ -121,7 +147,8 @@ class TargetGeometry:
 
 
 def hull_vertices(vertices: Array) -> Array:
-    """Return the vertices (m, 3) of the convex hull of points, or the points if they are few or have no hull.
+    """Return the vertices (m, 3) of the convex hull of points, or the points if they are few or
+    have no hull.
 
     Args:
         vertices: (n, 3) points in any frame.
@@ -136,15 +163,20 @@ def hull_vertices(vertices: Array) -> Array:
 
 @value_class
 class Margins:
-    """Margins of the geometric constraints at n points; a constraint holds where its margin is not negative.
+    """Margins of the geometric constraints at n points; a constraint holds where its margin is not
+    negative.
 
     Attributes:
-        first: (n, 5) margins of the first alternatives in the order of ``CONSTRAINTS`` [m]: inside the cone, inside the
-            corridor, within the release distance of the sphere, inside the corridor instead of at the clearance.
-        second: (n, 5) margins of the others [m], infinite where off: outside the range of the cone, outside that of the
-            corridor, outside the sphere, at the clearance, inside the workspace.
-        foot: (n, 3) closest points of the surface in {C} [m].  clearance: (n,) required clearance [m].
-        distance: (n,) signed distance to the surface [m], negative inside, infinite where far or not required.
+        first: (n, 5) margins of the first alternatives in the order of ``CONSTRAINTS`` [m]: inside
+            the cone, inside the corridor, within the release distance of the sphere, inside the
+            corridor instead of at the clearance.
+        second: (n, 5) margins of the others [m], infinite where off: outside the range of the cone,
+            outside that of the corridor, outside the sphere, at the clearance, inside the
+            workspace.
+        foot: (n, 3) closest points of the surface in {C} [m].
+        clearance: (n,) required clearance [m].
+        distance: (n,) signed distance to the surface [m], negative inside, infinite where far or
+            not required.
     """
 
     first: Array
@@ -165,7 +197,10 @@ class Margins:
 
     @property
     def between(self) -> Array:
-        """Margins (n - 1, 5) between consecutive points: where the alternatives change, that of the crossing."""
+        """Margins (n - 1, 5) between consecutive points.
+
+        Where the alternatives change, that of the crossing.
+        """
         difference = self.first - self.second
         with np.errstate(invalid="ignore", divide="ignore"):
             share = difference[:-1] / (difference[:-1] - difference[1:])
@@ -175,7 +210,9 @@ class Margins:
         return np.where(changes & np.isfinite(crossing), np.minimum(least, crossing), least)
 
 
-def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array, Array] | None = None) -> Margins:
+def margins(
+    scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array, Array] | None = None
+) -> Margins:
     """Evaluate the geometric constraints; ``Margins`` states the two alternatives of each.
 
     Args:
@@ -188,11 +225,18 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
     n, distance = len(y), np.linalg.norm(y, axis=1)
     first, second = np.full((n, 5), -math.inf), np.full((n, 5), math.inf)
     foot, gap, clearance = np.zeros((n, 3)), np.full(n, math.inf), np.zeros(n)
-    mouth, reach, corridor = limits.mouth_m or 0.0, limits.final_range_m or 0.0, np.full(n, -math.inf)
+    mouth, reach, corridor = (
+        limits.mouth_m or 0.0,
+        limits.final_range_m or 0.0,
+        np.full(n, -math.inf),
+    )
     if scene.axis_c is not None:
         along = y @ scene.axis_c
         across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
-        for i, degrees, length in ((0, limits.cone_deg, limits.cone_range_m or 0.0), (1, limits.final_deg, reach)):
+        for i, degrees, length in (
+            (0, limits.cone_deg, limits.cone_range_m or 0.0),
+            (1, limits.final_deg, reach),
+        ):
             if degrees is not None:
                 within = math.tan(math.radians(degrees)) * along + mouth - across
                 first[:, i], second[:, i] = within, distance - length
@@ -214,11 +258,13 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
 
 
 def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
-    """Return the smallest margin for a robot now [m or m/s]: negative if a constraint is violated, infinite without.
+    """Return the smallest margin for a robot now [m or m/s]: negative if a constraint is violated,
+    infinite without.
 
     Args:
         scene: The target.
-        limits: Resolved limits. As estimates change, lengths are extended by ``mouth_m`` and the speed by a twentieth.
+        limits: Resolved limits. As estimates change, lengths are extended by ``mouth_m`` and the
+            speed by a twentieth.
         r: (3,) position of the robot in {A} [m].
         v: (3,) its velocity [m/s].
     """
@@ -242,7 +288,10 @@ def in_fixture_axes(R: Array, vectors: Array) -> Array:
 
 
 class SampledScene:
-    """Motion of {C} sampled on a grid and interpolated by cubic splines; the grid is extended when needed."""
+    """Motion of {C} sampled on a grid and interpolated by cubic splines.
+
+    The grid is extended when needed.
+    """
 
     def __init__(self, scene: Scene, horizon_s: float, step_s: float, span_s: float) -> None:
         self.scene, self._horizon_s, self._step_s, self._span_s = scene, horizon_s, step_s, span_s
@@ -254,7 +303,9 @@ class SampledScene:
         return SampledScene(self.scene, self._horizon_s, self._step_s, self._span_s)
 
     def at(self, times: Array, order: int = 0) -> tuple[Array, Array]:
-        """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,) [s]."""
+        """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,)
+        [s].
+        """
         last = float(times.max())
         if last > self._end_s:
             self._end_s = min(max(1.5 * last, self._span_s), max(self._horizon_s, last))
@@ -267,7 +318,10 @@ class SampledScene:
         return in_fixture_axes(R, r - rho)
 
     def sigma(self, times: Array) -> tuple[Array, Array] | None:
-        """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None where unknown."""
+        """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,).
+
+        None where unknown.
+        """
         if self.scene.sigma is None:
             return None
         if self._sigma is None:
@@ -289,8 +343,10 @@ class Case:
     """Everything that does not change with the reference.
 
     Attributes:
-        entry: Fractions of the flight from which the cone and the corridor are required; None: the reference decides.
-        begin_c: (3,) position in {C} where the thrust begins.  start: (5,) margins there.
+        entry: Fractions of the flight from which the cone and the corridor are required; None: the
+            reference decides.
+        begin_c: (3,) position in {C} where the thrust begins.
+        start: (5,) margins there.
     """
 
     sampled: SampledScene
@@ -324,12 +380,21 @@ class Case:
 
     @property
     def axes(self) -> Array | None:
-        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component; None without."""
+        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component.
+
+        None without.
+        """
         bounds = self.limits.accel_axes_mps2
-        return None if bounds is None else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
+        return (
+            None
+            if bounds is None
+            else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
+        )
 
     def within_axes(self, u: Array) -> bool:
-        """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the base."""
+        """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the
+        base.
+        """
         bounds = self.limits.accel_axes_mps2
         return bounds is None or bool(np.all(np.abs(u @ self.limits.base_axes) <= bounds))
 
@@ -340,7 +405,8 @@ class Case:
 
 
 def largest_acceleration(limits: Limits, params: PlanParams) -> float:
-    """Return the largest acceleration in any direction [m/s2]: the corner of the box where each axis is bounded.
+    """Return the largest acceleration in any direction [m/s2]: the corner of the box where each
+    axis is bounded.
 
     Args:
         limits: Limits, with a bound of each axis or without.

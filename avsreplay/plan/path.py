@@ -1,8 +1,8 @@
 """Paths of the robot, and the motion of the goal sampled on a grid.
 
-A path of least time follows from the costate (eq:u): the primer vector is p(tau) = c2 - c1 tau and the thrust is
-u = -a_max p / |p|; both integrals of u are known in closed form. A path under constraints has constant thrust over
-equal intervals.
+A path of least time follows from the costate (eq:u): the primer vector is p(tau) = c2 - c1 tau and
+the thrust is u = -a_max p / |p|; both integrals of u are known in closed form. A path under
+constraints has constant thrust over equal intervals.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from avsreplay.outcome import Plan
 from avsreplay.plan.reachable_set import integrals
 from avsreplay.records import Trajectory
 
-MOTION_FACTOR = 1.5  # bounds on the goal's motion: this factor times the largest difference quotient on the grid
+# bounds on the goal's motion: this factor times the largest difference quotient on the grid
+MOTION_FACTOR = 1.5
 _HERMITE = 1.0 / 384.0  # position error of a cubic Hermite interval in units of d^4 |d4 rho|
 _HERMITE_RATE = math.sqrt(3.0) / 216.0  # its velocity error in units of d^3 |d4 rho|
 
@@ -55,7 +56,8 @@ class CostatePath:
         a_max: Magnitude of the thrust [m/s2].
         latency_s: Coasting time before the thrust [s].
         t_go_s: End of the thrust [s after the instant of planning].
-        costate: (6,) [c1, c2] of p(tau) = c2 - c1 tau, tau from the instant of planning, of unit norm.
+        costate: (6,) [c1, c2] of p(tau) = c2 - c1 tau, tau from the instant of planning, of unit
+            norm.
     """
 
     r0: Array
@@ -71,9 +73,17 @@ class CostatePath:
 
     @classmethod
     def from_normal(
-        cls, r0: Array, v0: Array, a_max: float, latency_s: float, thrust_s: float, P0: Array, P1: Array
+        cls,
+        r0: Array,
+        v0: Array,
+        a_max: float,
+        latency_s: float,
+        thrust_s: float,
+        P0: Array,
+        P1: Array,
     ) -> CostatePath:
-        """Return the path whose primer vector is -P, P changing linearly from P0 to P1 over the thrust time (eq:u).
+        """Return the path whose primer vector is -P, P changing linearly from P0 to P1 over the
+        thrust time (eq:u).
 
         Args:
             r0: (3,) position of the robot in {A} at the instant of planning [m].
@@ -81,7 +91,8 @@ class CostatePath:
             a_max: Magnitude of the thrust [m/s2].
             latency_s: Coasting time before the thrust [s].
             thrust_s: Duration of the thrust, above 0 [s].
-            P0: (3,) P at the begin of the thrust in {A}; a common factor of P0 and P1 has no effect.
+            P0: (3,) P at the begin of the thrust in {A}; a common factor of P0 and P1 has no
+                effect.
             P1: (3,) P at its end.
         """
         c1 = (P1 - P0) / thrust_s
@@ -109,7 +120,8 @@ class CostatePath:
         return out
 
     def thrust(self, times: Array) -> Array:
-        """Return the acceleration (n, 3) in {A} [m/s2] (eq:u); it is zero outside [latency_s, t_go_s].
+        """Return the acceleration (n, 3) in {A} [m/s2] (eq:u); it is zero outside [latency_s,
+        t_go_s].
 
         Args:
             times: (n,) [s after the instant of planning].
@@ -121,7 +133,8 @@ class CostatePath:
         return np.where(on[:, None], u, 0.0)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; after the end the robot coasts.
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; after the end the robot
+        coasts.
 
         Args:
             times: (n,) [s after the instant of planning].
@@ -135,7 +148,8 @@ class CostatePath:
         return self.r0 + self.v0 * times[:, None] + dr, self.v0 + dv
 
     def terminal_errors(self, goal: Trajectory) -> tuple[float, float]:
-        """Return the distance [m] and the relative speed [m/s] to the goal at the end (eq:terminal).
+        """Return the distance [m] and the relative speed [m/s] to the goal at the end
+        (eq:terminal).
 
         Args:
             goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
@@ -149,12 +163,17 @@ class CostatePath:
             nodes: Number of equally spaced instants.
         """
         times = np.linspace(self.latency_s, self.t_go_s, nodes)
-        return float(np.max(np.linalg.norm(self.thrust(times), axis=1))) if math.isfinite(self.t_go_s) else math.nan
+        return (
+            float(np.max(np.linalg.norm(self.thrust(times), axis=1)))
+            if math.isfinite(self.t_go_s)
+            else math.nan
+        )
 
 
 @value_class
 class StepPath:
-    """The robot thrusts with constant acceleration over each of n equal intervals, as constrained plans do.
+    """The robot thrusts with constant acceleration over each of n equal intervals, as constrained
+    plans do.
 
     Attributes:
         r0, v0: (3,) position [m] and velocity [m/s] of the robot in {A} at the instant of planning.
@@ -186,7 +205,9 @@ class StepPath:
         return (self.t_go_s - self.latency_s) / len(self.u)
 
     def nodes(self) -> tuple[Array, Array]:
-        """Return positions [m] and velocities [m/s], each (n + 1, 3) in {A}, at the ends of the intervals."""
+        """Return positions [m] and velocities [m/s], each (n + 1, 3) in {A}, at the ends of the
+        intervals.
+        """
         return self._nodes
 
     def _interval(self, times: Array) -> tuple[Array, Array]:
@@ -204,7 +225,8 @@ class StepPath:
         return np.where(on[:, None], self.u[self._interval(times)[0]], 0.0)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; the robot coasts before and after the thrust.
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; the robot coasts before
+        and after the thrust.
 
         Args:
             times: (n,) [s after the instant of planning].
@@ -218,7 +240,8 @@ class StepPath:
         return position + early * self.v0 + late * velocity, velocity
 
     def terminal_errors(self, goal: Trajectory) -> tuple[float, float]:
-        """Return the distance [m] and the relative speed [m/s] to the goal at the end (eq:terminal).
+        """Return the distance [m] and the relative speed [m/s] to the goal at the end
+        (eq:terminal).
 
         Args:
             goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
@@ -266,17 +289,21 @@ def _terminal_errors(path: RobotPath, goal: Trajectory) -> tuple[float, float]:
 
 @value_class
 class SampledGoal:
-    """Difference between the goal and a coasting robot on a grid of thrust times, interpolated by cubic Hermite pieces.
+    """Difference between the goal and a coasting robot on a grid of thrust times, interpolated by
+    cubic Hermite pieces.
 
-    A trajectory may be costly to evaluate because it integrates a tumbling body, so it is evaluated once on a grid.
+    A trajectory may be costly to evaluate because it integrates a tumbling body, so it is evaluated
+    once on a grid.
 
     Attributes:
         begin, step, end: First node, grid step and last node [s of thrust time].
         times: (n,) nodes.
         dr: (n, 3) goal minus coasting robot [m].
         dv: (n, 3) derivative of dr [m/s].
-        pieces: (n - 1, 4, 3) coefficients of each Hermite interval in powers of its local coordinate from 0 to 1.
-        acceleration, jerk, snap: Bounds on the second, third and fourth derivative of the goal's position [SI].
+        pieces: (n - 1, 4, 3) coefficients of each Hermite interval in powers of its local
+            coordinate from 0 to 1.
+        acceleration, jerk, snap: Bounds on the second, third and fourth derivative of the goal's
+            position [SI].
     """
 
     begin: float
@@ -295,12 +322,18 @@ class SampledGoal:
         d = self.step
         k = min(max(int((t - self.begin) / d), 0), len(self.pieces) - 1)
         s = (t - self.times.item(k)) / d
-        powers = ((1.0, s, s * s, s**3), (0.0, 1.0 / d, 2.0 * s / d, 3.0 * s * s / d), (0.0, 0.0, 2.0, 6.0 * s))
+        powers = (
+            (1.0, s, s * s, s**3),
+            (0.0, 1.0 / d, 2.0 * s / d, 3.0 * s * s / d),
+            (0.0, 0.0, 2.0, 6.0 * s),
+        )
         dr, dv, ddv = np.array(powers) @ self.pieces[k]
         return dr, dv, ddv / (d * d)
 
     def curvature(self, n0: float, n1: float, t: Array | float) -> Array | float:
-        """Return a bound on |d2/dt2| of P0.dr + P1.(t dv - dr) where |P0 - P1| = n0 and |P1| = n1."""
+        """Return a bound on |d2/dt2| of P0.dr + P1.(t dv - dr) where |P0 - P1| = n0 and |P1|
+        = n1.
+        """
         return (n0 + 2.0 * n1) * self.acceleration + n1 * t * self.jerk
 
     def interpolation_error(self, n0: float, n1: float, t: float) -> float:
@@ -312,7 +345,8 @@ class SampledGoal:
 def sample_goal(
     goal: Trajectory, r0: Array, v0: Array, delay_s: float, begin: float, end: float, step_s: float
 ) -> SampledGoal:
-    """Evaluate ``goal`` on a grid of thrust times from begin to end; thrust time t is its instant ``delay_s + t``.
+    """Evaluate ``goal`` on a grid of thrust times from begin to end; thrust time t is its instant
+    ``delay_s + t``.
 
     Raises:
         ValueError: The goal is not finite or not of shape (n, 3).
@@ -321,7 +355,9 @@ def sample_goal(
     times = np.linspace(begin, end, n)
     rho, rate = goal(times + delay_s)
     if rho.shape != (n, 3) or rate.shape != (n, 3):
-        raise ValueError(f"goal trajectory gave shapes {rho.shape} and {rate.shape}, expected {(n, 3)} twice")
+        raise ValueError(
+            f"goal trajectory gave shapes {rho.shape} and {rate.shape}, expected {(n, 3)} twice"
+        )
     dr = rho - r0 - v0 * (times + delay_s)[:, None]
     dv = rate - v0
     step = (end - begin) / (n - 1)

@@ -1,13 +1,16 @@
-"""The reachable set of a robot with bounded thrust, a convex set common to all problems, and its support function.
+"""The reachable set of a robot with bounded thrust, a convex set common to all problems, and its
+support function.
 
-With s = tau / t in [0, 1] and |w(s)| <= 1, the moments b0 = int (1 - s) w ds and b1 = int s w ds form a fixed convex
-set K in R^6. Its support function is h(P0, P1) = int |P(s)| ds with P(s) = (1 - s) P0 + s P1, and the maximiser is
-w = P / |P|, the primer-vector law of eq:u. Thrust of magnitude a over time t takes a coasting robot from the terminal
-residual (dr, dv) to the goal if and only if (dr, t dv - dr) / (a t^2) lies in K. The least thrust is therefore a gauge
-(Minkowski functional): a*(t) = max over P of P.b / (t^2 h(P)).
+With s = tau / t in [0, 1] and |w(s)| <= 1, the moments b0 = int (1 - s) w ds and b1 = int s w ds
+form a fixed convex set K in R^6. Its support function is h(P0, P1) = int |P(s)| ds with P(s) = (1 -
+s) P0 + s P1, and the maximiser is w = P / |P|, the primer-vector law of eq:u. Thrust of magnitude a
+over time t takes a coasting robot from the terminal residual (dr, dv) to the goal if and only if
+(dr, t dv - dr) / (a t^2) lies in K. The least thrust is therefore a gauge (Minkowski functional):
+a*(t) = max over P of P.b / (t^2 h(P)).
 
-K does not change when both moments are rotated alike, so the optimal P lies in the plane of b0 and b1, and the search
-has four unknowns in the plane, one of which is scale. All quantities here are dimensionless and belong to no frame.
+K does not change when both moments are rotated alike, so the optimal P lies in the plane of b0 and
+b1, and the search has four unknowns in the plane, one of which is scale. All quantities here are
+dimensionless and belong to no frame.
 """
 
 from __future__ import annotations
@@ -23,12 +26,20 @@ from avsreplay.plan import _cone
 
 Vector = list[float]
 
-# |P1 - P0| / (|P0| + |P1|) below which the closed form loses digits; eight Gauss nodes are exact to rounding there
+# |P1 - P0| / (|P0| + |P1|) below which the closed form loses digits; eight Gauss nodes are exact to
+# rounding there
 SMALL_TURN = 0.25
 MAX_NEWTON = 60
-_POSITIVE = np.array([0.18343464249564978, 0.525532409916329, 0.7966664774136267, 0.9602898564975362])
-_OF_POSITIVE = np.array([0.36268378337836166, 0.3137066458778869, 0.22238103445337443, 0.10122853629037706])
-_NODES, _WEIGHTS = np.r_[-_POSITIVE[::-1], _POSITIVE], np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE]  # Gauss-Legendre
+_POSITIVE = np.array(
+    [0.18343464249564978, 0.525532409916329, 0.7966664774136267, 0.9602898564975362]
+)
+_OF_POSITIVE = np.array(
+    [0.36268378337836166, 0.3137066458778869, 0.22238103445337443, 0.10122853629037706]
+)
+_NODES, _WEIGHTS = (
+    np.r_[-_POSITIVE[::-1], _POSITIVE],
+    np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE],
+)  # Gauss-Legendre
 _GAUSS_S = 0.5 * (_NODES + 1.0)
 _GAUSS_W = 0.5 * _WEIGHTS
 _GAUSS_NODES = np.stack([_GAUSS_S, _GAUSS_W])
@@ -42,7 +53,8 @@ class Gauge:
 
     Attributes:
         P0, P1: (3,) normal of K at that point, scaled to h(P0, P1) = 1.
-        value: The gauge P.b, the factor by which K must be scaled to contain b (b lies in K if it is <= 1).
+        value: The gauge P.b, the factor by which K must be scaled to contain b (b lies in K if it
+            is <= 1).
         residual: |grad h - b / value|, which is 0 at the exact boundary point.
     """
 
@@ -53,7 +65,9 @@ class Gauge:
 
 
 def _rod(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, float, float]:
-    """Return the integral of 1/|P| over s in [0, 1], (2/l) atanh(l/(r0+r1)), and the lengths at both ends."""
+    """Return the integral of 1/|P| over s in [0, 1], (2/l) atanh(l/(r0+r1)), and the lengths at
+    both ends.
+    """
     r0, r1 = math.hypot(p0x, p0y), math.hypot(p1x, p1y)
     length = math.hypot(p1x - p0x, p1y - p0y)
     dot, cross = p0x * p1x + p0y * p1y, p0x * p1y - p0y * p1x
@@ -63,7 +77,9 @@ def _rod(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, float, 
     return math.log(max(total * total, _FLOOR) / max(gap, _FLOOR)) / max(length, _FLOOR), r0, r1
 
 
-def _gauss_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
+def _gauss_support(
+    p0x: float, p0y: float, p1x: float, p1y: float
+) -> tuple[float, list[float], list[float]]:
     """Evaluate the support function with eight Gauss nodes, for P of nearly constant direction."""
     h = g0x = g0y = g1x = g1y = 0.0
     hess = [0.0] * 9
@@ -86,8 +102,13 @@ def _gauss_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[floa
     return h, [g0x, g0y, g1x, g1y], hess
 
 
-def _closed_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
-    """Evaluate the support function in closed form: P = u e + d n, u = u0 + l s, e = (P1 - P0)/l, n normal to e."""
+def _closed_support(
+    p0x: float, p0y: float, p1x: float, p1y: float
+) -> tuple[float, list[float], list[float]]:
+    """Evaluate the support function in closed form.
+
+    P = u e + d n, u = u0 + l s, e = (P1 - P0)/l, n normal to e.
+    """
     j0, r0, r1 = _rod(p0x, p0y, p1x, p1y)
     dx, dy = p1x - p0x, p1y - p0y
     l = math.hypot(dx, dy)
@@ -122,8 +143,12 @@ def _closed_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[flo
     return h, grad, hess
 
 
-def support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
-    """Return h(P0, P1) in the plane, its gradient (4) and the Hessian blocks 00, 01, 11 as (xx, xy, yy) each."""
+def support(
+    p0x: float, p0y: float, p1x: float, p1y: float
+) -> tuple[float, list[float], list[float]]:
+    """Return h(P0, P1) in the plane, its gradient (4) and the Hessian blocks 00, 01, 11 as (xx, xy,
+    yy) each.
+    """
     turn = math.hypot(p1x - p0x, p1y - p0y)
     ends = math.hypot(p0x, p0y) + math.hypot(p1x, p1y)
     if turn < SMALL_TURN * ends:
@@ -136,15 +161,23 @@ def _newton_step(
 ) -> list[float]:
     """Return the Newton step that decreases h on the plane P.b = 1.
 
-    h is homogeneous, so H P = 0 and P.(grad - h b) = 0. The solution of (H + k b b^T) step = -(grad - h b) therefore
-    satisfies b.step = 0, and the KKT system reduces to four symmetric positive definite equations (LDL^T).
+    h is homogeneous, so H P = 0 and P.(grad - h b) = 0. The solution of (H + k b b^T) step = -(grad
+    - h b) therefore satisfies b.step = 0, and the KKT system reduces to four symmetric positive
+    definite equations (LDL^T).
     """
     k = hess[0] + hess[2] + hess[6] + hess[8]
     b0, b1, b2, b3 = b
     d0 = hess[0] + k * b0 * b0 + damping
-    l1, l2, l3 = (hess[1] + k * b0 * b1) / d0, (hess[3] + k * b0 * b2) / d0, (hess[4] + k * b0 * b3) / d0
+    l1, l2, l3 = (
+        (hess[1] + k * b0 * b1) / d0,
+        (hess[3] + k * b0 * b2) / d0,
+        (hess[4] + k * b0 * b3) / d0,
+    )
     d1 = hess[2] + k * b1 * b1 + damping - l1 * l1 * d0
-    m2, m3 = (hess[4] + k * b1 * b2 - l1 * l2 * d0) / d1, (hess[5] + k * b1 * b3 - l1 * l3 * d0) / d1
+    m2, m3 = (
+        (hess[4] + k * b1 * b2 - l1 * l2 * d0) / d1,
+        (hess[5] + k * b1 * b3 - l1 * l3 * d0) / d1,
+    )
     d2 = hess[6] + k * b2 * b2 + damping - l2 * l2 * d0 - m2 * m2 * d1
     n3 = (hess[7] + k * b2 * b3 - l2 * l3 * d0 - m2 * m3 * d1) / d2
     d3 = hess[8] + k * b3 * b3 + damping - l3 * l3 * d0 - m3 * m3 * d1 - n3 * n3 * d2
@@ -185,7 +218,9 @@ def _evaluate(P: list[float], b: list[float]) -> _Point:
 
 
 def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
-    """Minimise h on P.b = 1 by damped Newton steps with a line search until |grad h - h b| <= tolerance."""
+    """Minimise h on P.b = 1 by damped Newton steps with a line search until |grad h - h b| <=
+    tolerance.
+    """
     now = _evaluate(P, b)
     for _ in range(MAX_NEWTON):
         if now.size <= tolerance + 4e-16 * now.h:
@@ -200,12 +235,19 @@ def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
 
 
 def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
-    """Return the first point along the step with sufficient decrease of h (Armijo), or of the residual at rounding."""
+    """Return the first point along the step with sufficient decrease of h (Armijo), or of the
+    residual at rounding.
+    """
     size = min(1.0, 2.0 * _norm(now.P) / max(_norm(step), _FLOOR))
     slope = _dot(now.residual, step)  # slope of h, because b.step is 0
     P = now.P
     for _ in range(30):
-        trial = [P[0] + size * step[0], P[1] + size * step[1], P[2] + size * step[2], P[3] + size * step[3]]
+        trial = [
+            P[0] + size * step[0],
+            P[1] + size * step[1],
+            P[2] + size * step[2],
+            P[3] + size * step[3],
+        ]
         point = _evaluate(trial, b)
         falls = point.h <= now.h + 1e-4 * size * slope
         if falls or (point.h <= now.h * (1.0 + 1e-15) and point.size < now.size):
@@ -214,7 +256,9 @@ def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
     return None
 
 
-def gauge(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, tolerance: float = 1e-15) -> Gauge:
+def gauge(
+    b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, tolerance: float = 1e-15
+) -> Gauge:
     """Return the gauge of K at (b0, b1) and the normal at the boundary point.
 
     Args:
@@ -242,7 +286,10 @@ def gauge(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, toleran
 
 
 def _scaled(b0: Array, b1: Array) -> tuple[Vector, Vector, float]:
-    """Return both vectors in units of their common norm, and that norm; lists are faster than arrays of three."""
+    """Return both vectors in units of their common norm, and that norm.
+
+    Lists are faster than arrays of three.
+    """
     x, y = b0.tolist(), b1.tolist()
     size = math.sqrt(_dot3(x, x) + _dot3(y, y))
     return [v / size for v in x], [v / size for v in y], size
@@ -263,11 +310,15 @@ def _lifted(along: float, across: float, plane: tuple[Vector, Vector]) -> Array:
 
 
 def _plane(b0: Vector, b1: Vector) -> tuple[Vector, Vector]:
-    """Return two orthonormal vectors whose plane contains b0 and b1, also if these are parallel or one is zero."""
+    """Return two orthonormal vectors whose plane contains b0 and b1, also if these are parallel or
+    one is zero.
+    """
     first, second = (b0, b1) if _dot3(b0, b0) >= _dot3(b1, b1) else (b1, b0)
     norm = math.sqrt(_dot3(first, first))
     e0 = [v / norm for v in first]
-    across = _without(_without(second, e0), e0)  # twice, to remove the rounding error of the first pass
+    across = _without(
+        _without(second, e0), e0
+    )  # twice, to remove the rounding error of the first pass
     norm = math.sqrt(_dot3(across, across))
     if norm < 1e-14:
         least = min(range(3), key=lambda i: abs(e0[i]))
@@ -294,4 +345,6 @@ def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
     Returns:
         int w ds (n, 3) and int (1 - s) w ds (n, 3) with w = P/|P|.
     """
-    return _cone.integrals(np.ascontiguousarray(P0), np.ascontiguousarray(P1), _GAUSS_NODES, SMALL_TURN, _FLOOR)
+    return _cone.integrals(
+        np.ascontiguousarray(P0), np.ascontiguousarray(P1), _GAUSS_NODES, SMALL_TURN, _FLOOR
+    )

@@ -1,10 +1,12 @@
-"""Time-optimal rendezvous with a moving goal under |u| <= a_max: the first root of a*(t_f) = a_max, with a certificate.
+"""Time-optimal rendezvous with a moving goal under |u| <= a_max: the first root of a*(t_f) = a_max,
+with a certificate.
 
-For a fixed t_f the least thrust a* is the gauge of one convex set (``reachable_set``). A normal P of this set separates
-the goal from it at time t if G(t) = P.b(t) - a_max t^2 h(P) > 0. The goal then remains unreachable for as long as G
-stays positive. The search therefore advances from t to the next root of G and cannot skip a feasible time. P is optimal
-at the instant for which it was computed, so G is tangent to the true margin there and the steps converge quadratically
-to the first root from below.
+For a fixed t_f the least thrust a* is the gauge of one convex set (``reachable_set``). A normal P
+of this set separates the goal from it at time t if G(t) = P.b(t) - a_max t^2 h(P) > 0. The goal
+then remains unreachable for as long as G stays positive. The search therefore advances from t to
+the next root of G and cannot skip a feasible time. P is optimal at the instant for which it was
+computed, so G is tangent to the true margin there and the steps converge quadratically to the first
+root from below.
 """
 
 from __future__ import annotations
@@ -24,8 +26,12 @@ from avsreplay.settings import Settings, setting
 
 MAX_STEPS = 400
 STRETCH_S = 30.0  # the goal is sampled over this time span at once; most captures need no more
-NEAR_ROOT = 1e-2  # where a* exceeds a_max by less than this fraction, Newton's method finishes the search
-GAP_LIMIT_S = 1e-6  # where t_f exceeds its lower bound by more, the certified steps continue to the root
+NEAR_ROOT = (
+    1e-2  # where a* exceeds a_max by less than this fraction, Newton's method finishes the search
+)
+GAP_LIMIT_S = (
+    1e-6  # where t_f exceeds its lower bound by more, the certified steps continue to the root
+)
 RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in metres per second
 
 
@@ -33,20 +39,31 @@ RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in 
 class PlanParams(Settings):
     """Capability of the robot, and how it plans."""
 
-    a_max_mps2: float = setting(0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0)
+    a_max_mps2: float = setting(
+        0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0
+    )
     horizon_s: float = setting(
-        120.0, "Latest time of capture that is considered, after the instant of planning.", unit="s", above=0.0
+        120.0,
+        "Latest time of capture that is considered, after the instant of planning.",
+        unit="s",
+        above=0.0,
     )
     latency_s: float = setting(
-        0.0, "Time between planning and the first thrust, during which the robot coasts.", unit="s", low=0.0
+        0.0,
+        "Time between planning and the first thrust, during which the robot coasts.",
+        unit="s",
+        low=0.0,
     )
     replan_period_s: float = setting(
-        1.0, "A new plan is made at the first scan this long after the previous plan.", unit="s", above=0.0
+        1.0,
+        "A new plan is made at the first scan this long after the previous plan.",
+        unit="s",
+        above=0.0,
     )
     grid_s: float = setting(
         0.2,
-        "Spacing of the samples of the goal trajectory. A larger value takes less time and interpolates the"
-        " trajectory less accurately.",
+        "Spacing of the samples of the goal trajectory. A larger value takes less time and"
+        " interpolates the trajectory less accurately.",
         unit="s",
         above=0.0,
     )
@@ -60,12 +77,17 @@ class PlanParams(Settings):
     def check(self) -> None:
         """Raise ValueError where the latency is not below the horizon."""
         if self.latency_s >= self.horizon_s:
-            raise ValueError(f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}")
+            raise ValueError(
+                f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}"
+            )
 
 
 @value_class
 class _Search:
-    """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t`` to rounding."""
+    """End of the certified steps: no capture before ``t``.
+
+    If ``reached``, a capture at ``t`` to rounding.
+    """
 
     t: float
     reached: bool
@@ -81,15 +103,18 @@ def rendezvous(
     t_ns: int = 0,
     earliest_s: float = 0.0,
 ) -> Plan:
-    """Plan the time-optimal rendezvous without constraints other than |u| <= a_max (eq:terminal, eq:a_max).
+    """Plan the time-optimal rendezvous without constraints other than |u| <= a_max (eq:terminal,
+    eq:a_max).
 
     Args:
-        goal: Function of times (n,) [s after t_ns]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
+        goal: Function of times (n,) [s after t_ns]: positions (n, 3) [m] and velocities (n, 3)
+            [m/s] in {A}.
         r0: (3,) position of the robot in {A} at t_ns [m].
         v0: (3,) its velocity [m/s].
         params: Thrust, horizon, latency and grid; the defaults where None.
         t_ns: Instant of planning.
-        earliest_s: Earliest capture allowed [s after t_ns]; the thrust is smaller than the bound where it decides.
+        earliest_s: Earliest capture allowed [s after t_ns]; the thrust is smaller than the bound
+            where it decides.
 
     Returns:
         A plan with status ``optimal`` (the first feasible time, certified by ``lower_bound_s``),
@@ -101,13 +126,21 @@ def rendezvous(
     params = params or PlanParams()
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
     plan = _earliest(goal, r0, v0, params, t_ns)
-    return _not_before(goal, r0, v0, params, plan, earliest_s) if plan.found and plan.t_go_s < earliest_s else plan
+    return (
+        _not_before(goal, r0, v0, params, plan, earliest_s)
+        if plan.found and plan.t_go_s < earliest_s
+        else plan
+    )
 
 
-def _not_before(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, plan: Plan, earliest_s: float) -> Plan:
-    """Return the plan that ends at the first grid time from ``earliest_s`` on at which the thrust suffices.
+def _not_before(
+    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, plan: Plan, earliest_s: float
+) -> Plan:
+    """Return the plan that ends at the first grid time from ``earliest_s`` on at which the thrust
+    suffices.
 
-    For a fixed time the least thrust has constant magnitude a*, so a later capture needs less than the bound.
+    For a fixed time the least thrust has constant magnitude a*, so a later capture needs less than
+    the bound.
     """
     for end in np.arange(earliest_s, params.horizon_s, params.grid_s):
         t = float(end) - params.latency_s
@@ -118,19 +151,33 @@ def _not_before(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, plan
         if least <= params.a_max_mps2:
             path = CostatePath.from_normal(r0, v0, least, params.latency_s, t, found.P0, found.P1)
             first = float(end) == earliest_s
-            graded = _grade(path, goal, plan.t_ns, _Search(earliest_s - params.latency_s, True, found, plan.steps))
-            return graded if first or not graded.found else replace(graded, status=PlanStatus.FEASIBLE)
-    return no_plan(plan.t_ns, PlanStatus.NOT_FOUND, params.a_max_mps2, params.latency_s + earliest_s)
+            graded = _grade(
+                path,
+                goal,
+                plan.t_ns,
+                _Search(earliest_s - params.latency_s, True, found, plan.steps),
+            )
+            return (
+                graded if first or not graded.found else replace(graded, status=PlanStatus.FEASIBLE)
+            )
+    return no_plan(
+        plan.t_ns, PlanStatus.NOT_FOUND, params.a_max_mps2, params.latency_s + earliest_s
+    )
 
 
 def _earliest(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
     """Return the plan of the first feasible time."""
     search, sampled = _first_feasible(goal, r0, v0, params, near=True)
     if search.reached and search.normal is None:
-        here = np.array([1.0, 0.0, 0.0])  # already at the goal: the thrust time is 0 and its direction has no effect
+        here = np.array(
+            [1.0, 0.0, 0.0]
+        )  # already at the goal: the thrust time is 0 and its direction has no effect
         wait = params.latency_s
         return _grade(
-            CostatePath(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])), goal, t_ns, search
+            CostatePath(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])),
+            goal,
+            t_ns,
+            search,
         )
     if not search.reached or search.normal is None:
         return _unreached(t_ns, params, search)
@@ -140,7 +187,9 @@ def _earliest(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, t_ns: 
         if not search.reached or search.normal is None:
             return _unreached(t_ns, params, search)
         t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
-    path = CostatePath.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
+    path = CostatePath.from_normal(
+        r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1
+    )
     return _grade(path, goal, t_ns, replace(search, t=bound))
 
 
@@ -168,7 +217,9 @@ def _unreached(t_ns: int, params: PlanParams, search: _Search) -> Plan:
     """Return the answer of a search that found no feasible time."""
     ended = search.t >= params.horizon_s - params.latency_s
     status = PlanStatus.INFEASIBLE if ended else PlanStatus.NO_CONVERGENCE
-    return replace(no_plan(t_ns, status, params.a_max_mps2, params.latency_s + search.t), steps=search.steps)
+    return replace(
+        no_plan(t_ns, status, params.a_max_mps2, params.latency_s + search.t), steps=search.steps
+    )
 
 
 def _grade(path: CostatePath, goal: Trajectory, t_ns: int, search: _Search) -> Plan:
@@ -193,7 +244,10 @@ def _grade(path: CostatePath, goal: Trajectory, t_ns: int, search: _Search) -> P
 def _first_feasible(
     goal: Trajectory, r0: Array, v0: Array, params: PlanParams, near: bool
 ) -> tuple[_Search, SampledGoal]:
-    """Advance the certified bound, time span by time span, until a_max suffices (``near``: nearly suffices)."""
+    """Advance the certified bound, time span by time span, until a_max suffices (``near``.
+
+    Nearly suffices).
+    """
     end, t, found = params.horizon_s - params.latency_s, 0.0, None
     begin, steps = 0.0, 0
     while True:
@@ -209,14 +263,17 @@ def _first_feasible(
         t, found, steps, begin = search.t, search.normal, search.steps, stretch
 
 
-def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Gauge | None, steps: int, near: bool) -> _Search:
+def _search_stretch(
+    goal: SampledGoal, a_max: float, t: float, found: Gauge | None, steps: int, near: bool
+) -> _Search:
     """Take certified steps within one sampled time span, from thrust time t on."""
     excess = 1.0
     for count in range(steps, MAX_STEPS):
         if t >= goal.end:
             return _Search(goal.end, False, found, count)
         dr, dv, ddv = goal.at(t)
-        # far from the root an approximate normal is still a valid certificate; G's error is the residual squared
+        # far from the root an approximate normal is still a valid certificate; G's error is the
+        # residual squared
         tolerance = max(1e-15, 1e-2 * min(excess * excess, 1.0))
         found = gauge(dr, t * dv - dr, (found.P0, found.P1) if found else None, tolerance)
         margin = found.value - a_max * t * t  # G(t), with h(P) = 1
@@ -227,7 +284,11 @@ def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Gauge | No
             excess = 0.0
             continue
         excess = margin / found.value
-        if near and excess < NEAR_ROOT and margin < 0.25 * local.slope * local.slope / local.bend(goal, t, a_max):
+        if (
+            near
+            and excess < NEAR_ROOT
+            and margin < 0.25 * local.slope * local.slope / local.bend(goal, t, a_max)
+        ):
             return _Search(t, True, found, count)
         t_new = local.step(goal, found, t, margin, a_max)
         if t_new - t <= 1e-10 * t:
@@ -238,7 +299,10 @@ def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Gauge | No
 
 def _met(goal: SampledGoal) -> bool:
     """Return whether the coasting robot already meets the goal at the start."""
-    return float(np.linalg.norm(goal.dr[0])) <= RESIDUAL_LIMIT and float(np.linalg.norm(goal.dv[0])) <= RESIDUAL_LIMIT
+    return (
+        float(np.linalg.norm(goal.dr[0])) <= RESIDUAL_LIMIT
+        and float(np.linalg.norm(goal.dv[0])) <= RESIDUAL_LIMIT
+    )
 
 
 def _first_bound(goal: SampledGoal, a_max: float) -> float:
@@ -264,15 +328,21 @@ class _Margin:
         return cls(math.sqrt(float(across @ across)), math.sqrt(float(found.P1 @ found.P1)), slope)
 
     def before(self, goal: SampledGoal, t: float) -> float:
-        """Return t reduced by the largest shift of the root that the interpolation of the goal can cause."""
+        """Return t reduced by the largest shift of the root that the interpolation of the goal can
+        cause.
+        """
         return max(t - goal.interpolation_error(self.n0, self.n1, t) / max(-self.slope, 1e-9), 0.0)
 
     def bend(self, goal: SampledGoal, t: float, a_max: float) -> float:
         """Return a bound on |d2G/dt2| up to t."""
         return float(goal.curvature(self.n0, self.n1, t)) + 2.0 * a_max
 
-    def joined(self, goal: SampledGoal, t: float, margin: float, bound: float, a_max: float) -> float:
-        """Return the bound moved to the root t if G decreases through t and is positive from ``bound`` up to t."""
+    def joined(
+        self, goal: SampledGoal, t: float, margin: float, bound: float, a_max: float
+    ) -> float:
+        """Return the bound moved to the root t if G decreases through t and is positive from
+        ``bound`` up to t.
+        """
         if self.slope < 0.0 and t - bound < -self.slope / self.bend(goal, t, a_max):
             return max(bound, t - 2.0 * margin / -self.slope)
         return bound
@@ -280,7 +350,8 @@ class _Margin:
     def step(self, goal: SampledGoal, found: Gauge, t: float, margin: float, a_max: float) -> float:
         """Return the latest instant up to which G is certainly positive.
 
-        Over several grid intervals the nodes and the chord error bound G; within one interval a Taylor bound does.
+        Over several grid intervals the nodes and the chord error bound G; within one interval a
+        Taylor bound does.
         """
         sag = 0.125 * goal.step**2
         near = self.bend(goal, t + goal.step, a_max)
@@ -290,7 +361,9 @@ class _Margin:
         if first >= len(goal.times) or margin <= near * sag:
             return reach
         times = goal.times[first:]
-        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # for the interval after each node
+        bend = (
+            goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max
+        )  # for the interval after each node
         along = goal.dr[first:] @ (found.P0 - found.P1) + times * (goal.dv[first:] @ found.P1)
         positive = along - a_max * times * times > sag * bend
         stop = int(positive.argmin())
@@ -300,9 +373,18 @@ class _Margin:
 
 
 def _polish(
-    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, sampled: SampledGoal, search: _Search, found: Gauge
+    goal: Trajectory,
+    r0: Array,
+    v0: Array,
+    params: PlanParams,
+    sampled: SampledGoal,
+    search: _Search,
+    found: Gauge,
 ) -> tuple[float, Gauge, float]:
-    """Solve G(t) = 0 by Newton's method on the exact goal. Returns t, the normal and the lower bound."""
+    """Solve G(t) = 0 by Newton's method on the exact goal.
+
+    Returns t, the normal and the lower bound.
+    """
     t, a_max = search.t, params.a_max_mps2
     best = (math.inf, t, found, search.t)
     for _ in range(6):

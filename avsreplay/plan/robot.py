@@ -1,4 +1,6 @@
-"""Settings of the robot with the end-effector (``[robot]``) and of the constraints on its plans (``[limits]``)."""
+"""Settings of the robot with the end-effector (``[robot]``) and of the constraints on its plans
+(``[limits]``).
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,24 @@ from avsreplay.settings import Settings, is_unit, setting
 
 @dataclass(frozen=True, slots=True)
 class Limits(Settings):
-    """Constraints of a plan besides thrust; one that is not set is switched off, unless it scales with the target."""
+    """Constraints of a plan besides thrust.
+
+    One that is not set is switched off, unless it scales with the target.
+    """
 
     cone_deg: float | None = setting(
-        None, "Half-angle of the approach cone at the grasp point.", unit="deg", above=0.0, below=90.0
+        None,
+        "Half-angle of the approach cone at the grasp point.",
+        unit="deg",
+        above=0.0,
+        below=90.0,
     )
     cone_range_m: float | None = setting(
-        None, "Distance to the grasp point within which the cone holds.", unit="m", above=0.0, of_extent=0.25
+        None,
+        "Distance to the grasp point within which the cone holds.",
+        unit="m",
+        above=0.0,
+        of_extent=0.25,
     )
     final_deg: float | None = setting(
         None,
@@ -30,15 +43,21 @@ class Limits(Settings):
         above=0.0,
         below=90.0,
     )
-    final_range_m: float | None = setting(None, "Length of the final approach.", unit="m", above=0.0, of_extent=0.06)
+    final_range_m: float | None = setting(
+        None, "Length of the final approach.", unit="m", above=0.0, of_extent=0.06
+    )
     mouth_m: float | None = setting(
         None, "Radius of both cones at the grasp point.", unit="m", above=0.0, of_extent=0.00125
     )
-    speed_max_mps: float | None = setting(None, "Largest speed of the robot in {A}.", unit="m/s", above=0.0)
+    speed_max_mps: float | None = setting(
+        None, "Largest speed of the robot in {A}.", unit="m/s", above=0.0
+    )
     contact_accel_mps2: float | None = setting(
         None, "Largest acceleration relative to the grasp point at contact.", unit="m/s2", above=0.0
     )
-    keepout_m: float | None = setting(None, "Radius of the keep-out sphere about the mass centre.", unit="m", above=0.0)
+    keepout_m: float | None = setting(
+        None, "Radius of the keep-out sphere about the mass centre.", unit="m", above=0.0
+    )
     keepout_release_m: float | None = setting(
         None,
         "Distance to the grasp point within which the keep-out sphere does not hold.",
@@ -48,20 +67,26 @@ class Limits(Settings):
     )
     clearance_m: float | None = setting(
         None,
-        "Smallest distance of the end-effector's centre to the target's surface outside the final approach cone.",
+        "Smallest distance of the end-effector's centre to the target's surface outside the final"
+        " approach cone.",
         unit="m",
         above=0.0,
     )
     clearance_sigmas: float = setting(
         3.0,
-        "Multiple of the predicted standard deviation of the surface's position that is added to the clearance.",
+        "Multiple of the predicted standard deviation of the surface's position that is added to"
+        " the clearance.",
         low=0.0,
     )
     abort: bool = setting(
-        True, "Require that the robot keeps the clearance if it aborts at any instant outside the final approach cone."
+        True,
+        "Require that the robot keeps the clearance if it aborts at any instant outside the final"
+        " approach cone.",
     )
     base_m: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "Position of the robot's base in {A}, the centre of its workspace.", unit="m"
+        (0.0, 0.0, 0.0),
+        "Position of the robot's base in {A}, the centre of its workspace.",
+        unit="m",
     )
     reach_max_m: float | None = setting(
         None, "Largest distance of the end-effector from the base.", unit="m", above=0.0
@@ -81,7 +106,8 @@ class Limits(Settings):
     )
     nodes: int = setting(
         60,
-        "Number of thrust intervals of a constrained plan. A larger value gives an earlier capture, in more time.",
+        "Number of thrust intervals of a constrained plan. A larger value gives an earlier capture,"
+        " in more time.",
         low=8,
     )
 
@@ -89,7 +115,8 @@ class Limits(Settings):
         """Return the limits for an end-effector of a given size.
 
         Args:
-            radius_m: Its radius [m], added to the clearance; without clearance and corridor the limits do not change.
+            radius_m: Its radius [m], added to the clearance; without clearance and corridor the
+                limits do not change.
         """
         if radius_m <= 0.0 or (self.clearance_m is None and self.final_deg is None):
             return self
@@ -105,7 +132,11 @@ class Limits(Settings):
     def cones(self) -> list[tuple[float, float]]:
         """Half-angle [deg] and length [m] of every cone that is required."""
         both = (self.cone_deg, self.cone_range_m), (self.final_deg, self.final_range_m)
-        return [(degrees, length) for degrees, length in both if degrees is not None and length is not None]
+        return [
+            (degrees, length)
+            for degrees, length in both
+            if degrees is not None and length is not None
+        ]
 
     @property
     def base_axes(self) -> Array:
@@ -116,7 +147,14 @@ class Limits(Settings):
     @property
     def geometric(self) -> bool:
         """Whether there is a constraint on the position relative to the target."""
-        named = (self.cone_deg, self.final_deg, self.keepout_m, self.clearance_m, self.reach_max_m, self.reach_min_m)
+        named = (
+            self.cone_deg,
+            self.final_deg,
+            self.keepout_m,
+            self.clearance_m,
+            self.reach_max_m,
+            self.reach_min_m,
+        )
         return any(value is not None for value in named)
 
 
@@ -125,10 +163,15 @@ _CAPABILITIES = ("accel_max_mps2", "accel_axes_mps2", "thrust_max_n", "thrust_ax
 
 @dataclass(frozen=True, slots=True)
 class RobotParams(Settings):
-    """The robot that carries the end-effector. What is set here takes precedence over ``plan`` and ``limits``."""
+    """The robot that carries the end-effector.
+
+    What is set here takes precedence over ``plan`` and ``limits``.
+    """
 
     name: str = setting("point", "Name of the robot, printed with every plan.")
-    mass_kg: float | None = setting(None, "Mass, by which a thrust is divided.", unit="kg", above=0.0)
+    mass_kg: float | None = setting(
+        None, "Mass, by which a thrust is divided.", unit="kg", above=0.0
+    )
     thrust_max_n: float | None = setting(
         None,
         "Largest thrust in any direction. Divided by the mass it is the largest acceleration.",
@@ -137,12 +180,17 @@ class RobotParams(Settings):
     )
     thrust_axes_n: tuple[float, float, float] | None = setting(
         None,
-        "Largest thrust along each axis of the base. Divided by the mass it is the largest acceleration.",
+        "Largest thrust along each axis of the base. Divided by the mass it is the largest"
+        " acceleration.",
         unit="N",
         above=0.0,
     )
     accel_max_mps2: float | None = setting(
-        None, "Largest acceleration in any direction.", unit="m/s2", above=0.0, unset="plan.a_max_mps2"
+        None,
+        "Largest acceleration in any direction.",
+        unit="m/s2",
+        above=0.0,
+        unset="plan.a_max_mps2",
     )
     accel_axes_mps2: tuple[float, float, float] | None = setting(
         None, "Largest acceleration along each axis of the base.", unit="m/s2", above=0.0
@@ -161,19 +209,26 @@ class RobotParams(Settings):
         (0.0, 0.0, 0.0, 1.0), "Quaternion that takes coordinates of the base to {A}."
     )
     start_position_m: tuple[float, float, float] | None = setting(
-        None, "Position of the end-effector in {A} at the start.", unit="m", unset="plan.robot_position_m"
+        None,
+        "Position of the end-effector in {A} at the start.",
+        unit="m",
+        unset="plan.robot_position_m",
     )
     start_velocity_mps: tuple[float, float, float] | None = setting(
-        None, "Velocity of the end-effector in {A} at the start.", unit="m/s", unset="plan.robot_velocity_mps"
+        None,
+        "Velocity of the end-effector in {A} at the start.",
+        unit="m/s",
+        unset="plan.robot_velocity_mps",
     )
     start_attitude_xyzw: tuple[float, float, float, float] = setting(
         (0.0, 0.0, 0.0, 1.0),
-        "Quaternion that takes coordinates of the gripper to {A} at the start; at capture the gripper has the axes"
-        " of {C}.",
+        "Quaternion that takes coordinates of the gripper to {A} at the start; at capture the"
+        " gripper has the axes of {C}.",
     )
     radius_m: float = setting(
         0.0,
-        "Radius of the end-effector, added to limits.clearance_m; without that setting it is the clearance.",
+        "Radius of the end-effector, added to limits.clearance_m; without that setting it is the"
+        " clearance.",
         unit="m",
         low=0.0,
     )
@@ -185,19 +240,32 @@ class RobotParams(Settings):
         unset="limits.reach_max_m",
     )
     reach_min_m: float | None = setting(
-        None, "Smallest distance of the end-effector from the base.", unit="m", above=0.0, unset="limits.reach_min_m"
+        None,
+        "Smallest distance of the end-effector from the base.",
+        unit="m",
+        above=0.0,
+        unset="limits.reach_min_m",
     )
     urdf: str | None = setting(
         None,
-        "URDF of a manipulator that carries the end-effector, relative to the file that states it: its joints can"
-        " follow the last metres of every plan, and its reach is the workspace where reach_max_m is not given.",
+        "URDF of a manipulator that carries the end-effector, relative to the file that states it:"
+        " its joints can follow the last metres of every plan, and its reach is the workspace where"
+        " reach_max_m is not given.",
     )
-    urdf_frame: str | None = setting(None, "Frame of the gripper in the URDF.", unset="its last frame")
+    urdf_frame: str | None = setting(
+        None, "Frame of the gripper in the URDF.", unset="its last frame"
+    )
     delay_s: float | None = setting(
-        None, "Time between planning and the first thrust.", unit="s", low=0.0, unset="plan.latency_s"
+        None,
+        "Time between planning and the first thrust.",
+        unit="s",
+        low=0.0,
+        unset="plan.latency_s",
     )
     thrust_noise: float = setting(
-        0.0, "1 sigma of the thrust error of each axis, as a fraction of the largest thrust, over 1 s.", low=0.0
+        0.0,
+        "1 sigma of the thrust error of each axis, as a fraction of the largest thrust, over 1 s.",
+        low=0.0,
     )
 
     def check(self) -> None:
@@ -209,7 +277,9 @@ class RobotParams(Settings):
         if thrust and self.mass_kg is None:
             raise ValueError(f"mass_kg and {given[0]} must be given together")
         if self.mass_kg is not None and not given:
-            raise ValueError("mass_kg and thrust_max_n (or another capability) must be given together")
+            raise ValueError(
+                "mass_kg and thrust_max_n (or another capability) must be given together"
+            )
         for name in ("base_attitude_xyzw", "start_attitude_xyzw"):
             if not is_unit(getattr(self, name)):
                 raise ValueError(f"{name} is {list(getattr(self, name))}, must be of unit length")
@@ -219,7 +289,10 @@ class RobotParams(Settings):
 
     @property
     def axes_mps2(self) -> tuple[float, float, float] | None:
-        """Largest acceleration along each axis of the base [m/s2]; None where it is equal in all directions."""
+        """Largest acceleration along each axis of the base [m/s2].
+
+        None where it is equal in all directions.
+        """
         if self.accel_axes_mps2 is not None:
             return self.accel_axes_mps2
         if self.thrust_axes_n is None or self.mass_kg is None:
@@ -231,7 +304,8 @@ class RobotParams(Settings):
         """Return the planner's parameters with acceleration, start and delay of the robot.
 
         Args:
-            params: The planner's parameters. The acceleration becomes one that the robot has in every direction.
+            params: The planner's parameters. The acceleration becomes one that the robot has in
+                every direction.
         """
         axes, given = self.axes_mps2, self.accel_max_mps2
         if axes is not None:
@@ -264,7 +338,10 @@ class RobotParams(Settings):
 
     @property
     def gripper(self) -> tuple[Array, float] | None:
-        """Attitude (4,) of the gripper at the start and its largest angular acceleration; None: not planned."""
+        """Attitude (4,) of the gripper at the start and its largest angular acceleration; None.
+
+        Not planned.
+        """
         q = np.array(self.start_attitude_xyzw)
         turn = self.angular_accel_radps2
         return None if turn is None else (np.asarray(q / np.linalg.norm(q)), turn)
@@ -306,7 +383,9 @@ def slowed(params: PlanParams, limits: Limits, share: float) -> tuple[PlanParams
     """
     axes = limits.accel_axes_mps2
     if axes is not None:
-        limits = replace(limits, accel_axes_mps2=(share * axes[0], share * axes[1], share * axes[2]))
+        limits = replace(
+            limits, accel_axes_mps2=(share * axes[0], share * axes[1], share * axes[2])
+        )
     return replace(params, a_max_mps2=share * params.a_max_mps2), limits
 
 

@@ -1,8 +1,9 @@
 """The supervisor: a table of rules that selects the action of the robot after each scan.
 
-The paper requires "the most appropriate control action if partial or complete failure of the vision system in the
-short term occurs" and leaves the choice open. Here the rules are data: the table is read from the top, the first rule
-whose conditions all hold determines the action, and its name is written to the row.
+The paper requires "the most appropriate control action if partial or complete failure of the vision
+system in the short term occurs" and leaves the choice open. Here the rules are data: the table is
+read from the top, the first rule whose conditions all hold determines the action, and its name is
+written to the row.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ class Action(Enum):
 
     STAND_STILL = "stand_still"  # remain at rest: the estimate has not converged
     APPROACH = "approach"  # fly the plan with healthy measurements
-    APPROACH_ON_PREDICTION = "approach_on_prediction"  # fly the plan without measurements, the prediction suffices
+    APPROACH_ON_PREDICTION = (  # fly the plan without measurements, the prediction suffices
+        "approach_on_prediction"
+    )
     HOLD = "hold"  # stop the approach and keep the approach point
     RETREAT = "retreat"  # increase the distance to the target
     CAPTURE = "capture"  # fly the last plan to its end and close the gripper
@@ -38,32 +41,46 @@ class Action(Enum):
 class SupervisorParams(Settings):
     """Capture tolerances and time limits of the supervisor."""
 
-    capture_pos_m: float | None = setting(None, "Capture tolerance on position.", unit="m", above=0.0, of_extent=0.0025)
+    capture_pos_m: float | None = setting(
+        None, "Capture tolerance on position.", unit="m", above=0.0, of_extent=0.0025
+    )
     capture_speed_mps: float | None = setting(
         None, "Capture tolerance on relative speed.", unit="m/s", above=0.0, of_extent=0.00125
     )
-    capture_angle_deg: float = setting(2.0, "Capture tolerance on the gripper's angle.", unit="deg", above=0.0)
+    capture_angle_deg: float = setting(
+        2.0, "Capture tolerance on the gripper's angle.", unit="deg", above=0.0
+    )
     sigmas: float = setting(
         3.0,
-        "The predicted 1 sigma (root of the trace) times this must be within the tolerances. A larger value"
-        " captures only with more precise predictions.",
+        "The predicted 1 sigma (root of the trace) times this must be within the tolerances. A"
+        " larger value captures only with more precise predictions.",
         above=0.0,
     )
     commit_s: float = setting(
-        0.5, "The last plan is flown to its end if the time to go is less than this.", unit="s", above=0.0
+        0.5,
+        "The last plan is flown to its end if the time to go is less than this.",
+        unit="s",
+        above=0.0,
     )
     patience_s: float = setting(
         1.5,
-        "Time without a healthy scan after which the approach continues only if the prediction is within the"
-        " tolerances up to the end of the plan.",
+        "Time without a healthy scan after which the approach continues only if the prediction is"
+        " within the tolerances up to the end of the plan.",
         unit="s",
         above=0.0,
     )
     recover_scans: int = setting(2, "Number of consecutive healthy scans that ends a hold.", low=1)
-    hold_limit_s: float = setting(60.0, "A hold or retreat that lasts longer becomes an abort.", unit="s", above=0.0)
-    attempts_max: int = setting(5, "Number of approaches after which the next withdrawal becomes an abort.", low=1)
+    hold_limit_s: float = setting(
+        60.0, "A hold or retreat that lasts longer becomes an abort.", unit="s", above=0.0
+    )
+    attempts_max: int = setting(
+        5, "Number of approaches after which the next withdrawal becomes an abort.", low=1
+    )
     approach_limit_s: float = setting(
-        600.0, "Time since the first approach after which the robot aborts unless it captures.", unit="s", above=0.0
+        600.0,
+        "Time since the first approach after which the robot aborts unless it captures.",
+        unit="s",
+        above=0.0,
     )
     standoff_m: float | None = setting(
         None,
@@ -73,7 +90,11 @@ class SupervisorParams(Settings):
         of_extent=0.125,
     )
     retreat_m: float | None = setting(
-        None, "Distance that a retreat or an abort keeps from that sphere.", unit="m", above=0.0, of_extent=0.5
+        None,
+        "Distance that a retreat or an abort keeps from that sphere.",
+        unit="m",
+        above=0.0,
+        of_extent=0.5,
     )
 
 
@@ -87,10 +108,12 @@ class Facts:
         converged: Whether the estimate may be used for planning.
         planned: Whether a capture plan exists.
         t_go_s: Time to the end of the plan [s], NaN without a plan.
-        pos_1s_m, vel_1s_mps, rot_1s_deg: 1 sigma of the grasp point predicted for that end without measurements.
+        pos_1s_m, vel_1s_mps, rot_1s_deg: 1 sigma of the grasp point predicted for that end without
+            measurements.
         distance_m: Distance of the robot to the grasp point [m].
         now_1s_m: 1 sigma of the grasp point's position now [m].
-        margin: Smallest margin of the constraints now, negative if one is violated (1 without constraints).
+        margin: Smallest margin of the constraints now, negative if one is violated (1 without
+            constraints).
     """
 
     t_s: float
@@ -169,16 +192,36 @@ _ACCURATE, _INACCURATE = Condition("error_ratio", "<=", 1.0), Condition("error_r
 
 RULES: tuple[Rule, ...] = (
     Rule("aborted", Action.ABORT, (Condition("aborted", "==", 1),), "an abort is final"),
-    Rule("captured", Action.CAPTURE, (Condition("captured", "==", 1),), "a capture is flown to its end"),
-    Rule("held_too_long", Action.ABORT, (Condition("held_s", ">", "hold_limit_s"),), "the time limit is exceeded"),
-    Rule("too_long", Action.ABORT, (Condition("approach_s", ">", "approach_limit_s"),), "the approach takes too long"),
+    Rule(
+        "captured",
+        Action.CAPTURE,
+        (Condition("captured", "==", 1),),
+        "a capture is flown to its end",
+    ),
+    Rule(
+        "held_too_long",
+        Action.ABORT,
+        (Condition("held_s", ">", "hold_limit_s"),),
+        "the time limit is exceeded",
+    ),
+    Rule(
+        "too_long",
+        Action.ABORT,
+        (Condition("approach_s", ">", "approach_limit_s"),),
+        "the approach takes too long",
+    ),
     Rule(
         "too_many_attempts",
         Action.ABORT,
         (_HOLDING, Condition("attempts", ">=", "attempts_max")),
         "every attempt was withdrawn",
     ),
-    Rule("constraint_broken", Action.RETREAT, (_MOVING, Condition("margin", "<", 0.0)), "a constraint is violated"),
+    Rule(
+        "constraint_broken",
+        Action.RETREAT,
+        (_MOVING, Condition("margin", "<", 0.0)),
+        "a constraint is violated",
+    ),
     Rule(
         "too_close_unsure",
         Action.RETREAT,
@@ -191,10 +234,27 @@ RULES: tuple[Rule, ...] = (
         (_AT_REST, Condition("converged", "==", 0)),
         "at rest until convergence (paper)",
     ),
-    Rule("convergence_lost", Action.HOLD, (Condition("converged", "==", 0),), "convergence was lost"),
-    Rule("no_plan_yet", Action.STAND_STILL, (_AT_REST, Condition("planned", "==", 0)), "no capture within the horizon"),
-    Rule("plan_lost", Action.HOLD, (Condition("planned", "==", 0),), "no capture within the horizon any more"),
-    Rule("blind_at_rest", Action.STAND_STILL, (_AT_REST, _FAULTY), "the approach does not begin without measurements"),
+    Rule(
+        "convergence_lost", Action.HOLD, (Condition("converged", "==", 0),), "convergence was lost"
+    ),
+    Rule(
+        "no_plan_yet",
+        Action.STAND_STILL,
+        (_AT_REST, Condition("planned", "==", 0)),
+        "no capture within the horizon",
+    ),
+    Rule(
+        "plan_lost",
+        Action.HOLD,
+        (Condition("planned", "==", 0),),
+        "no capture within the horizon any more",
+    ),
+    Rule(
+        "blind_at_rest",
+        Action.STAND_STILL,
+        (_AT_REST, _FAULTY),
+        "the approach does not begin without measurements",
+    ),
     Rule(
         "recovering",
         Action.HOLD,
@@ -204,7 +264,12 @@ RULES: tuple[Rule, ...] = (
     Rule("arrived_sure", Action.CAPTURE, (_AT_END, _ACCURATE), "accurate enough at the end"),
     Rule("arrived_unsure", Action.HOLD, (_AT_END, _INACCURATE), "not accurate enough at the end"),
     Rule("healthy", Action.APPROACH, (_HEALTHY,), "measurements improve the estimate"),
-    Rule("prediction_good", Action.APPROACH_ON_PREDICTION, (_ACCURATE,), "accurate enough without measurements"),
+    Rule(
+        "prediction_good",
+        Action.APPROACH_ON_PREDICTION,
+        (_ACCURATE,),
+        "accurate enough without measurements",
+    ),
     Rule("blind_holding", Action.HOLD, (_HOLDING,), "still no healthy measurement"),
     Rule(
         "short_gap",
@@ -232,9 +297,13 @@ class Supervisor:
         """
         for f in fields(params):
             if getattr(params, f.name) is None:
-                raise ValueError(f"{f.name} is None, resolve the parameters with the target's extent first")
+                raise ValueError(
+                    f"{f.name} is None, resolve the parameters with the target's extent first"
+                )
         if not rules or rules[-1].conditions:
-            raise ValueError("the last rule must have no condition, so that one rule always applies")
+            raise ValueError(
+                "the last rule must have no condition, so that one rule always applies"
+            )
         self.params = params
         self.rules = rules
 
@@ -253,10 +322,16 @@ class Supervisor:
         now = replace(memory, seen_s=seen_s, healthy_run=run)
         measures = self._measures(now, facts)
         rule = next(
-            rule for rule in self.rules if all(self._holds(condition, measures) for condition in rule.conditions)
+            rule
+            for rule in self.rules
+            if all(self._holds(condition, measures) for condition in rule.conditions)
         )
         holding = rule.action in (Action.HOLD, Action.RETREAT)
-        since = (memory.held_since_s if memory.held_since_s is not None else facts.t_s) if holding else None
+        since = (
+            (memory.held_since_s if memory.held_since_s is not None else facts.t_s)
+            if holding
+            else None
+        )
         moving = memory.moving or rule.action is not Action.STAND_STILL
         begins = rule.action in _CLOSING and memory.action not in _CLOSING
         after = replace(
@@ -271,13 +346,15 @@ class Supervisor:
         return after, Decision(rule.action, rule.name)
 
     def error_ratio(self, facts: Facts) -> float:
-        """Return the predicted error at the end of the plan over the tolerance; infinite where it is unknown.
+        """Return the predicted error at the end of the plan over the tolerance; infinite where it
+        is unknown.
 
         Args:
             facts: What is known after a scan.
 
         Returns:
-            ``sigmas`` times the largest of the three ratios 1 sigma / tolerance (position, speed, attitude).
+            ``sigmas`` times the largest of the three ratios 1 sigma / tolerance (position, speed,
+            attitude).
         """
         p = self.params
         parts = (
@@ -309,15 +386,20 @@ class Supervisor:
         }
 
     def _holds(self, condition: Condition, measures: Mapping[str, float]) -> bool:
-        bound = float(getattr(self.params, condition.bound)) if isinstance(condition.bound, str) else condition.bound
+        bound = (
+            float(getattr(self.params, condition.bound))
+            if isinstance(condition.bound, str)
+            else condition.bound
+        )
         return _COMPARE[condition.compare](measures[condition.measure], bound)
 
 
 def resting(scene: Scene, r: Array, v: Array, least_m: float, a_max: float) -> Scene:
     """Return the rest point of a hold, a retreat or an abort as the goal of a rendezvous.
 
-    The robot brakes as hard as possible relative to the centre of mass. If it would stop closer to the sphere that
-    contains the target than required, the rest point has this distance, directly away from the target.
+    The robot brakes as hard as possible relative to the centre of mass. If it would stop closer to
+    the sphere that contains the target than required, the rest point has this distance, directly
+    away from the target.
 
     Args:
         scene: The target now.

@@ -1,7 +1,8 @@
-"""Monte Carlo evaluation of a plan over the belief from which it was made and over the errors of the thrust.
+"""Monte Carlo evaluation of a plan over the belief from which it was made and over the errors of
+the thrust.
 
-The planner does not depend on the estimator: each draw of the error state is passed as one possible future of the
-target.
+The planner does not depend on the estimator: each draw of the error state is passed as one possible
+future of the target.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ class Spread:
         miss_m, speed_mps, angle_deg: Terminal errors of the one plan in each future.
         probability: Fraction of futures in which the errors are within the tolerance.
         probability_95: Its Wilson 95 % interval.
-        contact: Fraction of futures in which the end-effector touches the body outside the corridor; NaN: not checked.
+        contact: Fraction of futures in which the end-effector touches the body outside the
+            corridor; NaN: not checked.
         contact_95: Its Wilson 95 % interval.
     """
 
@@ -80,19 +82,28 @@ class Spread:
         out = [
             (
                 "t_go over belief",
-                f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; no plan in {self.infeasible} of the draws",
+                (
+                    f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; no plan in"
+                    f" {self.infeasible} of the draws"
+                ),
             ),
             ("miss over belief", _text(self.miss_m, 1e3, "mm", 2)),
             ("speed over belief", _text(self.speed_mps, 1e3, "mm/s", 2)),
             ("angle over belief", _text(self.angle_deg, 1.0, "deg", 3)),
             (
                 "capture probability",
-                f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws without replanning",
+                (
+                    f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws"
+                    " without replanning"
+                ),
             ),
         ]
         if self.contact >= 0.0:
             low, high = self.contact_95
-            text = f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor, without replanning"
+            text = (
+                f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor, without"
+                " replanning"
+            )
             out.append(("contact probability", text))
         return out
 
@@ -104,7 +115,8 @@ def _text(band: Band, scale: float, unit: str, digits: int) -> str:
 
 @value_class
 class Disturbance:
-    """Errors of the thrust: accelerations that are constant over each second, normal, independent between the axes.
+    """Errors of the thrust: accelerations that are constant over each second, normal, independent
+    between the axes.
 
     Attributes:
         sigma_mps2: 1 sigma of each axis [m/s2].
@@ -115,7 +127,8 @@ class Disturbance:
     rng: np.random.Generator
 
     def deviation(self, times: Array) -> tuple[Array, Array]:
-        """Draw one deviation of the robot from its planned path; each call draws a new one from ``rng``.
+        """Draw one deviation of the robot from its planned path; each call draws a new one from
+        ``rng``.
 
         Args:
             times: (n,) ascending from 0 [s].
@@ -159,7 +172,9 @@ def _root(P: Array) -> Array:
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(0.5 * (P + P.T) / np.outer(safe, safe))
     if values[0] < -1e-6 or np.any(np.diagonal(P) < 0.0):
-        raise ValueError(f"covariance is not positive: least eigenvalue of its correlation is {values[0]:.3g}")
+        raise ValueError(
+            f"covariance is not positive: least eigenvalue of its correlation is {values[0]:.3g}"
+        )
     root: Array = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return root
 
@@ -182,7 +197,8 @@ def spread(
         tolerance: Largest errors of a capture.
         attitude: (4,) q_ac of the gripper at the end.
         disturbance: Errors of the thrust; none where None.
-        limits: Resolved limits whose clearance is the radius of the end-effector; None: contact is not checked.
+        limits: Resolved limits whose clearance is the radius of the end-effector; None: contact is
+            not checked.
 
     Raises:
         ValueError: There is no future.
@@ -230,7 +246,9 @@ def touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of the fraction of ``successes`` in ``count`` trials, at least 1."""
+    """Return the Wilson 95 % interval of the fraction of ``successes`` in ``count`` trials, at
+    least 1.
+    """
     z2 = 1.96**2
     centre = (successes + 0.5 * z2) / (count + z2)
     half = 1.96 / (count + z2) * math.sqrt(successes * (count - successes) / count + 0.25 * z2)

@@ -13,7 +13,13 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.registration import PAIR_POINTS, SAME_SIDE, Pairing, moved, registered
-from avsreplay.reconstruct.tracking import KEEP_RATIO, FreeMotion, ReconstructionParams, Tracked, patchwork
+from avsreplay.reconstruct.tracking import (
+    KEEP_RATIO,
+    FreeMotion,
+    ReconstructionParams,
+    Tracked,
+    patchwork,
+)
 from avsreplay.reconstruct.views import (
     NEIGHBOURS,
     ScanView,
@@ -35,22 +41,38 @@ from avsreplay.register import sampling
 
 MOTION_POINTS = 1500  # points of a scan in one comparison for the fit of the motion
 FEWEST_KEYS = 40  # in a log with fewer key scans, every scan is a key scan in the refinement
-STILL = 0.1  # share of the spacing of the points up to which a moved pair of views keeps its corresponding points
+# share of the spacing of the points up to which a moved pair of views keeps its corresponding
+# points
+STILL = 0.1
 MERGED = 30  # nearest points of all key scans from which a normal is estimated
 MERGED_REACH = 0.03  # their largest distance as a share of the extent
 LEAST_VARIANCE = 0.1  # least variance of a point along its normal, in units of the median
 LONELY = 0.25  # weight of a point with too few neighbours for a variance
 MOST_SIGHTS = 60  # scans that are tested for rays through a point
-MOST_EMPTY = 3  # scans that face a point without a return there; with more, a point from one scan is left out
+# scans that face a point without a return there; with more, a point from one scan is left out
+MOST_EMPTY = 3
 OFTEN = 6  # points that so many scans have measured are compared with a third of the scans at first
 MOST_ASKED = 3000  # points of the model that are compared with one view
-LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
-MISSED = 0.05  # share of the surface in its direction that a view of a right model seldom contradicts
-SELDOM, FALSE_ALARM = 0.1, 0.01  # largest probability that it does; significance level of the test of all views
+# share of the model's visible points that a view must show, in units of the median of all views
+LEAST_SHOWN = 0.8
+MISSED = (
+    0.05  # share of the surface in its direction that a view of a right model seldom contradicts
+)
+SELDOM, FALSE_ALARM = (
+    0.1,
+    0.01,
+)  # largest probability that it does; significance level of the test of all views
 MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
-LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # damping; relative improvement of the rms that ends the steps
-SUPPORT = 5  # least number of the ten nearest points that continue the surface of a point from one scan
-SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
+LEAST_DAMPING, LEAST_GAIN = (
+    1e-3,
+    1e-4,
+)  # damping; relative improvement of the rms that ends the steps
+SUPPORT = (
+    5  # least number of the ten nearest points that continue the surface of a point from one scan
+)
+SPREAD_RAD = np.radians(
+    30.0
+)  # a direction counts as covered if a scan was taken from within this angle of it
 
 
 def refined(
@@ -58,15 +80,16 @@ def refined(
 ) -> tuple[list[ScanView], dict[int, Pose], float, float]:
     """Poses of the key views that minimise the distances between overlapping pairs.
 
-    The pairs of one view are spread evenly over the angles up to 90 degrees: pairs of views of nearly the same side do
-    not show a common displacement of all scans along the line of sight. After a first adjustment the normals are
-    estimated again, from the points of all key scans together. The weights of the result are inverse variances of the
-    points about the planes of their neighbours. They serve the fit of the motion only: a wrong pose makes the surface
-    rough where it lies, and with such weights in the adjustment of the poses it would stay there.
+    The pairs of one view are spread evenly over the angles up to 90 degrees: pairs of views of
+    nearly the same side do not show a common displacement of all scans along the line of sight.
+    After a first adjustment the normals are estimated again, from the points of all key scans
+    together. The weights of the result are inverse variances of the points about the planes of
+    their neighbours. They serve the fit of the motion only: a wrong pose makes the surface rough
+    where it lies, and with such weights in the adjustment of the poses it would stay there.
 
     Returns:
-        The views with the better normals and these weights, T_ac by number of the key view, the rms of the distances
-        that is left, and the gate that was used for them [m].
+        The views with the better normals and these weights, T_ac by number of the key view, the rms
+        of the distances that is left, and the gate that was used for them [m].
     """
     keys, known = list(tracked.keys), sorted(tracked.poses)
     if len(keys) < FEWEST_KEYS:
@@ -82,7 +105,11 @@ def refined(
 
 
 def _adjusted(
-    views: Sequence[ScanView], start: dict[int, Pose], p: ReconstructionParams, extent: float, gate: float
+    views: Sequence[ScanView],
+    start: dict[int, Pose],
+    p: ReconstructionParams,
+    extent: float,
+    gate: float,
 ) -> tuple[dict[int, Pose], float, float]:
     """Gauss-Newton iterations of the poses of all key views; the gate [m] follows the distances."""
     keys = sorted(start)
@@ -106,17 +133,24 @@ def _adjusted(
 
 
 def _with_merged_normals(
-    views: Sequence[ScanView] | dict[int, ScanView], poses: dict[int, Pose], extent: float, weighted: bool
+    views: Sequence[ScanView] | dict[int, ScanView],
+    poses: dict[int, Pose],
+    extent: float,
+    weighted: bool,
 ) -> dict[int, ScanView]:
-    """The key views with normals from the nearest points of all of them that lie on the same side of the target.
+    """The key views with normals from the nearest points of all of them that lie on the same side
+    of the target.
 
-    If ``weighted``, the weight of a point is the inverse of the variance of these points along the normal, in units of
-    the median variance: points at edges and of thin parts, whose neighbours lie on different faces, count little.
+    If ``weighted``, the weight of a point is the inverse of the variance of these points along the
+    normal, in units of the median variance: points at edges and of thin parts, whose neighbours lie
+    on different faces, count little.
     """
     keys = sorted(poses)
     p = np.vstack([poses[k].inverse().apply(views[k].points) for k in keys])
     n = np.vstack([views[k].normals @ poses[k].R for k in keys])
-    normals, squares, count = point_tree(p).planes(p, n, p, n, MERGED, MERGED_REACH * extent, SAME_SIDE)
+    normals, squares, count = point_tree(p).planes(
+        p, n, p, n, MERGED, MERGED_REACH * extent, SAME_SIDE
+    )
     good = count >= NEIGHBOURS
     normals *= np.where(np.einsum("ni,ni->n", normals, n) < 0.0, -1.0, 1.0)[:, None]
     normals = np.where(good[:, None], normals, n)
@@ -131,14 +165,20 @@ def _with_merged_normals(
 
 
 def joint_motion(
-    views: Sequence[ScanView], fine: dict[int, ScanView], start: FreeMotion, gate: float, thin_m: float, extent: float
+    views: Sequence[ScanView],
+    fine: dict[int, ScanView],
+    start: FreeMotion,
+    gate: float,
+    thin_m: float,
+    extent: float,
 ) -> FreeMotion:
     """The free motion that minimises the distances between overlapping pairs of key views.
 
-    The distances determine some directions of a pose much better than others: the turn of a cylinder about its axis is
-    hardly seen. A motion that is fitted to the poses with equal weights spreads the errors of the bad directions over
-    the good ones; fitted to the distances it uses the information of all scans about each direction. Normals and
-    weights depend on the poses and are estimated again from the first result, for more points of each scan.
+    The distances determine some directions of a pose much better than others: the turn of a
+    cylinder about its axis is hardly seen. A motion that is fitted to the poses with equal weights
+    spreads the errors of the bad directions over the good ones; fitted to the distances it uses the
+    information of all scans about each direction. Normals and weights depend on the poses and are
+    estimated again from the first result, for more points of each scan.
 
     Args:
         views: of the log, with the normals of all key views together.
@@ -152,7 +192,9 @@ def joint_motion(
         The motion after Levenberg-Marquardt steps in the 20 initial values.
     """
     motion = _least_distances([views[k] for k in fine], start, gate, thin_m, extent)
-    better = _with_merged_normals(fine, {k: motion.at(view.t_ns) for k, view in fine.items()}, extent, True)
+    better = _with_merged_normals(
+        fine, {k: motion.at(view.t_ns) for k, view in fine.items()}, extent, True
+    )
     return _least_distances([better[k] for k in fine], motion, gate, thin_m, extent)
 
 
@@ -160,7 +202,9 @@ def _least_distances(
     views: Sequence[ScanView], start: FreeMotion, gate: float, thin_m: float, extent: float
 ) -> FreeMotion:
     instants, chart, damping = [view.t_ns for view in views], to_chart(start.state), LEAST_DAMPING
-    pairing = Pairing(views, [start.at(t_ns).inverse() for t_ns in instants], MOTION_POINTS, STILL * thin_m)
+    pairing = Pairing(
+        views, [start.at(t_ns).inverse() for t_ns in instants], MOTION_POINTS, STILL * thin_m
+    )
     best, best_rms = start, np.inf
     for _ in range(MOST_STEPS):
         tried = replace(start, state=to_state(chart))
@@ -182,7 +226,11 @@ def _least_distances(
 
 
 def all_poses(
-    views: Sequence[ScanView], tracked: Tracked, keys: dict[int, Pose], p: ReconstructionParams, extent: float
+    views: Sequence[ScanView],
+    tracked: Tracked,
+    keys: dict[int, Pose],
+    p: ReconstructionParams,
+    extent: float,
 ) -> dict[int, Pose]:
     """Every tracked view registered once more, on the refined model of the key views."""
     model = patchwork(views, replace(tracked, poses=keys), 0.6 * p.thin * extent)
@@ -201,11 +249,13 @@ def all_poses(
 def contradicting(
     views: Sequence[ScanView], poses: dict[int, Pose], p: ReconstructionParams, extent: float
 ) -> tuple[list[int], Array]:
-    """Views without the surface that faces them by all other views: their poses are wrong, or they show another object.
+    """Views without the surface that faces them by all other views: their poses are wrong, or they
+    show another object.
 
-    Points of the joint model that face a view and that nothing hides must be in it. A pose that is wrong puts the
-    surfaces of other views where this one has measured something farther away, or nothing. The share of the points that
-    are there is compared with the median over all views, because a scanner may lose returns everywhere.
+    Points of the joint model that face a view and that nothing hides must be in it. A pose that is
+    wrong puts the surfaces of other views where this one has measured something farther away, or
+    nothing. The share of the points that are there is compared with the median over all views,
+    because a scanner may lose returns everywhere.
 
     Args:
         views: of the log.
@@ -214,24 +264,29 @@ def contradicting(
         extent: of the target [m].
 
     Returns:
-        The numbers of the views with less than LEAST_SHOWN of the median share, and for every view (n, 2) the share of
-        the points in its direction that it has seen through, with a return from farther away, and the share that it
-        has seen through or where it has no return. A surface without a return contradicts poses that nothing else
-        confirms; materials that return no light, and the limits of the field of view, also cause it.
+        The numbers of the views with less than LEAST_SHOWN of the median share, and for every view
+        (n, 2) the share of the points in its direction that it has seen through, with a return from
+        farther away, and the share that it has seen through or where it has no return. A surface
+        without a return contradicts poses that nothing else confirms; materials that return no
+        light, and the limits of the field of view, also cause it.
     """
     model = patchwork(views, Tracked(poses, sorted(poses), [], 0, []), p.thin * extent)
     every, reach = max(1, len(model.points) // MOST_ASKED), 0.03 * extent
     shown, missed = [], []
     for k in sorted(poses):
         q, n = poses[k].apply(model.points[::every]), model.normals[::every] @ poses[k].R.T
-        lines, measured = views[k].camera - q, np.linalg.norm(views[k].points - views[k].camera, axis=1)
+        lines, measured = (
+            views[k].camera - q,
+            np.linalg.norm(views[k].points - views[k].camera, axis=1),
+        )
         far = np.linalg.norm(lines, axis=1)
         facing = np.einsum("ni,ni->n", n, lines) > 0.5 * far
         off, nearest = views[k].rays.query(-lines[facing] / far[facing, None])
         behind = measured[nearest[:, 0]] - far[facing]
         hit = off[:, 0] * far[facing] <= reach
         hidden, there, seen = (
-            int((hit & where).sum()) for where in (behind < -reach, abs(behind) <= reach, behind > reach)
+            int((hit & where).sum())
+            for where in (behind < -reach, abs(behind) <= reach, behind > reach)
         )
         shown.append(there / max(len(hit) - hidden, 1))
         missed.append((seen / max(seen + there, 1), 1.0 - shown[-1]))
@@ -243,8 +298,9 @@ def contradicting(
 def refuted(missed: Array) -> bool:
     """Whether more views contradict a model than are expected of a right one, by a binomial test.
 
-    A view of a right model misses more than the share MISSED of the surface in its direction with a probability of at
-    most SELDOM. The model is refuted if as many views as have missed more have a probability below FALSE_ALARM.
+    A view of a right model misses more than the share MISSED of the surface in its direction with a
+    probability of at most SELDOM. The model is refuted if as many views as have missed more have a
+    probability below FALSE_ALARM.
 
     Args:
         missed: (n,) shares of the surface in the direction of each view.
@@ -263,33 +319,41 @@ class Sight:
     T_ac: Pose
 
     def seen_through(self, p_c: Array, spacing_m: float) -> Array:
-        """How far behind points (m, 3) of {C} this scan measured a surface in the same direction [m]; 0: nothing."""
+        """How far behind points (m, 3) of {C} this scan measured a surface in the same direction
+        [m]; 0: nothing.
+        """
         return depth_behind(self.T_ac.apply(p_c), self.points, self.camera, spacing_m)
 
     def without_return(self, p_c: Array, normals: Array, reach_m: float) -> NDArray[np.bool_]:
-        """Whether points (m, 3) of {C} on surfaces inclined by less than 60 degrees lie where this scan has no points.
+        """Whether points (m, 3) of {C} on surfaces inclined by less than 60 degrees lie where this
+        scan has no points.
 
-        The nearest line of sight with a return must pass farther away than ``reach_m`` and three times the spacing of
-        the points of the scan, so that something in front of a point also counts as a return.
+        The nearest line of sight with a return must pass farther away than ``reach_m`` and three
+        times the spacing of the points of the scan, so that something in front of a point also
+        counts as a return.
         """
         p, rays = self.T_ac.apply(p_c) - self.camera, self.points - self.camera
         far = np.linalg.norm(p, axis=1)
         tree = point_tree(rays / np.linalg.norm(rays, axis=1, keepdims=True))
         spacing = float(np.median(spacings(point_tree(self.points), self.points)))
         facing = np.abs(np.einsum("ni,ni->n", normals @ self.T_ac.R.T, p)) > 0.5 * far
-        return np.asarray(facing & (tree.query(p / far[:, None])[0][:, 0] * far > max(reach_m, 3.0 * spacing)))
+        return np.asarray(
+            facing & (tree.query(p / far[:, None])[0][:, 0] * far > max(reach_m, 3.0 * spacing))
+        )
 
 
 def fused(
     scans: Iterable[Scan], survey: Survey, twist: dict[int, Twist], size_m: float, rms_m: float
 ) -> tuple[Array, Array, Array, NDArray[np.int64], list[Sight]]:
-    """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one scan at a time.
+    """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one
+    scan at a time.
 
-    Points are left out if the scans whose rays pass through them are more than a third of those that have measured
-    them. Points that only one scan has measured are left out if they do not continue the surface of their neighbours,
-    or if more than MOST_EMPTY scans that face them have no return from their direction: they belong to something else.
-    Where voxels hold few points, their scatter is joined with one square of the noise of a point: half the mean square
-    ``rms_m`` of the distances between two scans.
+    Points are left out if the scans whose rays pass through them are more than a third of those
+    that have measured them. Points that only one scan has measured are left out if they do not
+    continue the surface of their neighbours, or if more than MOST_EMPTY scans that face them have
+    no return from their direction: they belong to something else. Where voxels hold few points,
+    their scatter is joined with one square of the noise of a point: half the mean square ``rms_m``
+    of the distances between two scans.
     """
     points, normals, owner, sights = [], [], [], list[Sight]()
     apart = max(1, len(twist) // MOST_SIGHTS)
@@ -299,27 +363,40 @@ def fused(
         full = full_cloud(scan, twist[k])
         fine, T_ca = central_points(full, 0.7 * size_m), twist[k].T_ac.inverse()
         points.append(T_ca.apply(fine).astype(np.float32))
-        normals.append((normals_of(fine, full, camera_of(scan, survey)) @ T_ca.R.T).astype(np.float32))
+        normals.append(
+            (normals_of(fine, full, camera_of(scan, survey)) @ T_ca.R.T).astype(np.float32)
+        )
         owner.append(np.full(len(fine), k))
         if (len(owner) - 1) % apart == 0:
             sights.append(Sight(fine, camera_of(scan, survey), twist[k].T_ac))
-    p, n, who = np.vstack(points).astype(np.float64), np.vstack(normals).astype(np.float64), np.concatenate(owner)
+    p, n, who = (
+        np.vstack(points).astype(np.float64),
+        np.vstack(normals).astype(np.float64),
+        np.concatenate(owner),
+    )
     mean, normal, cell = averaged(p, n, size_m)
     count = np.bincount(cell)
-    seen = np.bincount(np.unique(cell * (who.max() + 1) + who) // (who.max() + 1), minlength=len(count))
+    seen = np.bincount(
+        np.unique(cell * (who.max() + 1) + who) // (who.max() + 1), minlength=len(count)
+    )
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])
     wide = 1.5 * size_m  # rays of one scan are farther apart than points of all scans
     keep = _seen_through(mean, seen, sights, wide) * (len(twist) / len(sights)) <= 0.34 * seen
     keep &= (seen >= 2) | (len(twist) < 12) | continues(mean, normal, size_m)
     once = np.flatnonzero(keep & (seen == 1))
-    empty = sum(s.without_return(mean[once], normal[once], 2.0 * wide).astype(np.float64) for s in sights)
+    empty = sum(
+        s.without_return(mean[once], normal[once], 2.0 * wide).astype(np.float64) for s in sights
+    )
     keep[once] = np.asarray(empty) * (len(twist) / len(sights)) <= MOST_EMPTY
     sigma = np.sqrt(np.bincount(cell, height**2) + 0.5 * rms_m**2) / count
     return mean[keep], normal[keep], np.maximum(sigma, 1e-3 * size_m)[keep], seen[keep], sights
 
 
 def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wide: float) -> Array:
-    """Number of sights (n,) that have measured something behind each point; a point seen OFTEN needs several."""
+    """Number of sights (n,) that have measured something behind each point.
+
+    A point seen OFTEN needs several.
+    """
     through, tested = np.zeros(len(p)), np.arange(len(p))
     for part in (sights[::3], sights[1::3], sights[2::3]):
         for sight in part:
@@ -329,7 +406,9 @@ def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wi
 
 
 def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
-    """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and are in its plane."""
+    """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and
+    are in its plane.
+    """
     distances, nearest = point_tree(p).query(p, k=2 * SUPPORT + 1, most_m=3.0 * size_m)
     d = distances[:, 1:]
     index = np.where(np.isfinite(d), nearest[:, 1:], 0)
@@ -339,7 +418,9 @@ def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
 
 
 def turn_and_coverage(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple[float, float]:
-    """Largest turn between two poses [rad], and the share of all directions in {C} from which a scan was taken."""
+    """Largest turn between two poses [rad], and the share of all directions in {C} from which a
+    scan was taken.
+    """
     turns = [turn(poses[0], T) for T in poses]
     seen = sight_lines(views, [T.inverse() for T in poses])
     near = (sampling.directions(1000) @ seen.T).max(axis=1) > np.cos(SPREAD_RAD)

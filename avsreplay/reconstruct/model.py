@@ -1,4 +1,7 @@
-"""The reconstructed model: its frame, its comparison with a CAD model, and the files that hold it."""
+"""The reconstructed model.
+
+Its frame, its comparison with a CAD model, and the files that hold it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,9 @@ from avsreplay.reconstruct.views import averaged, point_tree
 from avsreplay.records import BLOCKS, Surface
 
 PATCH = 0.04  # radius of a grasp patch as a share of the extent
-APPROACH = np.cos(np.radians(20.0))  # cosine of the half-angle of the cone about the outward normal that must be free
+APPROACH = np.cos(
+    np.radians(20.0)
+)  # cosine of the half-angle of the cone about the outward normal that must be free
 MOST_REGIONS = 10
 FEWEST_IN_REGION = 10  # least number of points of a region
 FEWEST_EMPTY = 3.0  # least number of scans without a return from a surface that they faced
@@ -31,11 +36,15 @@ class Reconstruction:
     """A model made from scans.
 
     Attributes:
-        points: (n, 3) surface points in {C} [m].  normals: (n, 3) outward unit normals.
-        one_sigma_m: (n,) standard error of each point along its normal [m].  scans: (n,) scans that saw each point.
+        points: (n, 3) surface points in {C} [m].
+        normals: (n, 3) outward unit normals.
+        one_sigma_m: (n,) standard error of each point along its normal [m].
+        scans: (n,) scans that saw each point.
         poses: instant and pose T_ac of every scan that was used.
-        used, offered: scans used, and scans in the log.  searches: scans whose pose a global search found.
-        coverage: share of all directions from which the target was seen.  turn_deg: largest angle between two views.
+        used, offered: scans used, and scans in the log.
+        searches: scans whose pose a global search found.
+        coverage: share of all directions from which the target was seen.
+        turn_deg: largest angle between two views.
         rms_m: of the point-to-plane distances after the refinement [m].
         voxel_m: edge of the voxels in which points were averaged [m].
         notes: what limits the result, in sentences.
@@ -70,12 +79,17 @@ class Reconstruction:
 
     @property
     def spacing_m(self) -> float:
-        """Distance up to which neighbouring points, or rays of one scan, belong to one surface [m]."""
+        """Distance up to which neighbouring points, or rays of one scan, belong to one
+        surface [m].
+        """
         return 1.5 * self.voxel_m
 
     @property
     def mass_centre(self) -> tuple[Array, float] | None:
-        """Mass centre (3,) in {C} [m] and its 1 sigma, the root of the trace [m]; None if the motion is not known."""
+        """Mass centre (3,) in {C} [m] and its 1 sigma, the root of the trace [m].
+
+        None if the motion is not known.
+        """
         if self.motion is None:
             return None
         centre, spread = self.motion.mass_centre_c
@@ -83,37 +97,50 @@ class Reconstruction:
 
     @property
     def principal_axes(self) -> tuple[Array, float] | None:
-        """Attitude q_cb (4,) of the principal axes in {C} and its 1 sigma [rad]; None if the motion is not known."""
+        """Attitude q_cb (4,) of the principal axes in {C} and its 1 sigma [rad].
+
+        None if the motion is not known.
+        """
         if self.motion is None:
             return None
         P = self.motion.P[BLOCKS["mu"], BLOCKS["mu"]]
         q_ob = geometry.conjugate(self.motion.state.q_bc)
-        return geometry.multiply(geometry.conjugate(self.T_oc.q), q_ob), 2.0 * float(np.sqrt(np.trace(P)))
+        return geometry.multiply(geometry.conjugate(self.T_oc.q), q_ob), 2.0 * float(
+            np.sqrt(np.trace(P))
+        )
 
 
 def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction:
-    """Move the frame {C} to a grasp point: origin there, x axis along the outward normal of the surface.
+    """Move the frame {C} to a grasp point: origin there, x axis along the outward normal of the
+    surface.
 
     Args:
         made: the reconstruction.
-        grasp: (3,) in {C} [m]; None chooses the flattest reachable patch, whose normals differ least within a radius of
-            4 % of the extent. Enough scans must have seen it, and no other point may lie within 20 degrees of its
-            outward normal up to half the extent.
+        grasp: (3,) in {C} [m]; None chooses the flattest reachable patch, whose normals differ
+            least within a radius of 4 % of the extent. Enough scans must have seen it, and no other
+            point may lie within 20 degrees of its outward normal up to half the extent.
 
     Raises:
         UsageError: the point is farther from the surface than 5 % of the extent.
     """
-    tree, chosen_by = cKDTree(made.points), "the given point" if grasp is not None else "the flattest reachable patch"
+    tree, chosen_by = (
+        cKDTree(made.points),
+        "the given point" if grasp is not None else "the flattest reachable patch",
+    )
     if grasp is None:
         grasp = _flattest(made)
     distance, nearest = tree.query(grasp)
     if distance > 0.05 * made.extent:
         hint = "give a point of the reconstructed model, in its frame"
-        raise UsageError(f"the grasp point is {distance:.3f} m from the surface", where="--grasp", hint=hint)
+        raise UsageError(
+            f"the grasp point is {distance:.3f} m from the surface", where="--grasp", hint=hint
+        )
     index = tree.query_ball_point(made.points[nearest], PATCH * made.extent)
     x = _unit(made.normals[index].mean(axis=0))
     y = _unit(np.cross([0.0, 0.0, 1.0] if abs(x[2]) < 0.9 else [1.0, 0.0, 0.0], x))
-    T_old_new = Pose(geometry.quaternion(np.column_stack([x, y, np.cross(x, y)])), np.asarray(grasp))
+    T_old_new = Pose(
+        geometry.quaternion(np.column_stack([x, y, np.cross(x, y)])), np.asarray(grasp)
+    )
     inverse = T_old_new.inverse()
     return replace(
         made,
@@ -134,7 +161,9 @@ def _flattest(made: Reconstruction) -> Array:
     chosen = chosen[:: max(1, len(chosen) // 4000)]
     near: Any = cKDTree(points).query_ball_point(points[chosen], PATCH * made.extent)
     full = np.median([len(k) for k in near])
-    flat = np.array([float(np.linalg.norm(normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near])
+    flat = np.array(
+        [float(np.linalg.norm(normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near]
+    )
     order = np.argsort(-flat, kind="stable")
     for k in order[flat[order] > 0.0]:
         if _reachable(points, made.extent, points[chosen[k]], normals[near[k]].mean(axis=0)):
@@ -161,17 +190,25 @@ def surface_of(made: Reconstruction) -> Surface:
         made: the reconstruction.
     """
     data = reconstruction_ply(made)
-    return Surface(made.points, np.zeros((0, 3), np.int32), "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)
+    return Surface(
+        made.points,
+        np.zeros((0, 3), np.int32),
+        "reconstructed.ply",
+        hashlib.sha256(data).hexdigest(),
+        data,
+    )
 
 
 def meshed(made: Reconstruction) -> tuple[Surface, float]:
-    """Return a triangle mesh of the model, by screened Poisson reconstruction (Kazhdan and Hoppe, 2013).
+    """Return a triangle mesh of the model, by screened Poisson reconstruction (Kazhdan and Hoppe,
+    2013).
 
     Args:
         made: the reconstruction.
 
     Returns:
-        The mesh in {C} without parts farther than 4 voxels from any point, and the share of its area that is
+        The mesh in {C} without parts farther than 4 voxels from any point, and the share of its
+        area that is
         interpolated: farther than 1.5 voxels from any point.
 
     Raises:
@@ -181,18 +218,28 @@ def meshed(made: Reconstruction) -> tuple[Surface, float]:
         import open3d
     except ImportError:
         hint = "pip install 'avsreplay[open3d]'"
-        raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint) from None
+        raise MissingBackend(
+            "a mesh needs Open3D, which is not installed", where="--mesh", hint=hint
+        ) from None
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(made.points))
     cloud.normals = open3d.utility.Vector3dVector(made.normals)
-    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(made.points, axis=0).max() / made.spacing_m)), 5, 9))
-    mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    depth = int(
+        np.clip(np.ceil(np.log2(1.1 * np.ptp(made.points, axis=0).max() / made.spacing_m)), 5, 9)
+    )
+    mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=depth, n_threads=1
+    )
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
     corners = vertices[faces]
     away = np.asarray(cKDTree(made.points).query(corners.mean(axis=1))[0])
     faces, kept = faces[away < 4.0 * made.spacing_m], away[away < 4.0 * made.spacing_m]
-    area = np.linalg.norm(np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))), axis=1)
+    area = np.linalg.norm(
+        np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))), axis=1
+    )
     used, faces = np.unique(faces, return_inverse=True)
-    surface = Surface(frozen(vertices[used]), faces.reshape(-1, 3).astype(np.int32), "reconstructed.ply", "")
+    surface = Surface(
+        frozen(vertices[used]), faces.reshape(-1, 3).astype(np.int32), "reconstructed.ply", ""
+    )
     return surface, float(area[kept > 1.5 * made.spacing_m].sum() / max(area.sum(), 1e-30))
 
 
@@ -201,11 +248,14 @@ class Region:
     """A part of the target that differs from its CAD model.
 
     Attributes:
-        kind: ``added`` (measured where the model has no surface), ``missing`` (scans saw through its surface) or
-            ``no_return`` (scans that faced its surface have no points there: missing, or a material that returns none).
-        points: number of points.  centre_m: its centre in the frame of the CAD model [m].
+        kind: ``added`` (measured where the model has no surface), ``missing`` (scans saw through
+            its surface) or ``no_return`` (scans that faced its surface have no points there:
+            missing, or a material that returns none).
+        points: number of points.
+        centre_m: its centre in the frame of the CAD model [m].
         size_m: diagonal of its bounding box [m].
-        deviation_m: median distance, positive outside the model, negative where it is missing; NaN beyond ``most_m``.
+        deviation_m: median distance, positive outside the model, negative where it is missing; NaN
+            beyond ``most_m``.
     """
 
     kind: str
@@ -221,8 +271,10 @@ class Deviations:
 
     Attributes:
         T_mc: pose of the reconstruction's {C} in the frame of the CAD model.
-        signed_m: (n,) distance of each point from the CAD surface, positive outside [m]; NaN beyond ``most_m``.
-        most_m: largest distance that is measured.  inlier_ratio: share of the points nearer than that.
+        signed_m: (n,) distance of each point from the CAD surface, positive outside [m]; NaN beyond
+            ``most_m``.
+        most_m: largest distance that is measured.
+        inlier_ratio: share of the points nearer than that.
         median_m, p95_m: median and 95 % quantile of the absolute distances that were measured [m].
         regions: parts that differ, largest first.
     """
@@ -246,8 +298,8 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     Raises:
         UnreadableInput: no pose was found at which the two agree.
     """
-    from avsreplay.register import Registrar
     from avsreplay.register.params import Camera, RegisterParams
+    from avsreplay.register.registrar import Registrar
     from avsreplay.register.surface_index import SurfaceIndex
 
     found = Registrar(cad, RegisterParams(camera=Camera.NONE)).acquire(
@@ -255,17 +307,24 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     )  # its points were seen from all sides
     if not found.measured:
         raise UnreadableInput(
-            "the reconstruction does not fit the CAD model", where=cad.name, hint="check model and unit"
+            "the reconstruction does not fit the CAD model",
+            where=cad.name,
+            hint="check model and unit",
         )
     T_mc, most = found.T_ac.inverse(), 0.05 * cad.extent
     p_m = T_mc.apply(made.points)
     closest = SurfaceIndex.build(cad, most).closest(p_m)
     far = np.sqrt(closest.d2)
-    outside = np.einsum("ni,ni->n", np.nan_to_num(closest.normal), p_m - np.nan_to_num(closest.foot)) >= 0.0
+    outside = (
+        np.einsum("ni,ni->n", np.nan_to_num(closest.normal), p_m - np.nan_to_num(closest.foot))
+        >= 0.0
+    )
     signed = np.where(far < most, np.where(outside, far, -far), np.nan)
     known = np.abs(signed[np.isfinite(signed)])
     if not len(known):
-        raise UnreadableInput("no point lies near the CAD model", where=cad.name, hint="check model and unit")
+        raise UnreadableInput(
+            "no point lies near the CAD model", where=cad.name, hint="check model and unit"
+        )
     ratio = float(np.isfinite(signed).mean())
     median = float(np.median(known))
     tolerance = max(4.0 * 1.4826 * median, 3.0 * made.spacing_m)
@@ -273,14 +332,22 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     regions = _regions("added", p_m[extra], signed[extra], made.spacing_m)
     for kind, found_m, away in _missing(made, cad, T_mc, tolerance):
         regions += _regions(kind, found_m, -away, made.spacing_m)
-    largest = tuple(sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MOST_REGIONS])
+    largest = tuple(
+        sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MOST_REGIONS]
+    )
     return Deviations(T_mc, signed, most, ratio, median, float(np.quantile(known, 0.95)), largest)
 
 
-def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -> list[tuple[str, Array, Array]]:
-    """Points of the CAD surface that scans saw through or had no return from, and their distances to the model [m]."""
+def _missing(
+    made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float
+) -> list[tuple[str, Array, Array]]:
+    """Points of the CAD surface that scans saw through or had no return from, and their distances
+    to the model [m].
+    """
     corners = cad.vertices[cad.faces]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     rng = np.random.default_rng(0)
     count = int(np.clip(areas.sum() / made.spacing_m**2, 1000, 40000))
     face = rng.choice(len(areas), count, p=areas / areas.sum())
@@ -291,7 +358,10 @@ def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -
     p_c = T_mc.inverse().apply(p_m)
     away = np.asarray(cKDTree(made.points).query(p_c)[0])
     far = away > tolerance + 2.0 * made.spacing_m
-    normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[face[far]] @ T_mc.R
+    normals = (
+        _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[face[far]]
+        @ T_mc.R
+    )
     through, empty = np.zeros((2, int(far.sum())))
     for sight in made.sights if far.any() else ():
         through += sight.seen_through(p_c[far], 1.5 * made.spacing_m) > 6.0 * made.spacing_m
@@ -316,11 +386,13 @@ def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list
 
 
 def reconstruction_ply(made: Reconstruction, found: Deviations | None = None) -> bytes:
-    """Return a binary PLY file: points, normals, ``one_sigma`` [m], number of scans, and colours of the deviations.
+    """Return a binary PLY file: points, normals, ``one_sigma`` [m], number of scans, and colours of
+    the deviations.
 
     Args:
         made: the reconstruction.
-        found: deviations from a CAD model; colours run from blue (inside) through white to red (outside).
+        found: deviations from a CAD model; colours run from blue (inside) through white to red
+            (outside).
     """
     fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
     fields += [("one_sigma", "<f4"), ("scans", "<i4")]
@@ -330,12 +402,18 @@ def reconstruction_ply(made: Reconstruction, found: Deviations | None = None) ->
         table[axis], table[f"n{axis}"] = made.points[:, k], made.normals[:, k]
     table["one_sigma"], table["scans"] = made.one_sigma_m, made.scans
     if found:
-        share = np.clip(np.nan_to_num(found.signed_m / max(3.0 * found.median_m, 1e-9), nan=1.0), -1.0, 1.0)
+        share = np.clip(
+            np.nan_to_num(found.signed_m / max(3.0 * found.median_m, 1e-9), nan=1.0), -1.0, 1.0
+        )
         table["red"] = np.round(255.0 * np.minimum(1.0, 1.0 + share))
         table["green"] = np.round(255.0 * (1.0 - np.abs(share)))
         table["blue"] = np.round(255.0 * np.minimum(1.0, 1.0 - share))
     words = {"<f4": "float", "<i4": "int", "u1": "uchar"}
-    head = ["ply", "format binary_little_endian 1.0", "comment reconstructed by avsreplay, metres, frame {C}"]
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment reconstructed by avsreplay, metres, frame {C}",
+    ]
     head += [f"comment frame: {made.frame}"]
     if made.mass_centre is not None:
         (x, y, z), spread = made.mass_centre

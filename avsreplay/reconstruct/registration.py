@@ -1,4 +1,6 @@
-"""Registration of one scan to the model so far, search over many attitudes, and distances between pairs of scans."""
+"""Registration of one scan to the model so far, search over many attitudes, and distances between
+pairs of scans.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,14 @@ from avsreplay.register.surface_index import kernel_module
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 MOST_POINTS = 1500  # points of a scan in one registration
-COARSE_POINTS, COARSE_PASSES, HALVED = 200, 8, (2, 4, 5)  # search over attitudes: points, passes, halving passes
-PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
+COARSE_POINTS, COARSE_PASSES, HALVED = (
+    200,
+    8,
+    (2, 4, 5),
+)  # search over attitudes: points, passes, halving passes
+PAIR_TURN_RAD = np.radians(
+    90.0
+)  # key scans seen from directions closer than this are compared in the refinement
 PAIRS = 12  # most key scans with which one is compared
 PAIR_POINTS = 600  # points of a scan in one comparison
 FEWEST_COMMON = 30  # points that two scans must share to be compared
@@ -28,7 +36,10 @@ FINE_STARTS = 6  # poses of a search that are registered with all points
 
 @value_class
 class Patchwork:
-    """The model so far: points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree over the points."""
+    """The model so far.
+
+    Points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree over the points.
+    """
 
     points: Array
     normals: Array
@@ -43,8 +54,9 @@ class Match:
         T_ac: pose of the model in the camera frame.
         ratio: share of the points that lie on the model.
         rms_m: root mean square of their point-to-plane distances [m].
-        weakest: third smallest eigenvalue of the normal equations over the largest, in units of the extent; near 0
-            where the surface leaves three directions of the pose open (a sphere, a plane).
+        weakest: third smallest eigenvalue of the normal equations over the largest, in units of the
+            extent; near 0 where the surface leaves three directions of the pose open (a sphere, a
+            plane).
     """
 
     T_ac: Pose
@@ -53,8 +65,12 @@ class Match:
     weakest: float
 
 
-def registered(view: ScanView, model: Patchwork, guess: Pose, reach_m: float, extent: float, passes: int = 40) -> Match:
-    """Point-to-plane ICP of a view on the model, with Tukey's weights whose scale follows the residuals."""
+def registered(
+    view: ScanView, model: Patchwork, guess: Pose, reach_m: float, extent: float, passes: int = 40
+) -> Match:
+    """Point-to-plane ICP of a view on the model, with Tukey's weights whose scale follows the
+    residuals.
+    """
     T_ca, gate = guess.inverse(), reach_m
     ratio = rms = weakest = 0.0
     for _ in range(passes):
@@ -72,8 +88,12 @@ def registered(view: ScanView, model: Patchwork, guess: Pose, reach_m: float, ex
     return Match(T_ca.inverse(), ratio, rms, weakest)
 
 
-def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float) -> tuple[Array, Array, Array, float]:
-    """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m], and their share."""
+def _normal_equations(
+    view: ScanView, model: Patchwork, T_ca: Pose, gate: float
+) -> tuple[Array, Array, Array, float]:
+    """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m],
+    and their share.
+    """
     every = max(1, len(view.points) // MOST_POINTS)
     p, n_view = T_ca.apply(view.points[::every]), view.normals[::every] @ T_ca.R.T
     distance, nearest = model.tree.query(p, most_m=gate)
@@ -90,15 +110,19 @@ def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float)
 def between(a: Array, b: Array) -> Array:
     """Unit vectors halfway between unit normals a and b (n, 3).
 
-    The distance along them is zero for two points of one circle, so that the curvature of a surface gives no bias
-    (S. Rusinkiewicz, A symmetric objective function for ICP, ACM Transactions on Graphics 38(4), 2019).
+    The distance along them is zero for two points of one circle, so that the curvature of a surface
+    gives no bias (S. Rusinkiewicz, A symmetric objective function for ICP, ACM Transactions on
+    Graphics 38(4), 2019).
     """
     both = a + b
     return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True))
 
 
 def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
-    """The step d = [theta; v] in {C}; directions that the surface does not determine are left out."""
+    """The step d = [theta; v] in {C}.
+
+    Directions that the surface does not determine are left out.
+    """
     scale = np.array([1.0 / extent] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
     good = values > 1e-4 * values[-1]
@@ -111,15 +135,20 @@ def moved(T_ca: Pose, step: Array) -> Pose:
     return Pose(geometry.exp(step[:3]), step[3:]) @ T_ca
 
 
-def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: float, extent: float) -> list[Pose]:
-    """Return the FINE_STARTS poses with most points on the model, after a few passes from every attitude, all at once.
+def best_starts(
+    view: ScanView, model: Patchwork, attitudes: Array, gate_m: float, extent: float
+) -> list[Pose]:
+    """Return the FINE_STARTS poses with most points on the model, after a few passes from every
+    attitude, all at once.
 
-    A part of the points is registered; after the passes HALVED the worse half of the poses is left out.
+    A part of the points is registered; after the passes HALVED the worse half of the poses is left
+    out.
 
     Args:
         view: the scan.
         model: the model so far.
-        attitudes: (m, 4) q_ac to start from, each where the visible side of the model is where the scan is.
+        attitudes: (m, 4) q_ac to start from, each where the visible side of the model is where the
+            scan is.
         gate_m: largest distance of corresponding points [m].
         extent: of the target [m].
     """
@@ -131,7 +160,10 @@ def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: floa
     gate, scale = np.full(len(R), gate_m), np.array([1.0 / extent] * 3 + [1.0] * 3)
     for number in range(COARSE_PASSES):
         p, n = points @ R.transpose(0, 2, 1) + t[:, None], normals @ R.transpose(0, 2, 1)
-        d, index = (found.reshape(p.shape[:2]) for found in model.tree.query(p.reshape(-1, 3), most_m=gate_m))
+        d, index = (
+            found.reshape(p.shape[:2])
+            for found in model.tree.query(p.reshape(-1, 3), most_m=gate_m)
+        )
         near = np.isfinite(d) & (d < gate[:, None])
         index = np.where(near, index, 0)
         other = model.normals[index]
@@ -141,10 +173,15 @@ def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: floa
         e = np.where(near, np.einsum("mki,mki->mk", along, model.points[index] - p), np.nan)
         w = np.nan_to_num(np.maximum(1.0 - (e / gate[:, None]) ** 2, 0.0) ** 2)
         J = np.concatenate([np.cross(p, along), along], axis=2) * scale
-        N, g = (J * w[:, :, None]).transpose(0, 2, 1) @ J, np.einsum("mki,mk->mi", J, w * np.nan_to_num(e))
+        N, g = (
+            (J * w[:, :, None]).transpose(0, 2, 1) @ J,
+            np.einsum("mki,mk->mi", J, w * np.nan_to_num(e)),
+        )
         values, vectors = np.linalg.eigh(N)
         inverse = np.where(values > 1e-4 * values[:, -1:], 1.0 / np.maximum(values, 1e-12), 0.0)
-        step = scale * np.einsum("mij,mj->mi", vectors, inverse * np.einsum("mji,mj->mi", vectors, g))
+        step = scale * np.einsum(
+            "mij,mj->mi", vectors, inverse * np.einsum("mji,mj->mi", vectors, g)
+        )
         turn_ca = geometry.matrix(geometry.exp(step[:, :3]))
         R, t = turn_ca @ R, np.einsum("mij,mj->mi", turn_ca, t) + step[:, 3:]
         shown = (np.abs(np.nan_to_num(e, nan=gate_m)) < 0.02 * extent).mean(axis=1)
@@ -159,7 +196,9 @@ def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: floa
 
 
 def _visible_centres(model: Patchwork, R_ac: Array, towards: Array) -> Array:
-    """Centre (m, 3) of the side of the model that faces the camera in the direction ``towards``, for every attitude."""
+    """Centre (m, 3) of the side of the model that faces the camera in the direction ``towards``,
+    for every attitude.
+    """
     every = max(1, len(model.points) // MOST_POINTS)
     points, normals = model.points[::every], model.normals[::every]
     facing = (normals @ (R_ac.transpose(0, 2, 1) @ towards).T > 0.0).T
@@ -168,13 +207,20 @@ def _visible_centres(model: Patchwork, R_ac: Array, towards: Array) -> Array:
 
 
 def near_attitudes(q_ac: Array) -> Array:
-    """Return (m, 4) the attitude q_ac and those 12, 24, 36 and 50 degrees from it about 13 axes, both ways."""
+    """Return (m, 4) the attitude q_ac and those 12, 24, 36 and 50 degrees from it about 13 axes,
+    both ways.
+    """
     turns = [geometry.exp(np.radians(deg) * axis) for deg in (12, 24, 36, 50) for axis in _axes()]
     return np.array([q_ac] + [geometry.multiply(q_ac, turn) for turn in turns])
 
 
 def _axes() -> list[Array]:
-    every = [np.array((x, y, z), dtype=np.float64) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+    every = [
+        np.array((x, y, z), dtype=np.float64)
+        for x in (-1, 0, 1)
+        for y in (-1, 0, 1)
+        for z in (-1, 0, 1)
+    ]
     return [a / np.linalg.norm(a) for a in every if a.any()]
 
 
@@ -186,11 +232,13 @@ def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> 
 
 
 class Pairing:
-    """Corresponding points of overlapping pairs of views: of a point of view i the nearest point of view j.
+    """Corresponding points of overlapping pairs of views: of a point of view i the nearest point of
+    view j.
 
-    The points of a pair are searched again where the relative pose has changed by more than ``still_m`` at a corner of
-    the box of view i: within a small share of the spacing of the points the distance along the normals does not depend
-    on which of the neighbouring points corresponds. Each pair of a view takes every n-th point from another first one.
+    The points of a pair are searched again where the relative pose has changed by more than
+    ``still_m`` at a corner of the box of view i: within a small share of the spacing of the points
+    the distance along the normals does not depend on which of the neighbouring points corresponds.
+    Each pair of a view takes every n-th point from another first one.
 
     Args:
         views: the n views that are compared.
@@ -199,11 +247,16 @@ class Pairing:
         still_m: change of a relative pose that does not require a new search [m].
     """
 
-    def __init__(self, views: Sequence[ScanView], poses: Sequence[Pose], most: int, still_m: float) -> None:
+    def __init__(
+        self, views: Sequence[ScanView], poses: Sequence[Pose], most: int, still_m: float
+    ) -> None:
         self._views, self._most, self._still_m, self._gate = views, most, still_m, 0.0
         self._pairs = overlapping(views, poses)
         self._corners = np.array(
-            [list(product(*zip(v.points.min(axis=0), v.points.max(axis=0), strict=True))) for v in views]
+            [
+                list(product(*zip(v.points.min(axis=0), v.points.max(axis=0), strict=True)))
+                for v in views
+            ]
         )
         self._at = np.full((len(self._pairs), 8, 3), np.inf)
         self._found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))] * len(self._pairs)
@@ -216,8 +269,9 @@ class Pairing:
             gate: largest distance that counts [m].
 
         Returns:
-            Normal matrix (6n, 6n) and right side (6n,) of steps [theta; v] in {C} of all poses, the distances [m], and
-            their weighted rms [m] by Tukey's function, whose square the steps minimise.
+            Normal matrix (6n, 6n) and right side (6n,) of steps [theta; v] in {C} of all poses, the
+            distances [m], and their weighted rms [m] by Tukey's function, whose square the steps
+            minimise.
         """
         views, count = self._views, len(self._views)
         first = np.cumsum([0] + [len(view.points) for view in views])
@@ -241,8 +295,13 @@ class Pairing:
         rms = float(gate * np.sqrt(totals[0] / totals[1] / 3.0))
         return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), e, rms
 
-    def _search(self, p: Array, n: Array, first: NDArray[np.int64], poses: Sequence[Pose], gate: float) -> None:
-        """Search the corresponding points of the pairs whose relative poses have changed; of all if the gate has."""
+    def _search(
+        self, p: Array, n: Array, first: NDArray[np.int64], poses: Sequence[Pose], gate: float
+    ) -> None:
+        """Search the corresponding points of the pairs whose relative poses have changed.
+
+        Of all if the gate has.
+        """
         if gate != self._gate:
             self._gate, self._at[:] = gate, np.inf
         for number, (i, j) in enumerate(self._pairs):
@@ -260,11 +319,19 @@ class Pairing:
 
 
 def overlapping(views: Sequence[ScanView], poses: Sequence[Pose]) -> NDArray[np.int64]:
-    """Ordered pairs (m, 2) of views at poses T_ca whose directions of view differ by less than PAIR_TURN_RAD."""
+    """Ordered pairs (m, 2) of views at poses T_ca whose directions of view differ by less than
+    PAIR_TURN_RAD.
+    """
     found, directions = [], sight_lines(views, poses)
     for i, at in enumerate(directions):
         cosine = directions @ at
-        order = [int(j) for j in np.argsort(-cosine, kind="stable") if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)]
+        order = [
+            int(j)
+            for j in np.argsort(-cosine, kind="stable")
+            if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)
+        ]
         if order:
-            found += [(i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())]
+            found += [
+                (i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())
+            ]
     return np.array(found, dtype=np.int64).reshape(-1, 2)

@@ -1,4 +1,7 @@
-"""Tracking of an unknown target: each scan is registered against the model of the scans before it; its free motion."""
+"""Tracking of an unknown target: each scan is registered against the model of the scans before it.
+
+Its free motion.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,13 @@ from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import reference_fit
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.registration import Match, Patchwork, best_starts, near_attitudes, registered
+from avsreplay.reconstruct.registration import (
+    Match,
+    Patchwork,
+    best_starts,
+    near_attitudes,
+    registered,
+)
 from avsreplay.reconstruct.views import ScanView, Twist, averaged, depth_behind, point_tree, turn
 from avsreplay.records import BLOCKS, State
 from avsreplay.register import sampling
@@ -55,7 +64,8 @@ class FreeMotion:
     def pose_jacobian(
         self, chart: Chart, t_ns: Sequence[int], poses: Sequence[Pose], extent: float
     ) -> tuple[Array, Array]:
-        """Derivatives of poses of the motion by its initial values, and the information of the weak prior of these.
+        """Derivatives of poses of the motion by its initial values, and the information of the weak
+        prior of these.
 
         Args:
             chart: initial values at ``epoch_ns``.
@@ -64,7 +74,8 @@ class FreeMotion:
             extent: of the target [m].
 
         Returns:
-            (6n, 20) derivative of [theta; v] in {C} [rad, m] by steps of the chart, and (20, 20) information.
+            (6n, 20) derivative of [theta; v] in {C} [rad, m] by steps of the chart, and (20, 20)
+            information.
         """
         fixes = tuple(PoseFix(at, T, np.eye(6)) for at, T in zip(t_ns, poses, strict=True))
         measured = poses_of(fixes, self.epoch_ns)
@@ -80,7 +91,9 @@ class FreeMotion:
 
     @property
     def mass_centre_c(self) -> tuple[Array, float]:
-        """Position (3,) of the mass centre in {C} [m] and its 1 sigma, the root of the trace [m]."""
+        """Position (3,) of the mass centre in {C} [m] and its 1 sigma, the root of the trace
+        [m].
+        """
         spread = float(np.sqrt(np.trace(self.P[BLOCKS["varrho"], BLOCKS["varrho"]])))
         return -geometry.matrix(self.state.q_bc).T @ self.state.c_b, spread
 
@@ -94,9 +107,9 @@ def free_motion(t_ns: Sequence[int], poses: Sequence[Pose], extent: float) -> Fr
         extent: of the target [m].
 
     Returns:
-        The motion, or None if the poses are too few or do not follow one: at least MOTION_SHARE of them must agree, and
-        those must deviate by less than MOTION_RMS of the extent on the surface. A turntable that is turned by hand, or
-        scans without real instants, do not.
+        The motion, or None if the poses are too few or do not follow one: at least MOTION_SHARE of
+        them must agree, and those must deviate by less than MOTION_RMS of the extent on the
+        surface. A turntable that is turned by hand, or scans without real instants, do not.
     """
     if len(poses) < MOTION_POSES or np.diff(t_ns).min() <= 0:
         return None
@@ -105,14 +118,21 @@ def free_motion(t_ns: Sequence[int], poses: Sequence[Pose], extent: float) -> Fr
     if agrees.mean() < MOTION_SHARE:
         return None
     squares = np.square(fitted.d[agrees])
-    angle, distance = (float(np.sqrt(squares[:, k].sum(axis=1).mean())) for k in (slice(0, 3), slice(3, 6)))
+    angle, distance = (
+        float(np.sqrt(squares[:, k].sum(axis=1).mean())) for k in (slice(0, 3), slice(3, 6))
+    )
     if not np.hypot(0.5 * extent * angle, distance) < MOTION_RMS * extent:
         return None
     return FreeMotion(fitted.x, fitted.P, t_ns[0], agrees, (angle, distance))
 
 
-def twists(t_ns: Sequence[int], poses: dict[int, Pose], motion: FreeMotion | None) -> dict[int, Twist]:
-    """Motion of the target at every view that has a pose: of the free motion, else from its neighbours' poses."""
+def twists(
+    t_ns: Sequence[int], poses: dict[int, Pose], motion: FreeMotion | None
+) -> dict[int, Twist]:
+    """Motion of the target at every view that has a pose.
+
+    Of the free motion, else from its neighbours' poses.
+    """
     known = sorted(poses)
     found = {}
     for place, k in enumerate(known):
@@ -127,24 +147,37 @@ def twists(t_ns: Sequence[int], poses: dict[int, Pose], motion: FreeMotion | Non
 
 
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
-MOST_SHIFT = 0.4  # largest distance of the target's centre from its prediction, as a share of the extent
+MOST_SHIFT = (
+    0.4  # largest distance of the target's centre from its prediction, as a share of the extent
+)
 SHIFT_PER_LOST = 0.01  # increase of that share with every scan that was lost before
 LEAST_EXPLAINED = 0.15  # share of the model's visible side that a scan must show
-MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front of what another view has measured
-GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
+# share of points that may lie in the free space in front of what another view has measured
+MOST_VIOLATING = 0.12
+GRAZING = np.cos(
+    np.radians(70.0)
+)  # least cosine of the inclination to a line of sight for a test of free space
 MOST_TESTED = 600  # points of a scan in one test of free space
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
-LARGE_STEP_RAD = np.radians(30.0)  # a registration after a larger step may end at another pose of a similar side
-MOST_CONFIRMED = 6  # scans whose poses are not certain that are searched again in the complete model
-RIVAL = 0.8  # such a pose is ambiguous if another one explains this share of the points that it explains
+LARGE_STEP_RAD = np.radians(
+    30.0
+)  # a registration after a larger step may end at another pose of a similar side
+MOST_CONFIRMED = (
+    6  # scans whose poses are not certain that are searched again in the complete model
+)
+# such a pose is ambiguous if another one explains this share of the points that it explains
+RIVAL = 0.8
 DISTINCT_RAD = np.radians(60.0)  # starts nearer to the pose mostly lead back to it
 MOST_RETRIES = 20  # lost scans that are tried again at the end
-KEY_TURN_RAD = np.radians(7.0)  # a scan seen from a direction that differs by this from all key scans becomes one
+KEY_TURN_RAD = np.radians(
+    7.0
+)  # a scan seen from a direction that differs by this from all key scans becomes one
 
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionParams:
-    """Resolution and effort of a reconstruction; lengths are fractions of the extent of the first scan.
+    """Resolution and effort of a reconstruction; lengths are fractions of the extent of the first
+    scan.
 
     Attributes:
         voxel: edge of the voxels of the fused model.
@@ -167,7 +200,9 @@ class ReconstructionParams:
 
 @dataclass(slots=True, eq=False)
 class Tracked:
-    """Poses by number of the view, key views, views found by a search, scans lost in a row, ``weakest`` of a match."""
+    """Poses by number of the view, key views, views found by a search, scans lost in a row,
+    ``weakest`` of a match.
+    """
 
     poses: dict[int, Pose]
     keys: list[int]
@@ -177,7 +212,10 @@ class Tracked:
 
 
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
-    """Register every view against the model that the key views before it give; then try the lost ones once more."""
+    """Register every view against the model that the key views before it give.
+
+    Then try the lost ones once more.
+    """
     origin = views[0].points.mean(axis=0)
     found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], [], 0, [])
     model = patchwork(views, found, p.thin * extent)
@@ -197,9 +235,16 @@ def without(found: Tracked, wrong: Sequence[int]) -> Tracked:
 
 
 def _tracked(
-    views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, p: ReconstructionParams, extent: float
+    views: Sequence[ScanView],
+    found: Tracked,
+    k: int,
+    model: Patchwork,
+    p: ReconstructionParams,
+    extent: float,
 ) -> Patchwork:
-    """Register view k from its prediction, else by a search, note the result, and return the model that it gives."""
+    """Register view k from its prediction, else by a search, note the result, and return the model
+    that it gives.
+    """
     guess = _predicted(views, found, k, extent)
     match = registered(views[k], model, guess, p.reach * extent, extent)
     if not _accepted(match, guess, views, found, k, model, extent):
@@ -218,11 +263,19 @@ def _tracked(
 
 
 def _accepted(
-    match: Match, guess: Pose, views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, extent: float
+    match: Match,
+    guess: Pose,
+    views: Sequence[ScanView],
+    found: Tracked,
+    k: int,
+    model: Patchwork,
+    extent: float,
 ) -> bool:
-    """Whether scan and model explain each other and no measured ray passes through a surface of the other.
+    """Whether scan and model explain each other and no measured ray passes through a surface of the
+    other.
 
-    The target must also be near its predicted position, because another object in front of it fits to some flat side.
+    The target must also be near its predicted position, because another object in front of it fits
+    to some flat side.
     """
     if match.ratio < KEEP_RATIO or match.rms_m > 0.01 * extent:
         return False
@@ -233,11 +286,16 @@ def _accepted(
     if _explained(views[k], model, match.T_ac, extent) < LEAST_EXPLAINED:
         return False
     near = sorted(found.keys, key=lambda j: turn(found.poses[j], match.T_ac))[:3]
-    return all(_violation(views, found.poses[j], match.T_ac, j, k, extent) < MOST_VIOLATING for j in near)
+    return all(
+        _violation(views, found.poses[j], match.T_ac, j, k, extent) < MOST_VIOLATING for j in near
+    )
 
 
 def _explained(view: ScanView, model: Patchwork, T_ac: Pose, extent: float) -> float:
-    """Share of the model's side toward the camera that a scan shows; small for a scan of something else."""
+    """Share of the model's side toward the camera that a scan shows.
+
+    Small for a scan of something else.
+    """
     every = max(1, len(model.points) // 1500)
     p, n = T_ac.apply(model.points[::every]), model.normals[::every] @ T_ac.R.T
     lines = view.camera - p
@@ -248,20 +306,28 @@ def _explained(view: ScanView, model: Patchwork, T_ac: Pose, extent: float) -> f
     return float(np.isfinite(near).mean())
 
 
-def _violation(views: Sequence[ScanView], T_j: Pose, T_k: Pose, j: int, k: int, extent: float) -> float:
-    """Share of the points of each of two views that lie in front of the surface which the other has measured.
+def _violation(
+    views: Sequence[ScanView], T_j: Pose, T_k: Pose, j: int, k: int, extent: float
+) -> float:
+    """Share of the points of each of two views that lie in front of the surface which the other has
+    measured.
 
-    Points whose surface is inclined to the other line of sight by more than 70 degrees are left out: the depth of such
-    a surface changes by more than the tolerance between neighbouring rays.
+    Points whose surface is inclined to the other line of sight by more than 70 degrees are left
+    out: the depth of such a surface changes by more than the tolerance between neighbouring rays.
     """
     shares = []
     for a, T_a, b, T_b in ((views[k], T_k, views[j], T_j), (views[j], T_j, views[k], T_k)):
         T_ba = T_b @ T_a.inverse()
         every = max(1, len(a.points) // MOST_TESTED)
-        p, n = T_ba.apply(a.points[::every]), a.normals[::every] @ T_ba.R.T  # in {A} at the instant of b
+        p, n = (
+            T_ba.apply(a.points[::every]),
+            a.normals[::every] @ T_ba.R.T,
+        )  # in {A} at the instant of b
         lines = b.camera - p
         facing = np.einsum("ni,ni->n", n, lines) > GRAZING * np.linalg.norm(lines, axis=1)
-        in_front = depth_behind(p[facing], b.points, b.camera, 0.03 * extent, b.rays) > 0.03 * extent
+        in_front = (
+            depth_behind(p[facing], b.points, b.camera, 0.03 * extent, b.rays) > 0.03 * extent
+        )
         shares.append(float(in_front.sum()) / max(len(p), 1))
     return max(shares)
 
@@ -275,7 +341,10 @@ def _searched(
     p: ReconstructionParams,
     extent: float,
 ) -> Match | None:
-    """The best acceptable match from turned guesses: first about the prediction, then over all attitudes."""
+    """The best acceptable match from turned guesses.
+
+    First about the prediction, then over all attitudes.
+    """
     turned = [near_attitudes(guess.q)]
     if found.lost % SEARCH_EVERY < 2:
         turned.append(sampling.attitudes(400))
@@ -287,11 +356,15 @@ def _searched(
     return None
 
 
-def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams, extent: float) -> bool:
-    """Whether most of the views whose poses are not certain fit the complete model at another pose as well.
+def ambiguous(
+    views: Sequence[ScanView], found: Tracked, p: ReconstructionParams, extent: float
+) -> bool:
+    """Whether most of the views whose poses are not certain fit the complete model at another pose
+    as well.
 
-    A search, or a registration after a large step, finds one of several poses of a target that looks alike from
-    different sides. A model that was joined at a wrong one of them looks alike from both.
+    A search, or a registration after a large step, finds one of several poses of a target that
+    looks alike from different sides. A model that was joined at a wrong one of them looks alike
+    from both.
 
     Args:
         views: of the log.
@@ -301,7 +374,9 @@ def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams
     """
     used = sorted(found.poses)
     known = [k for k in used if k in found.searched]
-    known = known or [k for j, k in pairwise(used) if turn(found.poses[j], found.poses[k]) > LARGE_STEP_RAD]
+    known = known or [
+        k for j, k in pairwise(used) if turn(found.poses[j], found.poses[k]) > LARGE_STEP_RAD
+    ]
     if not known:
         return False
     known = known[:: max(1, -(-len(known) // MOST_CONFIRMED))]
@@ -312,7 +387,9 @@ def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams
         others = [q for q in sampling.attitudes(400) if turn(Pose(q, own.t), own) > DISTINCT_RAD]
         starts = best_starts(views[k], model, np.array(others), 2.0 * p.reach * extent, extent)
         fine = [registered(views[k], model, start, p.reach * extent, extent) for start in starts]
-        count += any(match.ratio > least and turn(match.T_ac, own) > 0.5 * DISTINCT_RAD for match in fine)
+        count += any(
+            match.ratio > least and turn(match.T_ac, own) > 0.5 * DISTINCT_RAD for match in fine
+        )
     return 2 * count > len(known)
 
 
@@ -324,19 +401,31 @@ def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
 def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patchwork:
     """The model that the key views give, averaged over voxels of the given size."""
     each = [(found.poses[k].inverse(), views[k]) for k in found.keys]
-    points, normals = [T.apply(view.points) for T, view in each], [view.normals @ T.R.T for T, view in each]
+    points, normals = (
+        [T.apply(view.points) for T, view in each],
+        [view.normals @ T.R.T for T, view in each],
+    )
     mean, normal, _ = averaged(np.vstack(points), np.vstack(normals), size_m)
     return Patchwork(mean, normal, point_tree(mean))
 
 
 def _predicted(views: Sequence[ScanView], found: Tracked, k: int, extent: float) -> Pose:
-    """The pose at view k by the constant twist, in {C}, of the last poses; after a gap by free motion if it fits."""
+    """The pose at view k by the constant twist, in {C}, of the last poses.
+
+    After a gap by free motion if it fits.
+    """
     known = sorted(found.poses)
     before = [j for j in known if j < k] or known[:1]
     last = before[-1]
     intervals = np.diff([views[j].t_ns for j in known])
-    if k - last > 1 and len(intervals) and views[k].t_ns - views[last].t_ns > 2.0 * np.median(intervals):
-        motion = free_motion([views[j].t_ns for j in known], [found.poses[j] for j in known], extent)
+    if (
+        k - last > 1
+        and len(intervals)
+        and views[k].t_ns - views[last].t_ns > 2.0 * np.median(intervals)
+    ):
+        motion = free_motion(
+            [views[j].t_ns for j in known], [found.poses[j] for j in known], extent
+        )
         if motion is not None:
             return motion.at(views[k].t_ns)
     if len(before) < 2:

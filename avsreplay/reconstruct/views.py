@@ -17,11 +17,17 @@ from avsreplay.register.surface_index import kernel_module
 
 SAMPLE = 24  # most scans from which extent and position of the camera are determined
 NEIGHBOURS = 12  # nearest points from which a normal is estimated
-ISOLATED = 4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
-LINK = 2.0  # points closer than this many times the typical distance of the fourth neighbour belong together
+ISOLATED = (
+    4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
+)
+# points closer than this many times the typical distance of the fourth neighbour belong together
+LINK = 2.0
 SMALL_GROUP = 0.02  # a group with a smaller share of the points does not count for the extent
-SIDES = np.array([0.61, 0.53, 0.59])  # the two sides of a thin wall have normals of opposite sign along this direction
-FAR_OF_EXTENT = 0.6  # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
+SIDES = np.array(
+    [0.61, 0.53, 0.59]
+)  # the two sides of a thin wall have normals of opposite sign along this direction
+# a scan whose centroid is farther than this from the origin of {A} was taken from the origin
+FAR_OF_EXTENT = 0.6
 
 
 @value_class
@@ -29,10 +35,14 @@ class ScanView:
     """A scan thinned for registration.
 
     Attributes:
-        t_ns: instant.  camera: (3,) position of the camera in {A} [m].
-        points: (n, 3) thinned points in {A} [m].  normals: (n, 3) unit normals toward the camera.
-        weight: (n,) cosine of the inclination to the line of sight: grazing points are the least accurate.
-        tree: ``PointTree`` over the points.  rays: over the directions from the camera to the points.
+        t_ns: instant.
+        camera: (3,) position of the camera in {A} [m].
+        points: (n, 3) thinned points in {A} [m].
+        normals: (n, 3) unit normals toward the camera.
+        weight: (n,) cosine of the inclination to the line of sight: grazing points are the least
+            accurate.
+        tree: ``PointTree`` over the points.
+        rays: over the directions from the camera to the points.
     """
 
     t_ns: int
@@ -49,9 +59,11 @@ class Survey:
     """Result of one pass over a log.
 
     Attributes:
-        chosen: positions in the log of the scans that are used.  offered: number of scans in the log.
+        chosen: positions in the log of the scans that are used.
+        offered: number of scans in the log.
         extent: typical diagonal of the box around the target in one scan [m].
-        camera: (3,) position of the camera in {A} [m].  timed: the points of the scans have times of their own.
+        camera: (3,) position of the camera in {A} [m].
+        timed: the points of the scans have times of their own.
     """
 
     chosen: tuple[int, ...]
@@ -63,7 +75,10 @@ class Survey:
 
 @value_class
 class Twist:
-    """Motion of the target during a scan: pose at the stamp, rate w_c (3,) [rad/s], velocity v_a (3,) [m/s] of {C}."""
+    """Motion of the target during a scan.
+
+    Pose at the stamp, rate w_c (3,) [rad/s], velocity v_a (3,) [m/s] of {C}.
+    """
 
     T_ac: Pose
     w_c: Array
@@ -94,8 +109,12 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
     if not kept:
         return Survey(chosen, offered, 0.0, np.zeros(3), False)
     clouds = [_connected(np.asarray(scan.points, dtype=np.float64)) for scan in kept]
-    extent = float(np.median([extent_of(points[:: max(1, len(points) // 3000)]) for points in clouds]))
-    return Survey(chosen, offered, extent, _camera(clouds), any(scan.times_s is not None for scan in kept))
+    extent = float(
+        np.median([extent_of(points[:: max(1, len(points) // 3000)]) for points in clouds])
+    )
+    return Survey(
+        chosen, offered, extent, _camera(clouds), any(scan.times_s is not None for scan in kept)
+    )
 
 
 def surveyed_scans(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
@@ -107,11 +126,16 @@ def surveyed_scans(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Itera
 def full_cloud(scan: Scan, twist: Twist | None) -> Array:
     """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp."""
     points = np.asarray(scan.points, dtype=np.float64)
-    return _connected(points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist))
+    return _connected(
+        points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist)
+    )
 
 
 def camera_of(scan: Scan, survey: Survey) -> Array:
-    """Return the position (3,) of the camera in {A} [m] at a scan: of the sensor, or as the survey found it."""
+    """Return the position (3,) of the camera in {A} [m] at a scan.
+
+    Of the sensor, or as the survey found it.
+    """
     return survey.camera if scan.sensor is None else scan.sensor.t
 
 
@@ -127,11 +151,15 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
     full = full_cloud(scan, twist)
     points = central_points(full, size_m)
     camera = camera_of(scan, survey)
-    points = points[np.linalg.norm(camera - points, axis=1) > 0.0]  # the sensor itself has no direction
+    points = points[
+        np.linalg.norm(camera - points, axis=1) > 0.0
+    ]  # the sensor itself has no direction
     normals, lines = normals_of(points, full, camera), camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
     rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
-    return ScanView(scan.t_ns, camera, points, normals, weight, point_tree(points), point_tree(rays))
+    return ScanView(
+        scan.t_ns, camera, points, normals, weight, point_tree(points), point_tree(rays)
+    )
 
 
 def point_tree(points: Array) -> Any:
@@ -145,22 +173,32 @@ def spacings(tree: Any, points: Array) -> Array:
 
 
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
-    """Points (n, 3) in {A} moved to the stamp: p(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity."""
+    """Points (n, 3) in {A} moved to the stamp.
+
+    P(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity.
+    """
     p_c = (points - twist.T_ac.t) @ twist.T_ac.R
-    return np.asarray(twist.T_ac.apply(at_instant(p_c, times_s, twist.w_c, twist.v_a @ twist.T_ac.R)))
+    return np.asarray(
+        twist.T_ac.apply(at_instant(p_c, times_s, twist.w_c, twist.v_a @ twist.T_ac.R))
+    )
 
 
 def _connected(points: Array) -> Array:
-    """The points without isolated ones: the fourth neighbour is farther away than ISOLATED times the median."""
+    """The points without isolated ones.
+
+    The fourth neighbour is farther away than ISOLATED times the median.
+    """
     distance = spacings(point_tree(points), points)
     return np.asarray(points[distance < ISOLATED * np.median(distance)])
 
 
 def extent_of(points: Array) -> float:
-    """Return the diagonal [m] of the box around a target, from one scan of it that may contain scattered outliers.
+    """Return the diagonal [m] of the box around a target, from one scan of it that may contain
+    scattered outliers.
 
-    Points are grouped where they lie closer together than LINK times the typical spacing; groups of less than
-    SMALL_GROUP of all points are left out. A box around all points would grow to the range limits of the scanner.
+    Points are grouped where they lie closer together than LINK times the typical spacing; groups of
+    less than SMALL_GROUP of all points are left out. A box around all points would grow to the
+    range limits of the scanner.
     """
     tree = point_tree(points)
     group = tree.groups(LINK * max(float(np.median(spacings(tree, points))), 1e-9))
@@ -169,12 +207,14 @@ def extent_of(points: Array) -> float:
 
 
 def _camera(clouds: Sequence[Array]) -> Array:
-    """Position of the camera in {A} [m]: the origin, unless the scans surround it or lie close to it.
+    """Position of the camera in {A} [m]: the origin, unless the scans surround it or lie close to
+    it.
 
-    Scans that were moved toward the origin do not show where the camera was, only that it is the same place for all
-    of them. It is then taken as far away along one line of sight: a surface is sampled in proportion to the cosine of
-    its inclination to that line, so the mean square of the cosine is largest along it. The camera is at the end of the
-    line from which the surfaces are convex on average, because it sees the outside of the target.
+    Scans that were moved toward the origin do not show where the camera was, only that it is the
+    same place for all of them. It is then taken as far away along one line of sight: a surface is
+    sampled in proportion to the cosine of its inclination to that line, so the mean square of the
+    cosine is largest along it. The camera is at the end of the line from which the surfaces are
+    convex on average, because it sees the outside of the target.
     """
     extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
@@ -192,7 +232,10 @@ def _camera(clouds: Sequence[Array]) -> Array:
 
 
 def central_points(points: Array, size_m: float) -> Array:
-    """The point nearest to the mean of each voxel: a measured point, because a mean lies inside a curved surface."""
+    """The point nearest to the mean of each voxel.
+
+    A measured point, because a mean lies inside a curved surface.
+    """
     cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
     order = np.lexsort((np.arange(len(points)), off, cell))
@@ -201,13 +244,22 @@ def central_points(points: Array, size_m: float) -> Array:
 
 
 def cell_of(points: Array, size_m: float, normals: Array | None = None) -> NDArray[np.intp]:
-    """Number (n,) of the occupied voxel of every point; with normals the two sides of a thin wall are distinguished."""
+    """Number (n,) of the occupied voxel of every point.
+
+    With normals the two sides of a thin wall are distinguished.
+    """
     place = np.floor(points / size_m).astype(np.int64)
     place -= place.min(axis=0)
     x, y, z = place.T
     width = place.max(axis=0) + 1
-    side = np.zeros(len(points), dtype=np.int64) if normals is None else (normals @ SIDES > 0.0).astype(np.int64)
-    return np.asarray(np.unique(((x * width[1] + y) * width[2] + z) * 2 + side, return_inverse=True)[1].ravel())
+    side = (
+        np.zeros(len(points), dtype=np.int64)
+        if normals is None
+        else (normals @ SIDES > 0.0).astype(np.int64)
+    )
+    return np.asarray(
+        np.unique(((x * width[1] + y) * width[2] + z) * 2 + side, return_inverse=True)[1].ravel()
+    )
 
 
 def means(values: Array, cell: NDArray[np.intp]) -> Array:
@@ -228,7 +280,10 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 
 
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
-    """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest points of the whole scan."""
+    """Unit normals (n, 3) toward the camera.
+
+    Smallest principal direction of the nearest points of the whole scan.
+    """
     full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
     normals = point_tree(full).planes(full, full, points, points, NEIGHBOURS)[0]
     away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
@@ -247,8 +302,11 @@ def turn(a: Pose, b: Pose) -> float:
     return float(geometry.angle(geometry.multiply(geometry.conjugate(a.q), b.q)))
 
 
-def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tree: Any = None) -> Array:
-    """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was.
+def depth_behind(
+    p: Array, measured: Array, camera: Array, spacing_m: float, tree: Any = None
+) -> Array:
+    """How far the surface that was measured in the direction of each point p lies behind it [m]; 0
+    where none was.
 
     ``tree`` is that over the directions of the measured points, if it is known.
     """
@@ -256,7 +314,9 @@ def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tre
         return np.zeros(0)
     rays, own = measured - camera, p - camera
     far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
-    tree = tree or point_tree(rays / np.maximum(far, 1e-300)[:, None])  # a point at the camera has no direction
+    tree = tree or point_tree(
+        rays / np.maximum(far, 1e-300)[:, None]
+    )  # a point at the camera has no direction
     d, index = tree.query(own / r[:, None], k=3, most_m=spacing_m / r.min())
     hit = d[:, 2] < spacing_m / r
     return np.where(hit, far[np.where(hit[:, None], index, 0)].min(axis=1) - r, 0.0)

@@ -1,10 +1,12 @@
-"""The protocol of a registration back end, the entry points of all back ends, and the default one, ``horn``.
+"""The protocol of a registration back end, the entry points of all back ends, and the default one,
+``horn``.
 
-A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It returns a pose, an
-iteration count and its own convergence flag, nothing more: ``quality.grade`` measures the quality of every pose.
+A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It
+returns a pose, an iteration count and its own convergence flag, nothing more: ``quality.grade``
+measures the quality of every pose.
 
-``poses`` is the entry for logs that hold poses of a tracker (markers, motion capture), of which nothing is registered:
-the pipeline takes the pose of such a scan as its alignment.
+``poses`` is the entry for logs that hold poses of a tracker (markers, motion capture), of which
+nothing is registered: the pipeline takes the pose of such a scan as its alignment.
 """
 
 from __future__ import annotations
@@ -36,11 +38,20 @@ CLOUD_PLANE_PASSES = 30  # point-to-plane passes of a second alignment to a mode
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
-SETTLED, RADIUS_OF_EXTENT = 0.05, 0.25  # of the rejection distance over the root of the points; usual rms radius
+SETTLED, RADIUS_OF_EXTENT = (
+    0.05,
+    0.25,
+)  # of the rejection distance over the root of the points; usual rms radius
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
-ROUGH_OF_GATE = 0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
-LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-ALIGN_WORK, WITHIN_WORK = (20_000, 8), (30_000, 15)  # most work of an alignment (fixed, per point); with a fixed gate
+ROUGH_OF_GATE = (
+    0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
+)
+# a scan of fewer points has the budget of this many, because its target may be mostly hidden
+LEAST_POINTS = 2000
+ALIGN_WORK, WITHIN_WORK = (
+    (20_000, 8),
+    (30_000, 15),
+)  # most work of an alignment (fixed, per point); with a fixed gate
 
 
 @value_class
@@ -75,29 +86,34 @@ class Backend(Protocol):
             guess: initial T_ca, the inverse of the predicted pose.
 
         Returns:
-            T_ca, the number of iterations and whether the iteration converged. If no point has a correspondence, the
-            guess and False. An exception, or a pose that is not finite, becomes the status FAILED.
+            T_ca, the number of iterations and whether the iteration converged. If no point has a
+            correspondence, the guess and False. An exception, or a pose that is not finite, becomes
+            the status FAILED.
         """
 
 
 class HornBackend:
-    """Exact closest points on the model, one fused pass, identical results for any number of threads.
+    """Exact closest points on the model, one fused pass, identical results for any number of
+    threads.
 
-    Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the gate starts at
-    ``reach_m``, follows three times the rms of the last pass and never goes below 0.004 of the extent, or ``gate_m`` if
-    that is less: points further away, at the edges of hidden surface, bias the pose. Where the
-    position of the camera is known, only faces that face it are matched.
+    Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the
+    gate starts at ``reach_m``, follows three times the rms of the last pass and never goes below
+    0.004 of the extent, or ``gate_m`` if that is less: points further away, at the edges of hidden
+    surface, bias the pose. Where the position of the camera is known, only faces that face it are
+    matched.
 
-    A model of points is aligned twice, and the pose with the smaller sum of min(d^2, gate_m^2) is taken. Along a flat
-    side Horn's iteration ends at false minima between the points, which more point-to-plane passes avoid; where the
-    model has holes, these passes can lead away from the guess.
+    A model of points is aligned twice, and the pose with the smaller sum of min(d^2, gate_m^2) is
+    taken. Along a flat side Horn's iteration ends at false minima between the points, which more
+    point-to-plane passes avoid; where the model has holes, these passes can lead away from the
+    guess.
     """
 
     name: ClassVar[str] = "horn"
     accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
     same_bytes: ClassVar[bool] = True  # on every x86-64 processor
     about: ClassVar[str] = (
-        "point-to-plane start, then Newton steps to the fixed point of Horn's quaternion ICP on the mesh itself, C++"
+        "point-to-plane start, then Newton steps to the fixed point of Horn's quaternion ICP on the"
+        " mesh itself, C++"
     )
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("avsreplay.register._kernel", "avsreplay"),)
     get: ClassVar[str] = "a C++17 compiler, then pip install ."
@@ -121,7 +137,9 @@ class HornBackend:
         poor_m = ROUGH_OF_GATE * limits.gate_m
         self._rough = {facing: replace(rule, poor_m=poor_m) for facing, rule in self._rules.items()}
         passes = min(CLOUD_PLANE_PASSES, limits.n_max)
-        self._more_plane = {facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()}
+        self._more_plane = {
+            facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()
+        }
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
@@ -132,8 +150,15 @@ class HornBackend:
         return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
 
     def align_roughly(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """Return T_ca as :meth:`align`; of a part of the scan, not converged, if that shows that no fit is close."""
-        return self.align(points, guess) if self._cloud else self._run(points, guess, self._rough.__getitem__)
+        """Return T_ca as :meth:`align`.
+
+        Of a part of the scan, not converged, if that shows that no fit is close.
+        """
+        return (
+            self.align(points, guess)
+            if self._cloud
+            else self._run(points, guess, self._rough.__getitem__)
+        )
 
     def _cost(self, points: NDArray[Any], T_ca: Pose) -> float:
         sums = self._index.normal_equations(points, T_ca, self._gate)
@@ -148,27 +173,48 @@ class HornBackend:
         most: int = MOST_WITHIN,
         most_work: int = 2**62,
     ) -> Fit:
-        """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most ``most``.
+        """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most
+        ``most``.
 
         After ``most_work`` point searches it ends, not converged.
 
-        ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
+        ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes
+        over few points come
         first: they would end further from the result than it is.
         """
         rule = self._rules[False]
-        plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
+        plane, few, most = (
+            0 if near else rule.n_plane,
+            0 if near else rule.few,
+            min(rule.n_max, most),
+        )
         within: dict[str, Any] = {"n_max": most, "n_plane": plane, "few": few, "tighten": 0.0}
-        # A third of the rejection distance is the noise; a small share of the error that it leaves need not be reached.
+        # A third of the rejection distance is the noise; a small share of the error that it leaves
+        # need not be reached.
         error = SETTLED * gate_m / np.sqrt(max(len(points), 1))
         limits, rad = self._rules[False], error / (RADIUS_OF_EXTENT * self._index.extent_m)
         within.update(
-            gate_m=gate_m, floor_m=gate_m, eps_m=max(limits.eps_m or 0.0, error), eps_rad=max(limits.eps_rad, rad)
+            gate_m=gate_m,
+            floor_m=gate_m,
+            eps_m=max(limits.eps_m or 0.0, error),
+            eps_rad=max(limits.eps_rad, rad),
         )
         most_work = max(1, min(most_work, _most(WITHIN_WORK, len(points))))
-        return self._run(points, guess, lambda facing: replace(self._rules[facing], **within), most_work)
+        return self._run(
+            points, guess, lambda facing: replace(self._rules[facing], **within), most_work
+        )
 
-    def _run(self, points: NDArray[Any], guess: Pose, rules: Callable[[bool], IcpParams], most_work: int = 0) -> Fit:
-        """Align with one of the rules; ``most_work`` point searches at most, 0: those of an alignment."""
+    def _run(
+        self,
+        points: NDArray[Any],
+        guess: Pose,
+        rules: Callable[[bool], IcpParams],
+        most_work: int = 0,
+    ) -> Fit:
+        """Align with one of the rules; ``most_work`` point searches at most, 0.
+
+        Those of an alignment.
+        """
         most = most_work or _most(ALIGN_WORK, len(points))
 
         def align(start: Pose, facing: bool) -> Fit:
@@ -215,7 +261,9 @@ class PoseBackend:
         Raises:
             ValueError: always.
         """
-        raise ValueError(f"the back end '{self.name}' takes the poses of the log and cannot align clouds")
+        raise ValueError(
+            f"the back end '{self.name}' takes the poses of the log and cannot align clouds"
+        )
 
 
 Factory = Callable[[Target], Backend]
@@ -258,7 +306,9 @@ def load_backend(name: str) -> Factory:
     try:
         factory = entry.load()
     except ImportError as error:
-        raise _missing(name, f"cannot be imported ({error})", "reinstall the package that provides it") from None
+        raise _missing(
+            name, f"cannot be imported ({error})", "reinstall the package that provides it"
+        ) from None
     state = _availability(name, factory)
     if not state.installed:
         raise _missing(name, "is not installed", state.get)
@@ -266,7 +316,10 @@ def load_backend(name: str) -> Factory:
 
 
 def create_backend(name: str, factory: Factory, target: Target) -> Backend:
-    """Build the back end. Raises MissingBackend if its library is installed but cannot be imported."""
+    """Build the back end.
+
+    Raises MissingBackend if its library is installed but cannot be imported.
+    """
     try:
         return factory(target)
     except ImportError as error:
@@ -275,7 +328,10 @@ def create_backend(name: str, factory: Factory, target: Target) -> Backend:
 
 
 def available() -> tuple[Availability, ...]:
-    """Return the state of every registered back end, by name. Does not import any registration library."""
+    """Return the state of every registered back end, by name.
+
+    Does not import any registration library.
+    """
     return tuple(_state(name) for name in names())
 
 
@@ -283,21 +339,36 @@ def _state(name: str) -> Availability:
     try:
         return _availability(name, _entry(name).load())
     except ImportError as error:
-        return Availability(name, False, "", f"cannot be imported: {error}", "reinstall the package that provides it")
+        return Availability(
+            name,
+            False,
+            "",
+            f"cannot be imported: {error}",
+            "reinstall the package that provides it",
+        )
 
 
 def aligned(
-    name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None, most_work: int, rough: bool
+    name: str,
+    backend: Backend,
+    scan: NDArray[Any],
+    guess: Pose,
+    width_m: float | None,
+    most_work: int,
+    rough: bool,
 ) -> Fit | str:
-    """Run a back end. An exception, or a result of a wrong type, is returned as the text of a failure.
+    """Run a back end. An exception, or a result of a wrong type, is returned as the text of a
+    failure.
 
     Args:
         name: of the back end.
         backend: built for the target.
         scan: (n, 3) points in {A} [m].
         guess: T_ca to begin with.
-        width_m: rejection distance from the first pass on [m], for a back end with ``align_within``; None for its own.
-        most_work: point searches after which it ends, for a back end with ``align_within`` and a given ``width_m``.
+        width_m: rejection distance from the first pass on [m], for a back end with
+            ``align_within``; None for its own.
+        most_work: point searches after which it ends, for a back end with ``align_within`` and a
+            given ``width_m``.
         rough: without ``width_m``, align with ``align_roughly`` where the back end has it.
     """
     within = None if width_m is None else getattr(backend, "align_within", None)
@@ -308,22 +379,33 @@ def aligned(
         if not isinstance(fit, Fit):
             return f"back end '{name}' returned {type(fit).__name__}, not Fit"
         finite = bool(np.isfinite(fit.T_ca.matrix).all())
-    except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
-        return f"back end '{name}' failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
+    except (
+        Exception
+    ) as error:  # an error of a library is a status of this scan, not the end of a replay
+        return f"back end '{name}' failed: {type(error).__name__}: {error}".splitlines()[0][
+            :MESSAGE_LENGTH
+        ]
     return fit if finite else f"back end '{name}' returned a pose that is not finite"
 
 
 def _availability(name: str, factory: Any) -> Availability:
-    """Read the optional class attributes ``requires`` (module, distribution), ``about``, ``get`` and ``same_bytes``."""
+    """Read the optional class attributes ``requires`` (module, distribution), ``about``, ``get``
+    and ``same_bytes``.
+    """
     requires: tuple[tuple[str, str], ...] = getattr(factory, "requires", ())
     missing = [module for module, _ in requires if importlib.util.find_spec(module) is None]
     version = "" if missing or not requires else _version(requires[0][1])
     get = str(getattr(factory, "get", "install the package that provides it")) if missing else ""
-    return Availability(name, not missing, version, str(getattr(factory, "about", "")), get, _elsewhere(factory))
+    return Availability(
+        name, not missing, version, str(getattr(factory, "about", "")), get, _elsewhere(factory)
+    )
 
 
 def _elsewhere(factory: Any) -> str:
-    """Attribute ``same_bytes``, or the stated accuracy: one that stops by its own rule can end anywhere in it."""
+    """Attribute ``same_bytes``, or the stated accuracy.
+
+    One that stops by its own rule can end anywhere in it.
+    """
     if getattr(factory, "same_bytes", False):
         return "same bytes"
     degrees, share = getattr(factory, "accuracy", (None, None))
@@ -341,10 +423,20 @@ def _entry(name: str) -> metadata.EntryPoint:
     found = [entry for entry in metadata.entry_points(group=GROUP) if entry.name == name]
     if not found:
         known = ", ".join(names())
-        hint = f"one of: {known}" if known else "install avsreplay ('pip install .') to register its own back ends"
-        raise UsageError(f"no registration back end is called '{name}'", where="--backend", hint=hint)
-    return min(found, key=lambda entry: entry.value)  # the same one in every run if a name is registered twice
+        hint = (
+            f"one of: {known}"
+            if known
+            else "install avsreplay ('pip install .') to register its own back ends"
+        )
+        raise UsageError(
+            f"no registration back end is called '{name}'", where="--backend", hint=hint
+        )
+    return min(
+        found, key=lambda entry: entry.value
+    )  # the same one in every run if a name is registered twice
 
 
 def _missing(name: str, what: str, get: str) -> MissingBackend:
-    return MissingBackend(f"back end '{name}' {what}", where="--backend", hint=f"install it with: {get}")
+    return MissingBackend(
+        f"back end '{name}' {what}", where="--backend", hint=f"install it with: {get}"
+    )

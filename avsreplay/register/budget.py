@@ -1,4 +1,6 @@
-"""The work that one scan may cost, counted in point searches, so that results do not depend on the machine."""
+"""The work that one scan may cost, counted in point searches, so that results do not depend on the
+machine.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +14,51 @@ from avsreplay.register.backend import LEAST_POINTS
 from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 
-HEALTHY_FIXED, HEALTHY_SEARCHED = (4200, 0.8), (7000, 1.3)  # an ordinary registration: work, and searches (per point)
-GRADE_WORK, POINTS_GRADED = 8000, 2  # the quality of a pose: point searches in all, and points of which each takes one
-NEAR_POINTS, NEAR_OF_EXTENT = 500, 0.002  # points with the noise of an ordinary scan that show the cost of a search
-SIMULATED_WORK = 1000, 2  # cost of the simulation of the noise: point searches in all, and of each point
+HEALTHY_FIXED, HEALTHY_SEARCHED = (
+    (4200, 0.8),
+    (7000, 1.3),
+)  # an ordinary registration: work, and searches (per point)
+GRADE_WORK, POINTS_GRADED = (
+    8000,
+    2,
+)  # the quality of a pose: point searches in all, and points of which each takes one
+NEAR_POINTS, NEAR_OF_EXTENT = (
+    500,
+    0.002,
+)  # points with the noise of an ordinary scan that show the cost of a search
+SIMULATED_WORK = (
+    1000,
+    2,
+)  # cost of the simulation of the noise: point searches in all, and of each point
 MOST_SIMULATED = 3000  # points that are simulated, at most
 LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
-FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
-SCATTER_WORK = 3, 7  # cost per point of finding whether points are scattered, and of leaving them out
-TEST_WORK, SIZE_WORK = 15_000, 15_000  # cost of a test of a pose, and of fitting the size [point searches]
-STRUCTURE_WORK, FREE_WORK = 3000, 8000  # cost of the residuals that neighbours share, and of free directions
-STAGE_WORK, CALL_WORK = 1200, 600  # cost in the interpreter of a stage of a restart, and of measuring a pose
-LAST_WORK = 30_000  # cost of registering a scan once more from its pose, and of the test of the result
+FAR_WORK, LEAST_NEAR = (
+    2,
+    0.5,
+)  # searches per point of a pass while less than this share of the points is on the model
+SCATTER_WORK = (
+    3,
+    7,
+)  # cost per point of finding whether points are scattered, and of leaving them out
+TEST_WORK, SIZE_WORK = (
+    15_000,
+    15_000,
+)  # cost of a test of a pose, and of fitting the size [point searches]
+STRUCTURE_WORK, FREE_WORK = (
+    3000,
+    8000,
+)  # cost of the residuals that neighbours share, and of free directions
+STAGE_WORK, CALL_WORK = (
+    1200,
+    600,
+)  # cost in the interpreter of a stage of a restart, and of measuring a pose
+LAST_WORK = (
+    30_000  # cost of registering a scan once more from its pose, and of the test of the result
+)
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work
-SPARED = 50  # after so many scans without an accepted pose, the guess is tested on every second scan, and so on
+# after so many scans without an accepted pose, the guess is tested on every second scan, and so on
+SPARED = 50
 
 
 def healthy_work(points: int, near: float) -> int:
@@ -36,12 +68,17 @@ def healthy_work(points: int, near: float) -> int:
         points: of the scan.
         near: cost of a search near the model, see ``near_work``.
     """
-    n, (fixed, each), (searches, passes) = max(points, LEAST_POINTS), HEALTHY_FIXED, HEALTHY_SEARCHED
+    n, (fixed, each), (searches, passes) = (
+        max(points, LEAST_POINTS),
+        HEALTHY_FIXED,
+        HEALTHY_SEARCHED,
+    )
     return int(fixed + each * n + near * (searches + passes * n))
 
 
 def near_work(surface: Surface, index: SurfaceIndex) -> float:
-    """Return the cost of a search near a surface, in units of an ordinary one: it depends on the size of the faces.
+    """Return the cost of a search near a surface, in units of an ordinary one: it depends on the
+    size of the faces.
 
     Args:
         surface: mesh or cloud.
@@ -54,7 +91,10 @@ def near_work(surface: Surface, index: SurfaceIndex) -> float:
 
 
 def grade_work(points: int, noisy: bool = False) -> int:
-    """Return the work of the quality of a pose of a scan of so many points, in point searches; of one with noise."""
+    """Return the work of the quality of a pose of a scan of so many points, in point searches.
+
+    Of one with noise.
+    """
     simulated = SIMULATED_WORK[0] + SIMULATED_WORK[1] * min(points, MOST_SIMULATED) if noisy else 0
     return GRADE_WORK + points // POINTS_GRADED + simulated
 
@@ -70,9 +110,10 @@ class Effort(Enum):
 def effort_after(failed: int) -> Effort:
     """Return what is done for a scan before the first accepted pose.
 
-    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far.
-    On the scans between the guess is tested, after n scans on one in 1 + n / ``SPARED`` of them. The total work
-    therefore stays small with a wrong model, of which no pose explains any scan.
+    Restarts and searches are made on the first five scans and then after delays of at most half of
+    the scans so far. On the scans between the guess is tested, after n scans on one in 1 + n /
+    ``SPARED`` of them. The total work therefore stays small with a wrong model, of which no pose
+    explains any scan.
 
     Args:
         failed: scans before this one on which no pose was accepted.
@@ -109,19 +150,27 @@ class Budget:
         self.left -= searches
 
     def registered(self, fit: Fit, found: Alignment, graded: int, noisy: bool) -> None:
-        """Subtract the work of an alignment, estimated if not counted, and of its quality by ``graded`` points.
+        """Subtract the work of an alignment, estimated if not counted, and of its quality by
+        ``graded`` points.
 
         ``noisy``: its noise was simulated.
         """
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
         free = FREE_WORK + found.points if found.status is AlignStatus.DEGENERATE else 0
-        self.spend((fit.work or fit.iterations * found.points * share) + grade_work(graded, noisy) + free)
+        self.spend(
+            (fit.work or fit.iterations * found.points * share) + grade_work(graded, noisy) + free
+        )
 
     def for_alignment(self, points: int) -> int:
-        """Return the searches that an alignment may take, so that its pose can be graded (with noise) and tested."""
+        """Return the searches that an alignment may take, so that its pose can be graded (with
+        noise) and tested.
+        """
         return max(1, self.left - grade_work(points, noisy=True) - TEST_WORK)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
-        """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
+        """Return whether this much work is left besides ``kept`` for a later step.
+
+        Without any, it is exhausted.
+        """
         self.exhausted = self.exhausted or searches > self.left
         return not self.exhausted and searches + kept <= self.left

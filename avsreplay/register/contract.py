@@ -1,7 +1,9 @@
-"""The laws that every back end must satisfy, used by the tests and by ``avsreplay backends --check NAME``.
+"""The laws that every back end must satisfy, used by the tests and by ``avsreplay backends --check
+NAME``.
 
-They are checked on a small target made of formulas. A back end may state its accuracy on an exact scan in a class
-attribute ``accuracy`` (degrees, share of the extent of the target); otherwise 0.1 deg and 0.001 apply.
+They are checked on a small target made of formulas. A back end may state its accuracy on an exact
+scan in a class attribute ``accuracy`` (degrees, share of the extent of the target); otherwise 0.1
+deg and 0.001 apply.
 """
 
 from __future__ import annotations
@@ -25,9 +27,13 @@ POINTS = 3000
 SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal except for rounding and the stopping rule
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20
-HESSIAN_STEP, HESSIAN_WITHIN = 1e-4, 0.03  # step in shares of the extent; relative error, mostly of points at edges
+HESSIAN_STEP, HESSIAN_WITHIN = (
+    1e-4,
+    0.03,
+)  # step in shares of the extent; relative error, mostly of points at edges
 
-# centre [m], edge lengths [m], rotation vector [rad] of each box: disjoint, all different, no symmetry
+# centre [m], edge lengths [m], rotation vector [rad] of each box: disjoint, all different, no
+# symmetry
 BOXES = (
     ((0.0, 0.0, 0.0), (2.0, 1.6, 2.4), (0.0, 0.0, 0.0)),
     ((2.6, 0.2, 0.3), (2.2, 0.5, 0.12), (0.3, 0.0, 0.1)),
@@ -64,17 +70,22 @@ class Bench:
         self.T_ac = example_pose(scale)
         self.scan = self.T_ac.apply(view(self.surface, POINTS, self.T_ac.inverse().t))
         self.guess = self.T_ac @ Pose(
-            exp(np.radians([2.0, -1.5, 1.0])), self.surface.extent * np.array([0.006, -0.005, 0.004])
+            exp(np.radians([2.0, -1.5, 1.0])),
+            self.surface.extent * np.array([0.006, -0.005, 0.004]),
         )
         self.accuracy: tuple[float, float] = getattr(load_backend(backend), "accuracy", ACCURACY)
         self.registrar = Registrar(self.surface, self.params)
 
-    def fresh(self, surface: Surface | None = None, params: RegisterParams | None = None) -> Registrar:
+    def fresh(
+        self, surface: Surface | None = None, params: RegisterParams | None = None
+    ) -> Registrar:
         """Return a new registrar, with the same parameters unless others are given."""
         return Registrar(surface if surface is not None else self.surface, params or self.params)
 
     def gap(self, T_a: Pose, T_b: Pose) -> tuple[float, float]:
-        """Return the rotation [rad] and translation [share of the extent] between two poses of {C}."""
+        """Return the rotation [rad] and translation [share of the extent] between two poses
+        of {C}.
+        """
         step = T_a.inverse() @ T_b
         return float(geometry.angle(step.q)), float(np.linalg.norm(step.t)) / self.surface.extent
 
@@ -82,30 +93,47 @@ class Bench:
 def recovers(bench: Bench) -> LawResult:
     """An exact scan is registered to the true pose from a guess a few degrees off."""
     return _aligned_near(
-        "recovers the exact pose", bench, bench.registrar.register(bench.scan, bench.guess), bench.T_ac
+        "recovers the exact pose",
+        bench,
+        bench.registrar.register(bench.scan, bench.guess),
+        bench.T_ac,
     )
 
 
 def stays(bench: Bench) -> LawResult:
     """Started at the true pose it stays there."""
-    return _aligned_near("stays at the true pose", bench, bench.registrar.register(bench.scan, bench.T_ac), bench.T_ac)
+    return _aligned_near(
+        "stays at the true pose",
+        bench,
+        bench.registrar.register(bench.scan, bench.T_ac),
+        bench.T_ac,
+    )
 
 
 def inverse(bench: Bench) -> LawResult:
-    """T_ac carries points of the model onto the scan, and its inverse carries the scan onto the surface."""
+    """T_ac carries points of the model onto the scan, and its inverse carries the scan onto the
+    surface.
+    """
     found = bench.registrar.register(bench.scan, bench.guess)
     there = found.T_ac.apply(view(bench.surface, POINTS, bench.T_ac.inverse().t))
     off = _rms(np.linalg.norm(there - bench.scan, axis=1)) / bench.surface.extent
-    back = _rms(bench.registrar.distance(bench.scan, found.T_ac, bench.surface.extent)) / bench.surface.extent
+    back = (
+        _rms(bench.registrar.distance(bench.scan, found.T_ac, bench.surface.extent))
+        / bench.surface.extent
+    )
     held = bool(max(off, back) < 2.0 * (np.radians(bench.accuracy[0]) + bench.accuracy[1]))
     detail = f"rms {off:.1e} of the extent, inverse {back:.1e}"
     return LawResult("T_ac carries the model onto the scan", held, detail)
 
 
 def information(bench: Bench) -> LawResult:
-    """The information is the Hessian of half the sum of squared distances over the variance, by finite differences."""
+    """The information is the Hessian of half the sum of squared distances over the variance, by
+    finite differences.
+    """
     sigma = 1e-3 * bench.surface.extent
-    found = bench.fresh(params=replace(bench.params, noise_m=sigma)).register(bench.scan, bench.guess)
+    found = bench.fresh(params=replace(bench.params, noise_m=sigma)).register(
+        bench.scan, bench.guess
+    )
     scale = np.repeat([1.0 / bench.surface.extent, 1.0], 3)
     H = _hessian(bench, found.T_ac) / sigma**2
     error, size = (float(np.linalg.norm(A * np.outer(scale, scale))) for A in (found.info - H, H))
@@ -115,25 +143,40 @@ def information(bench: Bench) -> LawResult:
 
 
 def camera_moved(bench: Bench) -> LawResult:
-    """Moving scan and guess together in {A} moves the pose with them. The camera position is not used."""
+    """Moving scan and guess together in {A} moves the pose with them.
+
+    The camera position is not used.
+    """
     registrar = bench.fresh(params=replace(bench.params, camera=Camera.NONE))
     still = registrar.register(bench.scan, bench.guess)
     moved = registrar.register(MOVE.apply(bench.scan), MOVE @ bench.guess)
-    return _same("moving the scan and the guess moves the pose", bench, MOVE @ still.T_ac, moved.T_ac)
+    return _same(
+        "moving the scan and the guess moves the pose", bench, MOVE @ still.T_ac, moved.T_ac
+    )
 
 
 def model_moved(bench: Bench) -> LawResult:
-    """With the model in another frame the pose is of that frame. A sampled or gridded model may differ slightly."""
+    """With the model in another frame the pose is of that frame.
+
+    A sampled or gridded model may differ slightly.
+    """
     motion = Pose(MOVE.q, bench.scale * MOVE.t)
     other = replace(bench.surface, vertices=motion.apply(bench.surface.vertices), sha256="moved")
     moved = bench.fresh(other).register(bench.scan, bench.guess @ motion.inverse())
-    return _aligned_near("a model in another frame gives the same target", bench, moved, bench.T_ac @ motion.inverse())
+    return _aligned_near(
+        "a model in another frame gives the same target",
+        bench,
+        moved,
+        bench.T_ac @ motion.inverse(),
+    )
 
 
 def order(bench: Bench) -> LawResult:
     """The order of the points in a scan does not matter."""
     shuffled = bench.scan[np.random.default_rng(SEED).permutation(len(bench.scan))]
-    first, second = (bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, shuffled))
+    first, second = (
+        bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, shuffled)
+    )
     return _same("the order of points does not matter", bench, first, second)
 
 
@@ -148,22 +191,35 @@ def views(bench: Bench) -> LawResult:
 
 def repeats(bench: Bench) -> LawResult:
     """Two runs, and a second registrar, give identical bits."""
-    runs = [r.register(bench.scan, bench.guess) for r in (bench.registrar, bench.registrar, bench.fresh())]
-    bits = {(run.T_ac.q.tobytes(), run.T_ac.t.tobytes(), run.iterations, run.inliers) for run in runs}
-    return LawResult("runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3")
+    runs = [
+        r.register(bench.scan, bench.guess)
+        for r in (bench.registrar, bench.registrar, bench.fresh())
+    ]
+    bits = {
+        (run.T_ac.q.tobytes(), run.T_ac.t.tobytes(), run.iterations, run.inliers) for run in runs
+    }
+    return LawResult(
+        "runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3"
+    )
 
 
 def far(bench: Bench) -> LawResult:
     """A scan ten extents away has no overlap."""
     away = bench.scan + 10.0 * bench.surface.extent
-    return _refused("far apart is no overlap", bench.registrar.register(away, bench.guess), AlignStatus.NO_OVERLAP)
+    return _refused(
+        "far apart is no overlap",
+        bench.registrar.register(away, bench.guess),
+        AlignStatus.NO_OVERLAP,
+    )
 
 
 def planar(bench: Bench) -> LawResult:
     """A plane leaves two translations and a rotation unobservable, and is not called aligned."""
     found = bench.registrar.register(bench.T_ac.apply(plate_scan(bench.scale)), bench.T_ac)
     words = found.status is not AlignStatus.DEGENERATE or found.free_directions != ""
-    finding = _refused("a plane is degenerate", found, AlignStatus.DEGENERATE, AlignStatus.NOT_CONVERGED)
+    finding = _refused(
+        "a plane is degenerate", found, AlignStatus.DEGENERATE, AlignStatus.NOT_CONVERGED
+    )
     return replace(finding, held=finding.held and words)
 
 
@@ -176,20 +232,32 @@ def collinear(bench: Bench) -> LawResult:
 def few(bench: Bench) -> LawResult:
     """One, two and five points are not called aligned."""
     found = [bench.registrar.register(bench.scan[:k], bench.T_ac) for k in (1, 2, 5)]
-    return replace(_refused("a handful of points is not aligned", found[-1]), held=all(map(_honest, found)))
+    return replace(
+        _refused("a handful of points is not aligned", found[-1]), held=all(map(_honest, found))
+    )
 
 
 def empty(bench: Bench) -> LawResult:
     """A scan without a finite point has the status NO_POINTS and keeps the guess."""
-    found = [bench.registrar.register(scan, bench.guess) for scan in (np.empty((0, 3)), np.full((50, 3), np.nan))]
-    held = all(a.status is AlignStatus.NO_POINTS and max(bench.gap(a.T_ac, bench.guess)) < 1e-12 for a in found)
+    found = [
+        bench.registrar.register(scan, bench.guess)
+        for scan in (np.empty((0, 3)), np.full((50, 3), np.nan))
+    ]
+    held = all(
+        a.status is AlignStatus.NO_POINTS and max(bench.gap(a.T_ac, bench.guess)) < 1e-12
+        for a in found
+    )
     return LawResult("an empty scan is no points", held, found[0].status.value)
 
 
 def not_finite(bench: Bench) -> LawResult:
     """Points that are not finite change nothing."""
-    dirty = np.insert(bench.scan, [10, 500, 500], [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0]], axis=0)
-    clean, found = (bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, dirty))
+    dirty = np.insert(
+        bench.scan, [10, 500, 500], [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0]], axis=0
+    )
+    clean, found = (
+        bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, dirty)
+    )
     return _same("points that are not finite change nothing", bench, clean, found)
 
 
@@ -232,8 +300,14 @@ def check(backend: str, scale: float = 1.0) -> tuple[LawResult, ...]:
 
 
 def boxes(scale: float = 1.0) -> Surface:
-    """Return the target of the laws in {C}: five boxes with outward faces, about 6.5 m overall at scale 1."""
-    parts = [Pose(exp(turn), np.array(centre)).apply(CORNERS * np.array(size)) for centre, size, turn in BOXES]
+    """Return the target of the laws in {C}.
+
+    Five boxes with outward faces, about 6.5 m overall at scale 1.
+    """
+    parts = [
+        Pose(exp(turn), np.array(centre)).apply(CORNERS * np.array(size))
+        for centre, size, turn in BOXES
+    ]
     vertices = scale * np.vstack(parts)
     faces = np.vstack([FACES + 8 * k for k in range(len(BOXES))]).astype(np.int32)
     return Surface(vertices, faces, "five boxes", hashlib.sha256(vertices.tobytes()).hexdigest())
@@ -245,25 +319,37 @@ def example_pose(scale: float = 1.0) -> Pose:
 
 
 def view(surface: Surface, count: int, camera_c: Array) -> Array:
-    """Return exact points (n, 3) in {C} of the faces that face a camera there; faces do not hide each other."""
+    """Return exact points (n, 3) in {C} of the faces that face a camera there.
+
+    Faces do not hide each other.
+    """
     points, normals = sample(surface, count)
     sight = camera_c - points
-    facing: Array = points[np.einsum("ij,ij->i", normals, sight) > 0.1 * np.linalg.norm(sight, axis=1)]
+    facing: Array = points[
+        np.einsum("ij,ij->i", normals, sight) > 0.1 * np.linalg.norm(sight, axis=1)
+    ]
     return facing
 
 
 def plate_scan(scale: float = 1.0) -> Array:
-    """Return (900, 3) points inside the top face of the first box, in {C}: a plane and nothing else."""
+    """Return (900, 3) points inside the top face of the first box, in {C}.
+
+    A plane and nothing else.
+    """
     u, v = np.meshgrid(np.linspace(-0.6, 0.6, 30), np.linspace(-0.45, 0.45, 30))
     return scale * np.stack([u.ravel(), v.ravel(), np.full(u.size, 1.2)], axis=1)
 
 
 def _hessian(bench: Bench, T_ac: Pose) -> Array:
-    """(6, 6) second differences of half the sum of squared distances [m^2] in d of T_ac_true = T_ac @ Exp(d)."""
+    """(6, 6) second differences of half the sum of squared distances [m^2] in d of T_ac_true = T_ac
+    @ Exp(d).
+    """
     h = HESSIAN_STEP * np.repeat([1.0, bench.surface.extent], 3)
 
     def cost(d: Array) -> float:
-        distance = bench.registrar.distance(bench.scan, T_ac @ Pose(exp(d[:3]), d[3:]), bench.surface.extent)
+        distance = bench.registrar.distance(
+            bench.scan, T_ac @ Pose(exp(d[:3]), d[3:]), bench.surface.extent
+        )
         return 0.5 * float(distance @ distance)
 
     H = np.empty((6, 6))
@@ -281,7 +367,9 @@ def _aligned_near(law: str, bench: Bench, found: Alignment, truth: Pose) -> LawR
     turn, shift = bench.gap(truth, found.T_ac)
     near = np.degrees(turn) < bench.accuracy[0] and shift < bench.accuracy[1]
     held = found.status is AlignStatus.ALIGNED and bool(near)
-    return LawResult(law, held, f"{found.status.value}, {np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
+    return LawResult(
+        law, held, f"{found.status.value}, {np.degrees(turn):.1e} deg, {shift:.1e} of the extent"
+    )
 
 
 def _same(law: str, bench: Bench, first: Pose, second: Pose) -> LawResult:
@@ -297,4 +385,8 @@ def _honest(found: Alignment) -> bool:
 
 def _refused(law: str, found: Alignment, *allowed: AlignStatus) -> LawResult:
     held = _honest(found) and (not allowed or found.status in allowed)
-    return LawResult(law, held, f"{found.status.value}{': ' + found.free_directions if found.free_directions else ''}")
+    return LawResult(
+        law,
+        held,
+        f"{found.status.value}{': ' + found.free_directions if found.free_directions else ''}",
+    )

@@ -1,31 +1,35 @@
-"""Covariance of a registered pose from its residuals: random errors by patches, and systematic errors.
+"""Covariance of a registered pose from its residuals: random errors by patches, and systematic
+errors.
 
-With J = [p x n, n] and e = n . (p - closest point), the pose error d = [theta; v] in {C} appears as e = J d + noise.
-Two kinds of errors correlate the noise of points:
+With J = [p x n, n] and e = n . (p - closest point), the pose error d = [theta; v] in {C} appears as
+e = J d + noise. Two kinds of errors correlate the noise of points:
 
-Random errors
-    They are alike within a patch (a detail that the model lacks, a stripe of a range image). Their covariance is the
-    sandwich estimate with patches as clusters, in the form without bias for independent noise (Bell and McCaffrey,
-    Survey Methodology 28, 2002). From a few patches it is too small in some direction. It is therefore shrunk towards
-    the covariance of independent noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004).
-    Displacements that neighbouring patches share, independent from one block of 4 patches a side to the next, add a
-    variance; it is estimated from the products of residuals of different patches of a block.
-Systematic errors
-    Errors of the model or of the ranges that vary slowly over the target: a symmetric strain and an offset of the
-    surface (size, aspect, shear, calibration of the scanner, thickness of paint or of the mesh). They are fitted with
-    the pose; the amplitudes of the strain are taken as draws of one normal distribution, that of the offset of
-    another. Their variances are maximum likelihood estimates (empirical Bayes), 0 if not significant.
+Random errors They are alike within a patch (a detail that the model lacks, a stripe of a range
+    image). Their covariance is the sandwich estimate with patches as clusters, in the form without
+    bias for independent noise (Bell and McCaffrey, Survey Methodology 28, 2002). From a few patches
+    it is too small in some direction. It is therefore shrunk towards the covariance of independent
+    noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004). Displacements
+    that neighbouring patches share, independent from one block of 4 patches a side to the next, add
+    a variance; it is estimated from the products of residuals of different patches of a block.
+Systematic errors Errors of the model or of the ranges that vary slowly over the target: a symmetric
+    strain and an offset of the surface (size, aspect, shear, calibration of the scanner, thickness
+    of paint or of the mesh). They are fitted with the pose; the amplitudes of the strain are taken
+    as draws of one normal distribution, that of the offset of another. Their variances are maximum
+    likelihood estimates (empirical Bayes), 0 if not significant.
 
-The covariance is an estimate from some hundred patches: the squared error of a pose in its metric is Hotelling's T^2,
-not chi-square. Its degrees of freedom are those of a Wishart matrix with the same mean and the same expected squared
-error, which Ledoit and Wolf estimate from the differences between the patches. For the sum with the systematic errors
-they follow from Welch and Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics, Theory
-and Methods 15, 1986).
+The covariance is an estimate from some hundred patches: the squared error of a pose in its metric
+is Hotelling's T^2, not chi-square. Its degrees of freedom are those of a Wishart matrix with the
+same mean and the same expected squared error, which Ledoit and Wolf estimate from the differences
+between the patches. For the sum with the systematic errors they follow from Welch and
+Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics, Theory and
+Methods 15, 1986).
 
-``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
-their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.
+``split_nis`` tests the result: pose from one half of the patches against the other, normalised with
+the covariance of their difference, in which common errors cancel. For normal errors it is
+chi-square with 6 degrees of freedom.
 
-The sums run over patches in C++ (``kernel/systematic.cpp``, ``kernel/covariance.cpp``), where the thresholds are.
+The sums run over patches in C++ (``kernel/systematic.cpp``, ``kernel/covariance.cpp``), where the
+thresholds are.
 """
 
 from __future__ import annotations
@@ -49,7 +53,8 @@ class Evidence:
 
     Attributes:
         points: points of the scan.
-        inliers: points nearer than the gate to the model, or to its faces that face the camera if that is known.
+        inliers: points nearer than the gate to the model, or to its faces that face the camera if
+            that is known.
         rms_m: rms of their distances.
         centre: (3,) centroid of the inliers.
         noise_m: robust standard deviation of e = n . (p - closest point).
@@ -76,7 +81,9 @@ class Evidence:
     def only(self, keep: NDArray[np.bool_]) -> Evidence:
         """Return the evidence of the patches with ``keep`` (m,) true."""
         names = [f.name for f in fields(self)]
-        return replace(self, **{name: getattr(self, name)[keep] for name in names[names.index("counts") :]})
+        return replace(
+            self, **{name: getattr(self, name)[keep] for name in names[names.index("counts") :]}
+        )
 
 
 @value_class
@@ -84,10 +91,13 @@ class Systematic:
     """Errors of a scan that the sandwich estimate over patches does not contain.
 
     Attributes:
-        extent_m: diagonal of the model's bounding box; the strains are per this length.  patch_m: side of a patch.
+        extent_m: diagonal of the model's bounding box; the strains are per this length.
+        patch_m: side of a patch.
         block_m2: variance of the displacement of a block, each axis [m^2].
-        smooth_m2: (7,) variances of the amplitudes: six of the strain times the extent, and the offset [m^2].
-        amplitudes: (7,) their fitted values [m].  centre: (3,) about which the strain was fitted.
+        smooth_m2: (7,) variances of the amplitudes: six of the strain times the extent, and the
+            offset [m^2].
+        amplitudes: (7,) their fitted values [m].
+        centre: (3,) about which the strain was fitted.
         fit: (6,) pose part of the common fit of pose and amplitudes.
     """
 
@@ -101,12 +111,20 @@ class Systematic:
 
     @property
     def values(self) -> tuple[float, list[float], list[float], list[float]]:
-        """Variance of blocks, variances and values of the amplitudes, and the fit, as the kernel takes them."""
-        return float(self.block_m2), self.smooth_m2.tolist(), self.amplitudes.tolist(), self.fit.tolist()
+        """Variance of blocks, variances and values of the amplitudes, and the fit, as the kernel
+        takes them.
+        """
+        return (
+            float(self.block_m2),
+            self.smooth_m2.tolist(),
+            self.amplitudes.tolist(),
+            self.fit.tolist(),
+        )
 
 
 def without_dominant_patches(found: Evidence) -> Evidence:
-    """Return the evidence without the patches that give more than half of the information on some motion.
+    """Return the evidence without the patches that give more than half of the information on some
+    motion.
 
     Example: the barely visible side of a box is determined by a few points next to its edge.
     """
@@ -115,11 +133,13 @@ def without_dominant_patches(found: Evidence) -> Evidence:
 
 
 def sandwich_covariance(normals: Array, gradients: Array) -> tuple[Array, float]:
-    """Return the cluster-robust sandwich covariance (6, 6) of d = [theta; v] and its degrees of freedom.
+    """Return the cluster-robust sandwich covariance (6, 6) of d = [theta; v] and its degrees of
+    freedom.
 
-    Clusters are patches of the model: errors within one may be correlated, patches are taken as independent. With N the
-    sum of N_p = J'J, g_p = sum of e J and N^-1 = W W', patch p adds the square of (I - W' N_p W)^-1/2 W' g_p. The sum S
-    is shrunk towards trace(S) / 6 times the identity; the covariance is W S W'.
+    Clusters are patches of the model: errors within one may be correlated, patches are taken as
+    independent. With N the sum of N_p = J'J, g_p = sum of e J and N^-1 = W W', patch p adds the
+    square of (I - W' N_p W)^-1/2 W' g_p. The sum S is shrunk towards trace(S) / 6 times the
+    identity; the covariance is W S W'.
 
     Args:
         normals: (m, 6, 6) sums of J'J.
@@ -146,15 +166,19 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     Returns:
         The variances; zero where every patch is a single point, or there are fewer than 24 patches.
     """
-    block_m2, smooth_m2, amplitudes, fit = _table(found, found.centre, extent_m, patch_m).systematic()
+    block_m2, smooth_m2, amplitudes, fit = _table(
+        found, found.centre, extent_m, patch_m
+    ).systematic()
     return Systematic(extent_m, patch_m, block_m2, smooth_m2, amplitudes, fit, found.centre)
 
 
 def patch_size(found: Evidence, extent_m: float, patch_m: float) -> tuple[float, float]:
-    """Return the size of the target over that of the model, less 1, and its standard error, from the sums of patches.
+    """Return the size of the target over that of the model, less 1, and its standard error, from
+    the sums of patches.
 
-    The size is fitted with the pose by linear least squares, with a patch as one point for the size. The standard
-    error is the cluster-robust one over the patches, infinite where a pose explains any size: three faces of a box.
+    The size is fitted with the pose by linear least squares, with a patch as one point for the
+    size. The standard error is the cluster-robust one over the patches, infinite where a pose
+    explains any size: three faces of a box.
 
     Args:
         found: sums at the registered pose.
@@ -166,7 +190,8 @@ def patch_size(found: Evidence, extent_m: float, patch_m: float) -> tuple[float,
 
 
 def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
-    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its degrees of freedom.
+    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its
+    degrees of freedom.
 
     Args:
         found: sums at the registered pose.
@@ -185,8 +210,8 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
         across: (k, 3) directions in {C}: the patches are split at their medians along each.
 
     Returns:
-        The largest over the directions, each chi-square with 6 degrees of freedom; None if a half does not determine a
-        pose, or without directions.
+        The largest over the directions, each chi-square with 6 degrees of freedom; None if a half
+        does not determine a pose, or without directions.
     """
     if found.counts.max(initial=1) == 1 or not len(across):
         return None
@@ -195,7 +220,8 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
 
 
 def noise_along(rays: Array, normal: Array, residual: Array, weight: Array) -> Array:
-    """Return normal noise (k,) along rays [m] that gives residuals along the normals of the same mean square.
+    """Return normal noise (k,) along rays [m] that gives residuals along the normals of the same
+    mean square.
 
     Args:
         rays: (k, 3) unit vectors.

@@ -1,8 +1,10 @@
-"""Directions of a pose that a view does not determine, such as the rotation of a cylinder about its axis.
+"""Directions of a pose that a view does not determine, such as the rotation of a cylinder about its
+axis.
 
-A motion of the target in {C} is written x = [L theta; u]: rotation about the centroid of the points, in units of their
-rms radius L, and displacement of the centroid. The mean information of a point on x then lies between 0 and about 1 for
-each direction, whatever the size of the target. Directions below ``FREE_BELOW`` are unobservable.
+A motion of the target in {C} is written x = [L theta; u]: rotation about the centroid of the
+points, in units of their rms radius L, and displacement of the centroid. The mean information of a
+point on x then lies between 0 and about 1 for each direction, whatever the size of the target.
+Directions below ``FREE_BELOW`` are unobservable.
 """
 
 from __future__ import annotations
@@ -16,8 +18,11 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.covariance import Evidence
 
-FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
-AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+# a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
+FREE_BELOW = 1e-3
+AXIS_WITHIN = (
+    0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+)
 
 
 @value_class
@@ -25,10 +30,12 @@ class Directions:
     """Observable and unobservable directions of one view.
 
     Attributes:
-        free: (6, k) unobservable directions of x, orthonormal.  observable: (6, 6 - k) the others.
+        free: (6, k) unobservable directions of x, orthonormal.
+        observable: (6, 6 - k) the others.
         to_x: (6, 6) x = to_x d for d = [theta; v] about the origin of {C}.
         level: mean information of the scan on an observable direction of x.
-        centre: (3,) centroid of the points in {C} [m].  radius_m: L.
+        centre: (3,) centroid of the points in {C} [m].
+        radius_m: L.
     """
 
     free: Array
@@ -40,7 +47,9 @@ class Directions:
 
     @classmethod
     def of(cls, total: Array, count: int, centre: Array) -> Directions:
-        """Return the directions by the sum of J'J (6, 6) over ``count`` points with the centroid (3,) [m]."""
+        """Return the directions by the sum of J'J (6, 6) over ``count`` points with the centroid
+        (3,) [m].
+        """
         info, radius = scaled_information(total, count, centre)
         values, vectors = np.linalg.eigh(info)
         to_x = np.eye(6)
@@ -61,30 +70,39 @@ class Directions:
         return tuple(_words(row) for row in _sparse_basis(self.free.T)) if self.free.size else ()
 
     def held(self, found: Evidence) -> Evidence:
-        """Return the sums with information on the unobservable directions, so that they determine a pose.
+        """Return the sums with information on the unobservable directions, so that they determine a
+        pose.
 
-        It is the mean information of the observable ones, spread evenly over the patches. Both kinds of directions are
-        orthogonal in the information, so that the covariance of the observable ones does not change.
+        It is the mean information of the observable ones, spread evenly over the patches. Both
+        kinds of directions are orthogonal in the information, so that the covariance of the
+        observable ones does not change.
         """
         F = self.to_x.T @ self.free
         return replace(found, normals=found.normals + self.level / len(found.normals) * (F @ F.T))
 
     def observable_information(self, P: Array) -> Array:
-        """Return the information (6, 6) of d by a covariance P (6, 6) of d, zero along the unobservable directions."""
+        """Return the information (6, 6) of d by a covariance P (6, 6) of d, zero along the
+        unobservable directions.
+        """
         U = self.to_x.T @ self.observable  # columns: gradients of the observable components of x
         V = np.linalg.inv(self.observable.T @ self.to_x @ P @ self.to_x.T @ self.observable)
         info = U @ V @ U.T
         return np.asarray(0.5 * (info + info.T))
 
     def nearest(self, T_ca: Pose, other: Pose) -> Pose:
-        """Return the pose nearest ``other`` that ``T_ca`` is carried to by a motion along the unobservable directions.
+        """Return the pose nearest ``other`` that ``T_ca`` is carried to by a motion along the
+        unobservable directions.
 
-        The motion is a screw motion, so that a body of revolution is carried onto itself by any angle.
+        The motion is a screw motion, so that a body of revolution is carried onto itself by any
+        angle.
         """
         step = other @ T_ca.inverse()
         theta = geometry.log(step.q)
         x = np.concatenate(
-            [self.radius_m * theta, np.linalg.solve(_screw(theta), step.apply(self.centre) - self.centre)]
+            [
+                self.radius_m * theta,
+                np.linalg.solve(_screw(theta), step.apply(self.centre) - self.centre),
+            ]
         )
         along = self.free @ (self.free.T @ x)
         theta = along[:3] / self.radius_m
@@ -109,15 +127,20 @@ def _screw(theta: Array) -> Array:
     W, angle = geometry.skew(theta), float(np.linalg.norm(theta))
     if angle < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * W + W @ W / 6.0)
-    return np.asarray(np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W)
+    return np.asarray(
+        np.eye(3)
+        + (1.0 - np.cos(angle)) / angle**2 * W
+        + (angle - np.sin(angle)) / angle**3 * W @ W
+    )
 
 
 def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, float]:
-    """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L, and L [m].
+    """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L,
+    and L [m].
 
-    ``total`` is the sum of J'J over ``count`` points, with rotations about the origin. Each diagonal entry is the mean
-    squared change of surface distance per squared unit of point motion, between 0 and about 1, whatever the size of the
-    target.
+    ``total`` is the sum of J'J over ``count`` points, with rotations about the origin. Each
+    diagonal entry is the mean squared change of surface distance per squared unit of point motion,
+    between 0 and about 1, whatever the size of the target.
     """
     shift = np.eye(6)
     shift[3:, :3] = geometry.skew(centre)  # (p - centre) x n = p x n - centre x n
@@ -128,14 +151,16 @@ def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, 
 
 
 def unbounded_directions(P: Array, extent_m: float) -> tuple[tuple[str, ...], Array]:
-    """Return every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad).
+    """Return every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1
+    rad).
 
     Args:
         P: covariance of d = [theta; v] in {C} [rad, m].
         extent_m: the target's bounding diagonal [m].
 
     Returns:
-        Their names, and the motions as columns d (6, k), of length 1 in units of 1 rad and of the extent.
+        Their names, and the motions as columns d (6, k), of length 1 in units of 1 rad and of the
+        extent.
     """
     scale = np.repeat([1.0, extent_m], 3)
     scaled = P / np.outer(scale, scale)
@@ -157,7 +182,10 @@ def motions_outside(motions: Array, free: Array | None, length_m: float) -> Arra
     if free is None or not motions.size:
         return motions
     scale = np.repeat([length_m, 1.0], 3)[:, None]
-    basis, d = np.linalg.qr(scale * free)[0], scale * motions / np.linalg.norm(scale * motions, axis=0)
+    basis, d = (
+        np.linalg.qr(scale * free)[0],
+        scale * motions / np.linalg.norm(scale * motions, axis=0),
+    )
     return motions[:, np.linalg.norm(basis.T @ d, axis=0) < AXIS_WITHIN]
 
 
@@ -175,7 +203,10 @@ def turn_words(step: Pose) -> str:
 
 
 def _sparse_basis(rows: Array) -> Array:
-    """Basis of the same space by elimination with full pivoting: one motion per row, as few axes as possible."""
+    """Basis of the same space by elimination with full pivoting.
+
+    One motion per row, as few axes as possible.
+    """
     basis = rows.copy()
     used: list[int] = []
     for k in range(len(basis)):

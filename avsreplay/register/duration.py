@@ -1,18 +1,21 @@
 """Duration of scans whose points have no times, from the residuals of registered scans of a run.
 
-A target that moves while its points are measured one after the other is deformed. If k is the share of the scan before
-a point, and u the velocity of the target there, the residual at a point p with normal n is
+A target that moves while its points are measured one after the other is deformed. If k is the share
+of the scan before a point, and u the velocity of the target there, the residual at a point p with
+normal n is
 
     n . (p - c) = J d + delta n . p + T (k - 1/2) n . u
 
-with the pose error d, the error delta of the size, and the duration T. Robust least squares give all three, so that a
-wrong size is not taken for a duration. The standard error of a scan is that of the size (``size``): correlated
-residuals of a patch, and errors of model and ranges that vary slowly over the target.
+with the pose error d, the error delta of the size, and the duration T. Robust least squares give
+all three, so that a wrong size is not taken for a duration. The standard error of a scan is that of
+the size (``size``): correlated residuals of a patch, and errors of model and ranges that vary
+slowly over the target.
 
-Along a run the scans are spread over the whole log. Their mean has a standard error from the differences between six
-blocks of consecutive scans (jackknife), because neighbouring scans show the same side and have the same errors, and
-that of the slowly varying errors, which all scans may share. The bias of the noise is found as that of the size, on a
-few of the scans; it is subtracted, and half of it counts as a standard error.
+Along a run the scans are spread over the whole log. Their mean has a standard error from the
+differences between six blocks of consecutive scans (jackknife), because neighbouring scans show the
+same side and have the same errors, and that of the slowly varying errors, which all scans may
+share. The bias of the noise is found as that of the size, on a few of the scans; it is subtracted,
+and half of it counts as a standard error.
 """
 
 from __future__ import annotations
@@ -38,7 +41,11 @@ from avsreplay.register.size import (
 )
 from avsreplay.register.surface_index import SurfaceIndex
 
-EVERY, MOST_SCANS, LEAST_SCANS = 2, 24, 8  # aligned scans of which one is measured at first; measured scans
+EVERY, MOST_SCANS, LEAST_SCANS = (
+    2,
+    24,
+    8,
+)  # aligned scans of which one is measured at first; measured scans
 BIAS_SCANS, BLOCKS = 4, 6  # scans for the bias of the noise, and blocks of the jackknife
 MOST_WEIGHT = 4.0  # largest weight of a scan for the size, in units of the median weight
 LEAST_OF_PERIOD = 0.02  # least duration that is reported, over the period
@@ -51,7 +58,8 @@ class ScanDuration:
     Attributes:
         duration_s: negative if the last point is measured first [s].
         sigma_s: standard error of the duration by the noise [s].
-        systematic_s: its standard error by errors of model and ranges that vary slowly over the target [s].
+        systematic_s: its standard error by errors of model and ranges that vary slowly over the
+            target [s].
         delta: size of the target over that of the model, less 1, fitted with the duration.
         weight: inverse variance of delta, without the slowly varying errors.
     """
@@ -65,7 +73,9 @@ class ScanDuration:
 
 @value_class
 class Duration:
-    """Duration of a scan [s] along a run, the size of the target over that of the model, and their standard errors."""
+    """Duration of a scan [s] along a run, the size of the target over that of the model, and their
+    standard errors.
+    """
 
     duration_s: float
     sigma_s: float
@@ -79,7 +89,8 @@ class OrderedScan:
 
     Attributes:
         points: (n, 3) in {C} [m], at the registered pose.
-        motion: (n, 3) velocity of the target at each point [m/s], in {C}, times the share of the scan before the point.
+        motion: (n, 3) velocity of the target at each point [m/s], in {C}, times the share of the
+            scan before the point.
         camera_c: (3,) camera position in {C} [m], or None: both sides of a face are matched.
         period_s: time since the last aligned scan [s].
     """
@@ -117,7 +128,10 @@ class Durations:
             self.measured, self.stride = self.measured[::2], 2 * self.stride
 
     def result(self, index: SurfaceIndex) -> Duration | None:
-        """Return the duration if it is significant, with the size that was fitted with it; else None."""
+        """Return the duration if it is significant, with the size that was fitted with it.
+
+        Else None.
+        """
         if len(self.measured) < LEAST_SCANS or not self._significant(*self._mean()):
             return None
         tried = np.linspace(0, len(self.measured) - 1, BIAS_SCANS).astype(np.intp)
@@ -136,7 +150,9 @@ class Durations:
 
     def _mean(self) -> tuple[float, float, float]:
         """The mean duration weighted by its variance, its standard error, and the period [s]."""
-        values = [(found.duration_s, found.sigma_s, found.systematic_s) for _, found in self.measured]
+        values = [
+            (found.duration_s, found.sigma_s, found.systematic_s) for _, found in self.measured
+        ]
         duration, sigma, shared = np.array(values).T
         weight = 1.0 / (sigma**2 + shared**2)
         mean, spread = _mean_of(duration, weight)
@@ -147,20 +163,24 @@ class Durations:
 def _mean_of(values: Array, weight: Array) -> tuple[float, float]:
     """Weighted mean of values (n,), and its standard error by the jackknife over blocks."""
     block = np.arange(len(values)) * BLOCKS // len(values)
-    without = [float(weight[block != k] @ values[block != k] / weight[block != k].sum()) for k in range(BLOCKS)]
+    without = [
+        float(weight[block != k] @ values[block != k] / weight[block != k].sum())
+        for k in range(BLOCKS)
+    ]
     return float(weight @ values / weight.sum()), spread_of(np.array(without))
 
 
 def scan_duration(index: SurfaceIndex, scan: OrderedScan) -> ScanDuration | None:
-    """Fit pose, size and duration of a scan whose points were measured one after the other while the target moved.
+    """Fit pose, size and duration of a scan whose points were measured one after the other while
+    the target moved.
 
     Args:
         index: of the model.
         scan: the registered points.
 
     Returns:
-        The duration, negative if the last point is measured first; None with fewer than 50 residuals, or if pose and
-        size explain any duration.
+        The duration, negative if the last point is measured first; None with fewer than 50
+        residuals, or if pose and size explain any duration.
     """
     if (found := _fitted(index, scan.points, scan.camera_c, scan.motion)) is None:
         return None
@@ -173,19 +193,25 @@ def scan_duration(index: SurfaceIndex, scan: OrderedScan) -> ScanDuration | None
 
 
 def noise_biases(index: SurfaceIndex, scan: OrderedScan) -> tuple[float, float]:
-    """Return the duration [s] and the size less 1 that the noise of a scan makes a still target appear to have.
+    """Return the duration [s] and the size less 1 that the noise of a scan makes a still target
+    appear to have.
 
     As ``size.noise_bias``, with the arguments of :func:`scan_duration`.
     """
     if (found := _fitted(index, scan.points, scan.camera_c, scan.motion)) is None:
         return 0.0, 0.0
     rows = found[2]
-    both = [_fitted(index, noisy, scan.camera_c, scan.motion[rows.used]) for noisy in noisy_points(rows, scan.camera_c)]
+    both = [
+        _fitted(index, noisy, scan.camera_c, scan.motion[rows.used])
+        for noisy in noisy_points(rows, scan.camera_c)
+    ]
     duration, size = np.mean([(found if each is None else each)[:2] for each in both], axis=0)
     return float(duration), float(size)
 
 
-def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float, Rows] | None:
+def _fitted(
+    index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array
+) -> tuple[float, float, Rows] | None:
     """Duration, size less 1, and rows of the last round."""
     duration, delta, moved, rows = 0.0, 0.0, Pose.identity(), None
     for _ in range(ROUNDS):

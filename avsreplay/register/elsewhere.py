@@ -1,9 +1,11 @@
-"""Other poses that explain the points of the result of a search as well, which the starts of the search did not reach.
+"""Other poses that explain the points of the result of a search as well, which the starts of the
+search did not reach.
 
-A body with a repeated pattern, of which a part is measured, has many poses that are far apart and equally good. Another
-object beside the target displaces the starts of a search, which then reaches one of several poses that the sides of a
-box-like body give. Such poses are the result turned and displaced. The turns are the near-symmetries of the model and
-the rotations of a cube along the two main directions of its faces; the displacements are in the plane of the scan.
+A body with a repeated pattern, of which a part is measured, has many poses that are far apart and
+equally good. Another object beside the target displaces the starts of a search, which then reaches
+one of several poses that the sides of a box-like body give. Such poses are the result turned and
+displaced. The turns are the near-symmetries of the model and the rotations of a cube along the two
+main directions of its faces; the displacements are in the plane of the scan.
 """
 
 from __future__ import annotations
@@ -38,14 +40,31 @@ OFF = 2.0  # a point farther from the model than this many widths is off it
 CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
-POINTS, STEP_OF_EXTENT, STEPS = 50, 0.06, 12  # of displaced starts: points, their distance, and steps each way
+POINTS, STEP_OF_EXTENT, STEPS = (
+    50,
+    0.06,
+    12,
+)  # of displaced starts: points, their distance, and steps each way
 FIRST_GATE, SECOND_GATE = 0.15, 0.075  # rejection distances over the extent
-MOST = 150, 80  # starts that are kept after the first passes: those turned by near-symmetries, and the others
+MOST = (
+    150,
+    80,
+)  # starts that are kept after the first passes: those turned by near-symmetries, and the others
 MOST_STARTS = 1200  # with more of them their distance is larger
 SECOND, LAST = 4, 6  # passes with the distance SECOND_GATE, and of the best with more points
-COMPARED_FIRST, COMPARED = 16, 4  # poses that are compared with more points, and that are registered to the model
-FIXED_WORK, POINT_WORK = 10_000, (540, 900)  # cost of these poses; usual one for each point, of a part of the target
-SQUARE, ALONG, LEAST_FACES = 0.1, 0.98, 0.05  # cosines of normals at right angles and parallel; share of the surface
+COMPARED_FIRST, COMPARED = (
+    16,
+    4,
+)  # poses that are compared with more points, and that are registered to the model
+FIXED_WORK, POINT_WORK = (
+    10_000,
+    (540, 900),
+)  # cost of these poses; usual one for each point, of a part of the target
+SQUARE, ALONG, LEAST_FACES = (
+    0.1,
+    0.98,
+    0.05,
+)  # cosines of normals at right angles and parallel; share of the surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,78 +84,132 @@ class Search(GlobalSearch):
     """A global search that also finds other poses of its result."""
 
     def elsewhere_work(self, points: int, partial: bool) -> int:
-        """Return the usual cost of :meth:`elsewhere` for a scan of so many points, in point searches."""
-        return FIXED_WORK + POINT_WORK[partial] * POINTS + REGISTERED_WORK * min(points, REFINED_POINTS)
+        """Return the usual cost of :meth:`elsewhere` for a scan of so many points, in point
+        searches.
+        """
+        return (
+            FIXED_WORK
+            + POINT_WORK[partial] * POINTS
+            + REGISTERED_WORK * min(points, REFINED_POINTS)
+        )
 
-    def elsewhere(self, points: Array, T_ca: Pose, partial: bool, left: int) -> tuple[list[Pose], int]:
-        """Return other poses that explain the points of the result of a search nearly as well, and the work.
+    def elsewhere(
+        self, points: Array, T_ca: Pose, partial: bool, left: int
+    ) -> tuple[list[Pose], int]:
+        """Return other poses that explain the points of the result of a search nearly as well, and
+        the work.
 
         Args:
             points: (n, 3) in {A} [m], those on the model at the result.
             T_ca: the result.
-            partial: the scan shows a part of the target, which may be anywhere on it; else starts are hardly displaced.
+            partial: the scan shows a part of the target, which may be anywhere on it; else starts
+                are hardly displaced.
             left: work that is left, in point searches; after most of it no pose is registered.
 
         Returns:
             At most ``COMPARED`` poses T_ca, and the work in point searches.
         """
         self._spent, self._registered = 0, REFINED_POINTS
-        L, width, threads = self._extent, MIDDLE_OF_EXTENT * self._extent, self._target.limits.threads
-        few, some, fine = (np.ascontiguousarray(thin_to(points, n)) for n in (POINTS, MIDDLE_POINTS, FINE_POINTS))
+        L, width, threads = (
+            self._extent,
+            MIDDLE_OF_EXTENT * self._extent,
+            self._target.limits.threads,
+        )
+        few, some, fine = (
+            np.ascontiguousarray(thin_to(points, n)) for n in (POINTS, MIDDLE_POINTS, FINE_POINTS)
+        )
         sight = self._target.visibility.direction_to_camera(points)
-        facing, starts = self._sided and sight is not None, self._displaced(few, T_ca, sight, STEPS if partial else 1)
+        facing, starts = (
+            self._sided and sight is not None,
+            self._displaced(few, T_ca, sight, STEPS if partial else 1),
+        )
         looked = len(few[::2]) * sum(map(len, starts)) * 3
         rule = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         kept = []
         for each, most in zip(starts, MOST, strict=True):
-            poses, costs = self._field.refine(few[::2].copy(), each, FIRST_PASSES, FIRST_GATE * L, *rule)
+            poses, costs = self._field.refine(
+                few[::2].copy(), each, FIRST_PASSES, FIRST_GATE * L, *rule
+            )
             kept.append(self._different(best_of(poses, costs, len(poses)), most, 0.3))
         poses = np.concatenate(kept)
         looked += len(few) * len(poses) * (1 + SECOND)
         poses, costs = self._field.refine(few, poses, SECOND, SECOND_GATE * L, *rule)
         poses = self._different(best_of(poses, costs, len(poses)), sum(MOST), 0.3)
         moved = few @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-        d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=width).d2.reshape(len(poses), -1)
+        d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=width).d2.reshape(
+            len(poses), -1
+        )
         costs, self._spent = np.minimum(d2 / width**2, 1.0).mean(axis=1), d2.size
         poses = self._different(best_of(poses, costs, len(poses)), COMPARED_FIRST, 0.5)
         looked += len(some) * len(poses) * (1 + LAST)
         rule = (FALL, 0.01 * L, width, facing, threads)
         poses, _ = self._field.refine(some, poses, LAST, 2.0 * width, *rule)
         self._most = left - FIXED_WORK - looked // LOOK_UPS
-        first, *found = [self._measured(some, each, MIDDLE_OF_EXTENT) for each in (T_ca, *map(Pose.from_matrix, poses))]
+        first, *found = [
+            self._measured(some, each, MIDDLE_OF_EXTENT)
+            for each in (T_ca, *map(Pose.from_matrix, poses))
+        ]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         dearest = float(first.unexplained(width).mean()) + RIVAL_AFTER
-        near = [T_ca.matrix, *(each.T_ca.matrix for each in ranked if each.unexplained(width).mean() < dearest)]
-        others = [Pose.from_matrix(T) for T in self._different(np.stack(near), 1 + COMPARED, 0.5)[1:]]
+        near = [
+            T_ca.matrix,
+            *(each.T_ca.matrix for each in ranked if each.unexplained(width).mean() < dearest),
+        ]
+        others = [
+            Pose.from_matrix(T) for T in self._different(np.stack(near), 1 + COMPARED, 0.5)[1:]
+        ]
         ended = self._to_the_end(fine, others, width)[0]
         return [each.T_ca for each in ended], FIXED_WORK + looked // LOOK_UPS + self._spent
 
-    def _displaced(self, few: Array, T_ca: Pose, sight: Array | None, most: int) -> tuple[Array, Array]:
-        """A pose turned and displaced where the centroid of points (n, 3) is inside the box of the model.
+    def _displaced(
+        self, few: Array, T_ca: Pose, sight: Array | None, most: int
+    ) -> tuple[Array, Array]:
+        """A pose turned and displaced where the centroid of points (n, 3) is inside the box of the
+        model.
 
-        ``sight``: direction to the camera, ``most``: steps each way in the plane of the points. Those turned by the
-        near-symmetries, (k, 4, 4), and those turned otherwise.
+        ``sight``: direction to the camera, ``most``: steps each way in the plane of the points.
+        Those turned by the near-symmetries, (k, 4, 4), and those turned otherwise.
         """
         turns: list[Array] = []
         alike = (np.eye(3), *self.symmetries[:, :3, :3])
         for R in (*alike, *self._square):
-            if not any(np.trace(R.T @ other) > 1.0 + 2.0 * np.cos(0.5 * SAME_RAD) for other in turns):
+            if not any(
+                np.trace(R.T @ other) > 1.0 + 2.0 * np.cos(0.5 * SAME_RAD) for other in turns
+            ):
                 turns.append(R)
-        rotations, near = np.stack([turn @ T_ca.R for turn in turns]), sum(any(R is x for x in alike) for R in turns)
+        rotations, near = (
+            np.stack([turn @ T_ca.R for turn in turns]),
+            sum(any(R is x for x in alike) for R in turns),
+        )
         starts = self._placed(few, rotations, sight, STEP_OF_EXTENT, most)
         wider = np.sqrt(sum(map(len, starts)) / MOST_STARTS)
-        starts = starts if wider <= 1.0 else self._placed(few, rotations, sight, wider * STEP_OF_EXTENT, most)
+        starts = (
+            starts
+            if wider <= 1.0
+            else self._placed(few, rotations, sight, wider * STEP_OF_EXTENT, most)
+        )
         return np.concatenate(starts[:near]), np.concatenate([np.zeros((0, 4, 4)), *starts[near:]])
 
-    def _placed(self, few: Array, rotations: Array, sight: Array | None, step: float, most: int) -> list[Array]:
+    def _placed(
+        self, few: Array, rotations: Array, sight: Array | None, step: float, most: int
+    ) -> list[Array]:
         """The starts with each of the rotations (k, 3, 3), so many extents apart."""
-        k, L, vertices = step * np.arange(-most, most + 1), self._extent, self._target.surface.vertices
+        k, L, vertices = (
+            step * np.arange(-most, most + 1),
+            self._extent,
+            self._target.surface.vertices,
+        )
         axes = np.linalg.svd(few - (centroid := few.mean(axis=0)), full_matrices=False)[2]
         steps = L * (k[:, None, None] * axes[0] + k[None, :, None] * axes[1]).reshape(-1, 3)
-        low, high = vertices.min(axis=0) - MIDDLE_OF_EXTENT * L, vertices.max(axis=0) + MIDDLE_OF_EXTENT * L
+        low, high = (
+            vertices.min(axis=0) - MIDDLE_OF_EXTENT * L,
+            vertices.max(axis=0) + MIDDLE_OF_EXTENT * L,
+        )
         starts = []
         for R in rotations:
-            middle = (self._middle if sight is None else self._centroids.of(R @ sight)) + steps @ R.T
+            middle = (
+                self._middle if sight is None else self._centroids.of(R @ sight)
+            ) + steps @ R.T
             inside = ((middle > low) & (middle < high)).all(axis=1)
             T = np.tile(np.eye(4), (int(inside.sum()), 1, 1))
             T[:, :3, :3], T[:, :3, 3] = R, middle[inside] - R @ centroid
@@ -145,7 +218,10 @@ class Search(GlobalSearch):
 
     @cached_property
     def _square(self) -> Array:
-        """The rotations (24, 3, 3) of a cube along two directions of most of the faces; none if they are not square."""
+        """The rotations (24, 3, 3) of a cube along two directions of most of the faces.
+
+        None if they are not square.
+        """
         normals = sample(self._target.surface, MODEL_POINTS // 3)[1]
         along = (np.abs(normals @ normals.T) > ALONG).sum(axis=1)
         first = normals[np.argmax(along)]
@@ -161,7 +237,9 @@ class Search(GlobalSearch):
 def cube_rotations() -> Array:
     """Return the 24 rotations (24, 3, 3) of a cube along the axes."""
     signed = [
-        np.diag(signs)[list(order)] for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)
+        np.diag(signs)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
     ]
     return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
 
@@ -179,7 +257,15 @@ def decides(better: Contradicted, other: Contradicted, width_m: float, complete:
     share = max(CONTRADICTING, float(np.mean((a > width_m) & (b > width_m))))
     if share >= 0.5:
         return False
-    rays_for = np.count_nonzero((a < width_m) & (b > off)) + other.passed + (other.empty if complete else 0.0)
-    against = np.count_nonzero((b < width_m) & (a > off)) + better.passed + (better.empty if complete else 0.0)
+    rays_for = (
+        np.count_nonzero((a < width_m) & (b > off))
+        + other.passed
+        + (other.empty if complete else 0.0)
+    )
+    against = (
+        np.count_nonzero((b < width_m) & (a > off))
+        + better.passed
+        + (better.empty if complete else 0.0)
+    )
     enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
     return bool(enough and against <= MOST_AGAINST * rays_for)

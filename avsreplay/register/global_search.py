@@ -1,10 +1,12 @@
-"""Global search: the pose from one scan alone, without a guess, for any attitude; and whether it is unique.
+"""Global search: the pose from one scan alone, without a guess, for any attitude; and whether it is
+unique.
 
-The search goes from coarse to fine. A start is an attitude with the centroid of the scan on the centroid of the surface
-visible from there. It is refined by a few point-to-plane passes with few points against points sampled from the model,
-which are looked up in a grid. The best starts are refined with more points. The last few, all different poses, are
-registered to the model itself and ranked by the truncated distances that remain. If no pose explains the scan, more
-starts follow: shifted ones for a target that is partly hidden, and other positions of the camera.
+The search goes from coarse to fine. A start is an attitude with the centroid of the scan on the
+centroid of the surface visible from there. It is refined by a few point-to-plane passes with few
+points against points sampled from the model, which are looked up in a grid. The best starts are
+refined with more points. The last few, all different poses, are registered to the model itself and
+ranked by the truncated distances that remain. If no pose explains the scan, more starts follow:
+shifted ones for a target that is partly hidden, and other positions of the camera.
 """
 
 from __future__ import annotations
@@ -22,39 +24,106 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
-from avsreplay.register.sampling import attitudes, sample_evenly, scan_axes, thin_to, without_sparse_points
+from avsreplay.register.sampling import (
+    attitudes,
+    sample_evenly,
+    scan_axes,
+    thin_to,
+    without_sparse_points,
+)
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.visibility import VisibleCentroids
 
-COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
-COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
-MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
+COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = (
+    100,
+    300,
+    1500,
+)  # points: first and second selection, final ranking
+COARSE_PASSES, MIDDLE_PASSES = (
+    8,
+    12,
+)  # point-to-plane iterations for each attitude in the two selections
+MIDDLE_STARTS, FINE_STARTS = (
+    50,
+    10,
+)  # attitudes kept for the second selection, and poses registered on the model
 MODEL_POINTS, CELLS = 3000, 40  # sampled from the model; cells of the grid along its diagonal
-COARSE_OF_EXTENT, MIDDLE_OF_EXTENT, MOST_OF_EXTENT = 0.03, 0.02, 0.05  # distances of unexplained points; the largest
-START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
-FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # after two passes with part of the points one start in three is kept
-SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # after two more passes with all of them one start in eight is kept
-MIDDLE_FIRST, MIDDLE_STRIDE, KEPT_IN_MIDDLE = 4, 2, 20  # passes with every second point, after which so many are left
-FIRST_STRIDES, THINNED = (2, 3, 3), (1, 2, 2)  # every n-th point, and every n-th attitude, by the round
-SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turned onto itself; most motions tried
+COARSE_OF_EXTENT, MIDDLE_OF_EXTENT, MOST_OF_EXTENT = (
+    0.03,
+    0.02,
+    0.05,
+)  # distances of unexplained points; the largest
+START_OF_EXTENT, FALL = (
+    0.3,
+    0.7,
+)  # rejection distance of the first pass, and its factor from pass to pass
+FIRST_PASSES, KEPT_AFTER_FIRST = (
+    2,
+    3,
+)  # after two passes with part of the points one start in three is kept
+SECOND_PASSES, KEPT_AFTER_SECOND = (
+    2,
+    8,
+)  # after two more passes with all of them one start in eight is kept
+MIDDLE_FIRST, MIDDLE_STRIDE, KEPT_IN_MIDDLE = (
+    4,
+    2,
+    20,
+)  # passes with every second point, after which so many are left
+FIRST_STRIDES, THINNED = (
+    (2, 3, 3),
+    (1, 2, 2),
+)  # every n-th point, and every n-th attitude, by the round
+SYMMETRIC, SYMMETRIES = (
+    0.3,
+    6,
+)  # largest unexplained share of the surface turned onto itself; most motions tried
 TURNED_PASSES, TURNED_RIVALS = 6, 2
-RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
+RIVALS, RIVAL_WITHIN = (
+    6,
+    0.15,
+)  # poses that are registered to the end: share of unexplained points over the least
 SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # poses that differ by less are the same
-SIGMAS = FAVOURED = 5.0  # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
+SIGMAS = FAVOURED = (
+    # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
+    5.0
+)
 REFINED_POINTS = 500  # fine points with which the last poses are registered
-STOP_RAD, STOP_OF_EXTENT = 1e-4, 1e-4  # a pass that moves the pose by less ends a registration, as poses are compared
-FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
-RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS, ROUND_WORK = 6, 28_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
-SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
-REGISTERED_SHARE, REGISTERED_WORK = 0.8, 10  # of the work left, for the last poses; usual cost for each fine point
+STOP_RAD, STOP_OF_EXTENT = (
+    1e-4,
+    1e-4,
+)  # a pass that moves the pose by less ends a registration, as poses are compared
+FIRST_FINE, FINE_PASSES = (
+    5,
+    15,
+)  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
+RIVAL_AFTER, MOST_RIVALS = (
+    0.05,
+    4,
+)  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
+LOOK_UPS, ROUND_WORK = (
+    6,
+    28_000,
+)  # look-ups in the grid that cost as much as a search on the model; cost of a round
+# with less work left than so many usual rounds, the last poses are registered with half of the
+# points
+SHORT = 1.5
+REGISTERED_SHARE, REGISTERED_WORK = (
+    0.8,
+    10,
+)  # of the work left, for the last poses; usual cost for each fine point
 APART = 0.6  # usual share of different starts
-SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
+SHIFTS, SHIFT_OF_EXTENT = (
+    6,
+    0.3,
+)  # number and size of the shifts of the starts across the direction to the camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A pose T_ca and the distances (k,) [m] of the points of the scan from the faces that the camera sees."""
+    """A pose T_ca and the distances (k,) [m] of the points of the scan from the faces that the
+    camera sees.
+    """
 
     T_ca: Pose
     distance: Array
@@ -70,8 +139,8 @@ class SearchResult:
 
     Attributes:
         best: the best pose T_ca.
-        rivals: other poses, more than 10 deg or 0.05 of the extent from the best one, that explain the scan as well,
-            within the statistical error of these points.
+        rivals: other poses, more than 10 deg or 0.05 of the extent from the best one, that explain
+            the scan as well, within the statistical error of these points.
         width_m: distance beyond which a point is not on the model; it follows the noise.
         inlier_ratio: share of the points of the scan on the model at the best pose.
         candidates: all poses that were registered to the end, for a further round.
@@ -90,22 +159,37 @@ class GlobalSearch:
     """Searches the pose of one target. Built once; a search does not change it.
 
     Attributes:
-        symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the identity.
+        symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the
+            identity.
         same_rad: rotation below which two poses nearly at one place are the same.
     """
 
     def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
-        """Sample the model and find its near-symmetries, or take both from ``kept``; what is missing is added to it."""
-        self._target, self._params, self._sided, self.same_rad = target, params, target.visibility.sided, SAME_RAD
+        """Sample the model and find its near-symmetries, or take both from ``kept``.
+
+        What is missing is added to it.
+        """
+        self._target, self._params, self._sided, self.same_rad = (
+            target,
+            params,
+            target.visibility.sided,
+            SAME_RAD,
+        )
         self._extent = target.surface.extent
         if "sampled" not in kept:
             kept["sampled"] = np.stack(sample_evenly(target.surface, MODEL_POINTS))
         points, normals = kept["sampled"]
         planes = normals if self._sided else target.index.closest(points).normal
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
-        self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
+        self._centroids = VisibleCentroids(
+            points, normals if self._sided else np.zeros_like(normals), self._extent
+        )
         self._middle = points.mean(axis=0)
-        self._spent, self._most, self._registered = 0, 2**62, REFINED_POINTS  # work of the round, its limit; points
+        self._spent, self._most, self._registered = (
+            0,
+            2**62,
+            REFINED_POINTS,
+        )  # work of the round, its limit; points
         coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
@@ -116,7 +200,9 @@ class GlobalSearch:
         self.symmetries = kept["symmetries"]
 
     def work(self, points: int, number: int) -> int:
-        """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
+        """Return the usual cost of round ``number`` in point searches, for a scan of so many
+        points.
+        """
         return self._looked(points, number) + REGISTERED_WORK * min(points, FINE_POINTS)
 
     def _looked(self, points: int, number: int) -> int:
@@ -145,18 +231,25 @@ class GlobalSearch:
 
         Args:
             points: (n, 3) in {A} [m], finite, n >= 1.
-            number: 0 assumes that the whole visible side is in the scan; 1 shifts the starts, for a target that is
-                partly outside the scan or hidden; 2 does not assume the position of the camera.
+            number: 0 assumes that the whole visible side is in the scan; 1 shifts the starts, for a
+                target that is partly outside the scan or hidden; 2 does not assume the position of
+                the camera.
             before: result of another round for the same points, whose poses are compared as well.
-            known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
+            known: a pose T_ca that is compared as well: another one is unique only if it explains
+                the scan better.
             left: work that is left, in point searches; after most of it no pose is registered.
             kept: work of it that a later step needs.
         """
         self._most = min(int(REGISTERED_SHARE * left), left - kept)
         self._spent = self._looked(len(points), number)
-        self._registered = REFINED_POINTS // (2 if left < SHORT * self.work(len(points), number) else 1)
+        self._registered = REFINED_POINTS // (
+            2 if left < SHORT * self.work(len(points), number) else 1
+        )
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
-        few, some, fine = (np.ascontiguousarray(thin_to(scan, n)) for n in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
+        few, some, fine = (
+            np.ascontiguousarray(thin_to(scan, n))
+            for n in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS)
+        )
         sight = self._target.visibility.direction_to_camera(scan)
         sights, shifts, facing = self._rounds(few, sight)[number]
         starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
@@ -165,8 +258,12 @@ class GlobalSearch:
         found = found if known is None else [*found, self._measured(fine, known)]
         return self._verdict([*found, *(before.candidates if before else ())])
 
-    def _rounds(self, few: Array, sight: Array | None) -> list[tuple[Sequence[Array | None], Array, bool]]:
-        """Camera directions, shifts of the scan (k, 3) in {A} [m], and whether the directions can be relied on."""
+    def _rounds(
+        self, few: Array, sight: Array | None
+    ) -> list[tuple[Sequence[Array | None], Array, bool]]:
+        """Camera directions, shifts of the scan (k, 3) in {A} [m], and whether the directions can
+        be relied on.
+        """
         none = np.zeros((1, 3))
         axes = np.linalg.svd((few - few.mean(axis=0)) if sight is None else sight[None])[2]
         turn = 2.0 * np.pi * np.arange(SHIFTS)[:, None] / SHIFTS
@@ -178,8 +275,13 @@ class GlobalSearch:
             ([sight, *scan_axes(few)], none, False),
         ]
 
-    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array, thinned: int = 1) -> Array:
-        """Every attitude with every camera direction and shift: centroid of the scan on that of the visible surface."""
+    def _starts(
+        self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array, thinned: int = 1
+    ) -> Array:
+        """Every attitude with every camera direction and shift.
+
+        Centroid of the scan on that of the visible surface.
+        """
         R_ca = geometry.matrix(attitudes(max(1, self._params.starts // thinned)))
         starts = np.tile(np.eye(4), (len(sights), len(shifts), len(R_ca), 1, 1))
         starts[..., :3, :3] = R_ca
@@ -189,8 +291,12 @@ class GlobalSearch:
                 starts[k, j, :, :3, 3] = middle - R_ca @ (centroid_a + shift)
         return starts.reshape(-1, 4, 4)
 
-    def _selected(self, few: Array, some: Array, starts: Array, facing: bool, stride: int = 2) -> list[Pose]:
-        """The best starts after passes with few points, then the best of these, all different, with more points."""
+    def _selected(
+        self, few: Array, some: Array, starts: Array, facing: bool, stride: int = 2
+    ) -> list[Pose]:
+        """The best starts after passes with few points, then the best of these, all different, with
+        more points.
+        """
         p, L, threads = self._params, self._extent, self._target.limits.threads
         coarse = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         middle = (FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
@@ -200,28 +306,46 @@ class GlobalSearch:
         )
         poses = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
         poses, costs = self._field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
-        poses, narrow = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)), narrow * FALL**SECOND_PASSES
-        poses, costs = self._field.refine(few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse)
+        poses, narrow = (
+            best_of(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)),
+            narrow * FALL**SECOND_PASSES,
+        )
+        poses, costs = self._field.refine(
+            few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse
+        )
         poses = self._different(best_of(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
-        poses, costs = self._field.refine(some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle)
+        poses, costs = self._field.refine(
+            some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle
+        )
         poses, narrow = best_of(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
-        poses, costs = self._field.refine(some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle)
+        poses, costs = self._field.refine(
+            some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle
+        )
         found = self._different(best_of(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
         return [Pose.from_matrix(T) for T in found]
 
     def _different(self, poses: Array, most: int, scale: float) -> Array:
         """The first few of (k, 4, 4) that are different poses."""
         trace, near = 1.0 + 2.0 * np.cos(scale * SAME_RAD), scale * SAME_OF_EXTENT * self._extent
-        return np.ascontiguousarray(poses[kernel_module().different(poses, self._middle, most, trace, near)])
+        return np.ascontiguousarray(
+            poses[kernel_module().different(poses, self._middle, most, trace, near)]
+        )
 
-    def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
-        """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
+    def _refined(
+        self, some: Array, fine: Array, poses: list[Pose], facing: bool
+    ) -> list[Candidate]:
+        """The poses measured on the model.
+
+        The best, and the very best by a near-symmetry, are registered to it.
+        """
         width = MIDDLE_OF_EXTENT * self._extent
         found = [self._measured(some, T_ca, MIDDLE_OF_EXTENT) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
-        best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
+        best = [
+            each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most
+        ]
         found, least = self._to_the_end(fine, best, width)
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
@@ -237,23 +361,35 @@ class GlobalSearch:
     def _to_the_end(
         self, fine: Array, poses: list[Pose], width_m: float, least: float = np.inf
     ) -> tuple[list[Candidate], float]:
-        """The poses registered to the model by a few passes, and to the end those that may be as good as the best.
+        """The poses registered to the model by a few passes, and to the end those that may be as
+        good as the best.
 
-        Also returned: the least cost after the few passes, also of other poses if it is given (``least``).
+        Also returned: the least cost after the few passes, also of other poses if it is given
+            (``least``).
         """
         part = np.ascontiguousarray(fine[:: max(1, len(fine) // self._registered)])
         brief = [self._ended(self._brief, part, T_ca, width_m) for T_ca in poses]
         found = [self._measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
         least = min(least, float(costs.min(initial=np.inf)))
-        order = [k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER]
+        order = [
+            k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER
+        ]
         last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
         ended = [self._ended(self._refine, part, found[k].T_ca, width_m, True) for k in last]
-        best, others = [self._measured(fine, T_ca) for T_ca in ended], (found[k].T_ca for k in order if k not in last)
-        return best + [self._measured(fine, T_ca) for T_ca in others if self._spent < self._most], least
+        best, others = (
+            [self._measured(fine, T_ca) for T_ca in ended],
+            (found[k].T_ca for k in order if k not in last),
+        )
+        return best + [
+            self._measured(fine, T_ca) for T_ca in others if self._spent < self._most
+        ], least
 
     def _near_symmetries(self, points: Array) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different ones, not the identity."""
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself.
+
+        Different ones, not the identity.
+        """
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
@@ -265,12 +401,19 @@ class GlobalSearch:
         return self._different(np.stack([np.eye(4), *ended]), 1 + SYMMETRIES, 1.0)[1:]
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
-        distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)
+        distance, work = self._target.visibility.distances(
+            self._target.index, points, T_ca, most * self._extent
+        )
         self._spent += work
         return Candidate(T_ca, distance)
 
-    def _ended(self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False) -> Pose:
-        """The pose registered to the model; the pose itself where the work of the round is spent."""
+    def _ended(
+        self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False
+    ) -> Pose:
+        """The pose registered to the model.
+
+        The pose itself where the work of the round is spent.
+        """
         if self._spent >= self._most:
             return T_ca
         fit = horn.align_within(points, T_ca, width_m, near, most_work=self._most - self._spent)
@@ -279,12 +422,21 @@ class GlobalSearch:
 
     def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
         noise = self.noise_of(found)
-        width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
+        width = max(
+            self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent)
+        )
         best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
         good = takewhile(lambda other: as_good(best, other, width, self.margin(noise)), others)
         rivals = tuple(other.T_ca for other in good)
-        return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found), self._spent)
+        return SearchResult(
+            best.T_ca,
+            rivals,
+            width,
+            float(np.mean(best.distance < width)),
+            tuple(found),
+            self._spent,
+        )
 
     def noise_of(self, found: Sequence[Candidate]) -> float:
         """Return the least robust noise [m] of the poses."""
@@ -295,18 +447,25 @@ class GlobalSearch:
         return max(self._params.margin, FAVOURED * noise_m / self._extent)
 
     def refined(self, points: Array, T_ca: Pose, width_m: float) -> Pose:
-        """Return the pose T_ca registered to the model with ``points`` (n, 3) in {A} nearer than ``width_m`` [m]."""
+        """Return the pose T_ca registered to the model with ``points`` (n, 3) in {A} nearer than
+        ``width_m`` [m].
+        """
         return self._refine.align_within(points, T_ca, width_m).T_ca
 
     def same(self, first: Pose, other: Pose) -> bool:
         """Return whether two poses T_ca differ by less than ``same_rad`` and 0.05 of the extent."""
         step = first @ other.inverse()  # in {C}
-        near = float(np.linalg.norm(step.apply(self._middle) - self._middle)) < SAME_OF_EXTENT * self._extent
+        near = (
+            float(np.linalg.norm(step.apply(self._middle) - self._middle))
+            < SAME_OF_EXTENT * self._extent
+        )
         return near and float(geometry.angle(step.q)) < self.same_rad
 
 
 def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:
-    """Return whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
+    """Return whether the excess cost of the second, point by point, is below 5 sigma of its mean or
+    the margin.
+    """
     excess = second.unexplained(width) - best.unexplained(width)
     error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
     return bool(excess.mean() < max(margin, error))

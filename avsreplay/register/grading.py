@@ -1,4 +1,6 @@
-"""Registration of a scan from one guess, and the quality of the pose, within the budget of the scan."""
+"""Registration of a scan from one guess, and the quality of the pose, within the budget of the
+scan.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,23 @@ from avsreplay.register.budget import Budget
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.restarts import Restarter
 
-FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
+FAR_RAD = np.radians(
+    30.0
+)  # a result rotated by more from its guess is verified by the global search
 
 
 class Grader:
     """One back end with the quality of its poses."""
 
-    def __init__(self, target: Target, params: RegisterParams, backend: Backend, restarter: Restarter) -> None:
-        self._target, self._params, self._backend, self._restarter = target, params, backend, restarter
+    def __init__(
+        self, target: Target, params: RegisterParams, backend: Backend, restarter: Restarter
+    ) -> None:
+        self._target, self._params, self._backend, self._restarter = (
+            target,
+            params,
+            backend,
+            restarter,
+        )
         self._accuracy: tuple[float, float] = getattr(backend, "accuracy", quality.ACCURACY)
         self._closest = isinstance(backend, HornBackend)
 
@@ -40,16 +51,19 @@ class Grader:
     ) -> Alignment:
         """Register a scan and measure the quality of the pose.
 
-        A close fit that is not at a minimum before the last pass that is allowed is registered once more from there.
+        A close fit that is not at a minimum before the last pass that is allowed is registered once
+        more from there.
 
         Args:
             scan: (n, 3) finite, in {A} [m].
             guess: T_ac.
             budget: work that is left.
-            width_m: rejection distance from the first pass on, and of inliers [m]; None: that of the back end.
+            width_m: rejection distance from the first pass on, and of inliers [m]; None: that of
+                the back end.
             halves: two halves of the scan are compared.
             carried: as of ``Registrar.register``.
-            rough: a part of the scan suffices where it shows that the fit is not close; it is then not converged.
+            rough: a part of the scan suffices where it shows that the fit is not close; it is then
+                not converged.
         """
         start = T_ca = guess.inverse()
         index, limits = self._target.index, self._target.limits
@@ -58,20 +72,32 @@ class Grader:
             rule = (width_m, budget.for_alignment(len(scan)), rough and not last)
             fit = aligned(self._params.backend, self._backend, scan, T_ca, *rule)
             if isinstance(fit, str):
-                return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
+                return replace(
+                    quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit
+                )
             of, full = self._restarter.part(scan) if fit.rough else scan, not fit.rough
             options = (self._params, halves and full, self._accuracy, full and not carried, start)
-            found = quality.grade(index, self._target.visibility, of, fit, limits, *options, full and self._closest)
+            found = quality.grade(
+                index, self._target.visibility, of, fit, limits, *options, full and self._closest
+            )
             if fit.rough:
-                found = replace(found, points=len(scan), inliers=found.inliers * len(scan) // len(of))
+                found = replace(
+                    found, points=len(scan), inliers=found.inliers * len(scan) // len(of)
+                )
             noisy = full and self._closest and found.rms_m > quality.SMALL_NOISE * index.extent_m
             budget.registered(fit, found, len(of), noisy)
             ended = last or fit.iterations >= limits.n_max or budget.left < budget.healthy
-            if ended or found.status is not AlignStatus.NOT_CONVERGED or not self._worth_more(guess, found):
+            if (
+                ended
+                or found.status is not AlignStatus.NOT_CONVERGED
+                or not self._worth_more(guess, found)
+            ):
                 break
             T_ca = fit.T_ca
         if found.status is AlignStatus.FAILED:
-            found = replace(found, T_ac=guess, message=f"back end '{self._params.backend}' {found.message}")
+            found = replace(
+                found, T_ac=guess, message=f"back end '{self._params.backend}' {found.message}"
+            )
         return found
 
     def _worth_more(self, guess: Pose, found: Alignment) -> bool:

@@ -1,9 +1,11 @@
-"""Surface indices, and what a search needs of a model, kept on disk, so that a large model is prepared once.
+"""Surface indices, and what a search needs of a model, kept on disk, so that a large model is
+prepared once.
 
-A file is ``<key>.avsindex``: 8 bytes of magic, a checksum of the payload (8 bytes), zeros up to 64, the payload. The
-key is the SHA-256 of the layout version, the byte order, the reach and the vertices and faces of the surface, so a
-changed model, reach or version uses another file. A truncated, altered or foreign file is ignored. A folder that cannot
-be written to is no error: the index is then built in every run, with the same result.
+A file is ``<key>.avsindex``: 8 bytes of magic, a checksum of the payload (8 bytes), zeros up to 64,
+the payload. The key is the SHA-256 of the layout version, the byte order, the reach and the
+vertices and faces of the surface, so a changed model, reach or version uses another file. A
+truncated, altered or foreign file is ignored. A folder that cannot be written to is no error: the
+index is then built in every run, with the same result.
 """
 
 from __future__ import annotations
@@ -29,7 +31,10 @@ LEAST_PRIMITIVES = 20_000  # a smaller model is indexed faster than its file is 
 
 
 def user_folder() -> Path | None:
-    """Return the cache folder of avsreplay for this user by the rules of the platform; None where there is no home."""
+    """Return the cache folder of avsreplay for this user by the rules of the platform.
+
+    None where there is no home.
+    """
     given = {"win32": "LOCALAPPDATA", "darwin": ""}.get(sys.platform, "XDG_CACHE_HOME")
     base = Path(os.environ.get(given, "")) if given else Path()
     if base.is_absolute():  # a relative path is invalid by the XDG specification
@@ -37,7 +42,9 @@ def user_folder() -> Path | None:
     if sys.platform == "win32":
         return None
     try:
-        return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "avsreplay"
+        return (
+            Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "avsreplay"
+        )
     except RuntimeError:  # no home folder
         return None
 
@@ -48,7 +55,9 @@ def folder_for(surface: Surface) -> Path | None:
     return user_folder() if large else None
 
 
-def cache_path(folder: Path, layout: int | str, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
+def cache_path(
+    folder: Path, layout: int | str, vertices: Array, faces: NDArray[np.int32], reach_m: float
+) -> Path:
     """Return the file name of the index of a surface.
 
     Args:
@@ -58,7 +67,9 @@ def cache_path(folder: Path, layout: int | str, vertices: Array, faces: NDArray[
         faces: (m, 3) vertex indices.
         reach_m: largest distance of a query [m].
     """
-    key = hashlib.sha256(f"{layout} {sys.byteorder} {float(reach_m).hex()} {vertices.shape} {faces.shape}".encode())
+    key = hashlib.sha256(
+        f"{layout} {sys.byteorder} {float(reach_m).hex()} {vertices.shape} {faces.shape}".encode()
+    )
     key.update(np.ascontiguousarray(vertices).data)
     key.update(np.ascontiguousarray(faces).data)
     return folder / f"{key.hexdigest()}.avsindex"
@@ -86,7 +97,10 @@ def read(path: Path, checksum: Checksum) -> NDArray[np.uint8] | None:
 
 
 def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
-    """Return the arrays that ``write_arrays`` wrote by their names; none without a complete, unchanged file."""
+    """Return the arrays that ``write_arrays`` wrote by their names.
+
+    None without a complete, unchanged file.
+    """
     payload = None if path is None else read(path, checksum)
     if payload is None:
         return {}

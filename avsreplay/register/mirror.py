@@ -1,18 +1,21 @@
-"""Whether the mirror image of a model explains the accepted scans of a run better than the model itself.
+"""Whether the mirror image of a model explains the accepted scans of a run better than the model
+itself.
 
-A mirrored model of a nearly mirror-symmetric object is accepted on many scans, because only its marks are on the wrong
-side. The mirror image needs no index of its own: a scan that is reflected in the frame of the sensor is one of the
-reflected object.
+A mirrored model of a nearly mirror-symmetric object is accepted on many scans, because only its
+marks are on the wrong side. The mirror image needs no index of its own: a scan that is reflected in
+the frame of the sensor is one of the reflected object.
 
-Reflections: the motions with a mirroring that carry most of the surface onto itself. Planes through its centroid are
-compared by the distances of reflected points, and the best of them are registered. With the pose T_cs of the sensor in
-{C}, the reflection S in the frame of the sensor and one of these motions R, the reflected scan is near R T_cs S.
+Reflections: the motions with a mirroring that carry most of the surface onto itself. Planes through
+its centroid are compared by the distances of reflected points, and the best of them are registered.
+With the pose T_cs of the sensor in {C}, the reflection S in the frame of the sensor and one of
+these motions R, the reflected scan is near R T_cs S.
 
-Decision: the poses of a scan and of its reflection are refined in the same way, and each point has the difference of
-its truncated squared distances, in units of three standard deviations of the noise. The mean over a patch of the model
-and over all scans counts as one observation, because errors of the model are alike within a patch and in every scan.
-The log likelihood ratio of a normal error is 4.5 times this mean. It is limited to log((1 - e) / e), where e is the
-share of the patches that contradict the true shape. The mirror image is better if the sum decides for it, and what is
+Decision: the poses of a scan and of its reflection are refined in the same way, and each point has
+the difference of its truncated squared distances, in units of three standard deviations of the
+noise. The mean over a patch of the model and over all scans counts as one observation, because
+errors of the model are alike within a patch and in every scan. The log likelihood ratio of a normal
+error is 4.5 times this mean. It is limited to log((1 - e) / e), where e is the share of the patches
+that contradict the true shape. The mirror image is better if the sum decides for it, and what is
 against it is a small part of what is for it.
 """
 
@@ -34,27 +37,69 @@ from avsreplay.register.sampling import directions, sample_evenly
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
-MOST_SCANS, APART = 6, np.cos(np.radians(30.0))  # scans that are compared, from directions so far apart
+MOST_SCANS, APART = (
+    6,
+    np.cos(np.radians(30.0)),
+)  # scans that are compared, from directions so far apart
 REFINED_POINTS = 600  # of a scan, with which the poses are chosen and refined
-PLANES, PLANE_POINTS, SURFACE_POINTS = 200, 100, 400  # planes, and points of the surface that are reflected
-NEAR_PLANES, PLANES_APART = 16, np.cos(np.radians(12.0))  # planes that are registered, with normals so far apart
-REFLECTIONS, SAME_TRACE = 6, 1.0 + 2.0 * np.cos(np.radians(5.0))  # most reflections, and rotation between them
-WIDTH_OF_EXTENT, ROUGHLY, UNCARRIED = 0.03, 0.5, 0.3  # truncation of distances; largest mean after each stage
-TO_MODEL = ((0.12, 5), (0.05, 5), (0.02, 5))  # rejection distances [extent] and passes of a reflected surface
+PLANES, PLANE_POINTS, SURFACE_POINTS = (
+    200,
+    100,
+    400,
+)  # planes, and points of the surface that are reflected
+NEAR_PLANES, PLANES_APART = (
+    16,
+    np.cos(np.radians(12.0)),
+)  # planes that are registered, with normals so far apart
+REFLECTIONS, SAME_TRACE = (
+    6,
+    1.0 + 2.0 * np.cos(np.radians(5.0)),
+)  # most reflections, and rotation between them
+WIDTH_OF_EXTENT, ROUGHLY, UNCARRIED = (
+    0.03,
+    0.5,
+    0.3,
+)  # truncation of distances; largest mean after each stage
+TO_MODEL = (
+    (0.12, 5),
+    (0.05, 5),
+    (0.02, 5),
+)  # rejection distances [extent] and passes of a reflected surface
 TO_SCAN = ((0.03, 4), (0.015, 4), (0.008, 6))  # and of a scan
-TRIED, TRIED_OF_EXTENT = 2, 0.02  # reflections of which a scan is refined, and truncation to choose them
-NOISE, LEAST_OF_EXTENT, MOST_OF_EXTENT = 3.0, 0.003, 0.05  # truncation: noise, least; largest distance measured
-PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = 0.05, 0.381966, 4  # side of a patch, its offset, and fewest points
+TRIED, TRIED_OF_EXTENT = (
+    2,
+    0.02,
+)  # reflections of which a scan is refined, and truncation to choose them
+NOISE, LEAST_OF_EXTENT, MOST_OF_EXTENT = (
+    3.0,
+    0.003,
+    0.05,
+)  # truncation: noise, least; largest distance measured
+PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = (
+    0.05,
+    0.381966,
+    4,
+)  # side of a patch, its offset, and fewest points
 CONTRADICTING = 0.1  # share of the patches that contradict the true shape
-LEAST_LIKELIHOOD, MOST_AGAINST = 6.0, 0.25  # log likelihood ratio that decides; patches against over those for it
+LEAST_LIKELIHOOD, MOST_AGAINST = (
+    6.0,
+    0.25,
+)  # log likelihood ratio that decides; patches against over those for it
 ENOUGH = 3  # scans that decide for the model, after which no more are compared
-MOST_OFF = 0.1  # share of the points off the model, above which the mirror image of one scan is searched
-TESTED_POINTS, LEAST_FACING = 200, 0.4  # points of which so many must be on faces towards the sensor
+MOST_OFF = (
+    0.1  # share of the points off the model, above which the mirror image of one scan is searched
+)
+TESTED_POINTS, LEAST_FACING = (
+    200,
+    0.4,
+)  # points of which so many must be on faces towards the sensor
 
 
 @value_class
 class SeenScan:
-    """Points (n, 3) of a registered scan in the frame of the sensor [m], and the pose of the sensor in {C}."""
+    """Points (n, 3) of a registered scan in the frame of the sensor [m], and the pose of the sensor
+    in {C}.
+    """
 
     points: NDArray[np.float32]
     T_cs: Pose
@@ -76,7 +121,9 @@ class _Compared:
 
 
 def from_another_side(T_cs: Pose, kept: Sequence[SeenScan], middle: Array) -> bool:
-    """Return whether a sensor sees another side of the target, with its middle (3,) in {C} [m], than those kept."""
+    """Return whether a sensor sees another side of the target, with its middle (3,) in {C} [m],
+    than those kept.
+    """
     sight = _sight(T_cs, middle)
     return all(float(sight @ _sight(each.T_cs, middle)) < APART for each in kept)
 
@@ -106,7 +153,11 @@ def mirror_image_fits(registrar: Registrar, surface: Surface, scans: Sequence[Se
     """
     if not scans:
         return False
-    motions, extent, compared = reflections(surface, registrar.index), registrar.index.extent_m, list[_Compared]()
+    motions, extent, compared = (
+        reflections(surface, registrar.index),
+        registrar.index.extent_m,
+        list[_Compared](),
+    )
     for scan in scans:
         compared.append(_compared(registrar, scan, [R @ scan.T_cs.matrix @ S for R in motions]))
         if sum(_decide([each], extent, -1.0) for each in compared) == ENOUGH:
@@ -120,12 +171,16 @@ def mirror_image_fits(registrar: Registrar, surface: Surface, scans: Sequence[Se
         compared += [_compared(registrar, scan, []) for scan in scans[len(compared) :]]
         sure += [False] * (len(compared) - len(sure))
         of = zip(scans, compared, sure, strict=True)
-        compared = [each if decided else _searched(registrar, scan, each) for scan, each, decided in of]
+        compared = [
+            each if decided else _searched(registrar, scan, each) for scan, each, decided in of
+        ]
     return _decide(compared, extent)
 
 
 def _searched(registrar: Registrar, scan: SeenScan, before: _Compared) -> _Compared:
-    """The comparison with the mirror image where a search finds it, if that is better for it than ``before``."""
+    """The comparison with the mirror image where a search finds it, if that is better for it than
+    ``before``.
+    """
     found = registrar.acquire(reflected(scan.points))
     if not found.measured:
         return before
@@ -160,11 +215,16 @@ def reflections(surface: Surface, index: SurfaceIndex) -> Array:
     cost = _uncarried(index, few, planes, 2.0 * WIDTH_OF_EXTENT)
     chosen = list[int]()
     for k in np.argsort(cost, kind="stable").tolist():
-        if len(chosen) < NEAR_PLANES and all(abs(normals[k] @ normals[j]) < PLANES_APART for j in chosen):
+        if len(chosen) < NEAR_PLANES and all(
+            abs(normals[k] @ normals[j]) < PLANES_APART for j in chosen
+        ):
             chosen.append(k)
     moved = planes[chosen]
     for part, stages, most in ((few, TO_MODEL[:1], ROUGHLY), (points, TO_MODEL[1:], UNCARRIED)):
-        ended = [_refined(index, _moved(part, T), Pose.identity(), stages, False).matrix @ T for T in moved]
+        ended = [
+            _refined(index, _moved(part, T), Pose.identity(), stages, False).matrix @ T
+            for T in moved
+        ]
         moved = np.reshape(ended, (-1, 4, 4))
         cost = _uncarried(index, points, moved, WIDTH_OF_EXTENT)
         order = np.argsort(cost, kind="stable")
@@ -175,7 +235,9 @@ def reflections(surface: Surface, index: SurfaceIndex) -> Array:
 def _different(motions: Array) -> Array:
     """The motions (k, 4, 4) that differ from all before them by a rotation."""
     kept = [
-        k for k, T in enumerate(motions) if (np.einsum("kij,ij->k", motions[:k, :3, :3], T[:3, :3]) < SAME_TRACE).all()
+        k
+        for k, T in enumerate(motions)
+        if (np.einsum("kij,ij->k", motions[:k, :3, :3], T[:3, :3]) < SAME_TRACE).all()
     ]
     return np.asarray(motions[kept])
 
@@ -185,14 +247,19 @@ def _moved(points: Array, T: Array) -> Array:
 
 
 def _uncarried(index: SurfaceIndex, points: Array, motions: Array, width: float) -> Array:
-    """Mean of min(1, squared distance) of points (n, 3) after each motion (k, 4, 4); ``width`` is over the extent."""
+    """Mean of min(1, squared distance) of points (n, 3) after each motion (k, 4, 4).
+
+    ``width`` is over the extent.
+    """
     width_m = min(width * index.extent_m, index.reach_m)
     moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
     distance = index.distances(moved.reshape(-1, 3), Pose.identity(), width_m, False, 1, 0.0)[0]
     return np.asarray(np.mean((distance.reshape(len(motions), len(points)) / width_m) ** 2, axis=1))
 
 
-def _refined(index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple[float, int]], sided: bool) -> Pose:
+def _refined(
+    index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple[float, int]], sided: bool
+) -> Pose:
     """A pose T_cs after passes with falling rejection distances."""
     small = IcpParams(tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * index.extent_m)
     for gate, n in stages:
@@ -203,13 +270,17 @@ def _refined(index: SurfaceIndex, points: Array, T: Pose, stages: Sequence[tuple
 
 
 def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> _Compared:
-    """Compare the poses of a scan and of its reflection, from poses (k, 4, 4) of the sensor in {C} for the latter."""
+    """Compare the poses of a scan and of its reflection, from poses (k, 4, 4) of the sensor in {C}
+    for the latter.
+    """
     index, sided = registrar.index, registrar.sided
     points = scan.points.astype(np.float64)
     image = reflected(points)
 
     def distance(part: Array, T: Pose, most: float) -> Array:
-        return index.distances(part, T, most * index.extent_m, sided, TESTED_POINTS, LEAST_FACING)[0]
+        return index.distances(part, T, most * index.extent_m, sided, TESTED_POINTS, LEAST_FACING)[
+            0
+        ]
 
     def of_image(T: Pose) -> float:
         return float(np.mean(distance(some_of_image, T, TRIED_OF_EXTENT) ** 2))
@@ -217,10 +288,19 @@ def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> 
     some, some_of_image = _some(points, REFINED_POINTS), _some(image, REFINED_POINTS)
     best = sorted(map(Pose.from_matrix, starts), key=of_image)[:TRIED]
     ended = [_refined(index, some_of_image, T, TO_SCAN, sided) for T in best]
-    own, mirrored = _refined(index, some, scan.T_cs, TO_SCAN, sided), min(ended, key=of_image, default=None)
+    own, mirrored = (
+        _refined(index, some, scan.T_cs, TO_SCAN, sided),
+        min(ended, key=of_image, default=None),
+    )
     by_model = distance(points, own, MOST_OF_EXTENT)
-    by_image = np.full_like(by_model, np.inf) if mirrored is None else distance(image, mirrored, MOST_OF_EXTENT)
-    width = max(NOISE * min(map(robust_noise, (by_model, by_image))), LEAST_OF_EXTENT * index.extent_m)
+    by_image = (
+        np.full_like(by_model, np.inf)
+        if mirrored is None
+        else distance(image, mirrored, MOST_OF_EXTENT)
+    )
+    width = max(
+        NOISE * min(map(robust_noise, (by_model, by_image))), LEAST_OF_EXTENT * index.extent_m
+    )
     by_model, by_image = (np.minimum(each / width, 1.0) ** 2 for each in (by_model, by_image))
     return _Compared(own.apply(points), by_model - by_image, float(np.mean(by_model == 1.0)))
 
@@ -231,10 +311,14 @@ def _some(points: Array, count: int) -> Array:
 
 def _by_patch(compared: Sequence[_Compared], extent_m: float) -> Array:
     """Mean over each patch, of all scans, of what its points have in favour of the mirror image."""
-    points, gain = (np.concatenate([getattr(each, name) for each in compared]) for name in ("points", "gain"))
+    points, gain = (
+        np.concatenate([getattr(each, name) for each in compared]) for name in ("points", "gain")
+    )
     cell = np.floor(points / (PATCH_OF_EXTENT * extent_m) + OFF_PLANES).astype(np.int64)
     cell -= cell.min(axis=0)
     span = cell.max(axis=0) + 1
-    of = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[1]
+    of = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[
+        1
+    ]
     counts = np.bincount(of)
     return np.asarray((np.bincount(of, gain) / counts)[counts >= PATCH_POINTS])

@@ -1,10 +1,12 @@
-"""Other local minima near a registered pose, along the directions of motion that the scan determines least.
+"""Other local minima near a registered pose, along the directions of motion that the scan
+determines least.
 
-Three cases lead to a wrong minimum near the true pose. Points of another object next to the surface can hold a pose
-away from the minimum that the surface alone has; the cost is then lower along the floor of the valley. A scan that
-shows a small part of the target has several minima, and nearly all points can be near the model at a wrong one; the
-scan is then registered again from poses displaced along these directions. A scan of a panel can be matched to its other
-side; it is registered again from a pose that is displaced towards the camera.
+Three cases lead to a wrong minimum near the true pose. Points of another object next to the surface
+can hold a pose away from the minimum that the surface alone has; the cost is then lower along the
+floor of the valley. A scan that shows a small part of the target has several minima, and nearly all
+points can be near the model at a wrong one; the scan is then registered again from poses displaced
+along these directions. A scan of a panel can be matched to its other side; it is registered again
+from a pose that is displaced towards the camera.
 """
 
 from __future__ import annotations
@@ -26,35 +28,56 @@ from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
 
-VALLEY_STEPS, VALLEY_POINTS = 8, 250  # steps of half a gate each way along the two least certain directions; points
+VALLEY_STEPS, VALLEY_POINTS = (
+    8,
+    250,
+)  # steps of half a gate each way along the two least certain directions; points
 VALLEY_WORK = 16_000  # cost of the search along the valley
-POINTS, DIRECTIONS = 300, 3  # points that are registered from displaced poses; directions, each both ways
+POINTS, DIRECTIONS = (
+    300,
+    3,
+)  # points that are registered from displaced poses; directions, each both ways
 DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
-UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, is not compared; usual rms radius
+UNMOVED, RADIUS_OF_EXTENT = (
+    0.25,
+    0.25,
+)  # a pose nearer to its guess, in gates, is not compared; usual rms radius
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
-PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
-POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
+PART_ONLY = (
+    "the scan shows too little of the visible surface: without a guess it fits the model in many"
+    " places"
+)
+POSTPONED = (
+    "the search for a pose is postponed, because the searches of the scans before found none"
+)
 NOT_FOUND = "no pose of the model explains the scan, and no work is left for a longer search"
 NOT_COMPARED = "no work is left to compare the poses near this one"
-UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
-NOISY_OF_GATE = 0.2  # with a smaller rms distance, in gates, the noise is not the cause of an uncertain attitude
-SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
+UNCERTAIN_RAD = np.radians(
+    1.0
+)  # a larger standard deviation of the attitude, caused by noise, is stated
+# with a smaller rms distance, in gates, the noise is not the cause of an uncertain attitude
+NOISY_OF_GATE = 0.2
+# a minimum whose excess cost is below so many standard errors of it explains the scan as well
+SIGMAS = 4.0
 
 
 class Neighbourhood:
     """Local minima near registered poses of one target."""
 
-    def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter, grader: Grader) -> None:
+    def __init__(
+        self, target: Target, test: PlausibilityTest, restarter: Restarter, grader: Grader
+    ) -> None:
         self._target, self._test, self._restarter, self._grader = target, test, restarter, grader
         self._extent = target.surface.extent
 
     def best(
         self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
     ) -> tuple[Restart | None, AlignStatus, str]:
-        """Return a better minimum around a pose; the status of the better of both, and why it is not accepted.
+        """Return a better minimum around a pose; the status of the better of both, and why it is
+        not accepted.
 
-        Nothing is compared at the predicted pose, and where the scan shows all of the target on faces that face the
-        camera.
+        Nothing is compared at the predicted pose, and where the scan shows all of the target on
+        faces that face the camera.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -69,7 +92,9 @@ class Neighbourhood:
         if not (aligned or found.status is AlignStatus.DEGENERATE) or not self._moved(T_ca, guess):
             return None, found.status, ""
         points = self._restarter.part(scan)
-        if not (self._test.turned_away(points, T_ca) or (aligned and self._test.partial(points, T_ca))):
+        if not (
+            self._test.turned_away(points, T_ca) or (aligned and self._test.partial(points, T_ca))
+        ):
             return None, found.status, ""
         if not budget.allows(self._minima_work):
             return None, AlignStatus.BUDGET_EXHAUSTED, NOT_COMPARED
@@ -83,7 +108,8 @@ class Neighbourhood:
         return None if best is minima[0] else best, AlignStatus.AMBIGUOUS, doubt
 
     def of_both_sides(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Restart:
-        """Return the best minimum around the result of a search, where a panel can be matched to its other side.
+        """Return the best minimum around the result of a search, where a panel can be matched to
+        its other side.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.
@@ -91,19 +117,28 @@ class Neighbourhood:
             budget: work that is left.
 
         Returns:
-            The result itself where only faces towards the camera are matched, where its distances are too large for any
-            pose to be accepted, or where no work is left.
+            The result itself where only faces towards the camera are matched, where its distances
+            are too large for any pose to be accepted, or where no work is left.
         """
         at, target = self._restarter.measure(points, T_ca, budget), self._target
         known = target.visibility.camera_c(target.index, points, T_ca) is not None
-        if known or at.noise_m > NOISE_OF_EXTENT * self._extent or self._minima_work + LAST_WORK > budget.left:
+        if (
+            known
+            or at.noise_m > NOISE_OF_EXTENT * self._extent
+            or self._minima_work + LAST_WORK > budget.left
+        ):
             return at
         return self._restarter.least(self._minima(points, T_ca, DIRECTIONS, budget, LAST_WORK)[0])
 
     @property
     def _minima_work(self) -> int:
         """The usual cost of the minima around a pose."""
-        return int((1 + 2 * DIRECTIONS) * FAR_WORK * self._restarter.work(self._restarter.narrow_m) * POINTS)
+        return int(
+            (1 + 2 * DIRECTIONS)
+            * FAR_WORK
+            * self._restarter.work(self._restarter.narrow_m)
+            * POINTS
+        )
 
     def _moved(self, T_ca: Pose, guess: Pose) -> bool:
         """Whether a pose differs from the predicted T_ac ``guess``."""
@@ -114,18 +149,27 @@ class Neighbourhood:
     def _minima(
         self, points: NDArray[Any], T_ca: Pose, count: int, budget: Budget, kept: int = 0
     ) -> tuple[list[Restart], bool]:
-        """The pose, and those registered from poses displaced towards the camera and along ``count`` directions.
+        """The pose, and those registered from poses displaced towards the camera and along
+        ``count`` directions.
 
-        Also: whether all were registered; else the work was not enough besides ``kept`` for a later step.
+        Also: whether all were registered; else the work was not enough besides ``kept`` for a later
+            step.
         """
         few = points[:: max(1, len(points) // POINTS)]
-        found, weak = [self._restarter.measure(points, T_ca, budget)], self._weak(few, T_ca, count, budget)
+        found, weak = (
+            [self._restarter.measure(points, T_ca, budget)],
+            self._weak(few, T_ca, count, budget),
+        )
         if weak is None:
             return found, True
         centre, radius, directions = weak[:3]
         dearest = 0  # work of one registration so far
-        nearer = np.concatenate([np.zeros(3), T_ca.t - centre])[None] / np.linalg.norm(T_ca.t - centre)
-        for x in DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions]):
+        nearer = np.concatenate([np.zeros(3), T_ca.t - centre])[None] / np.linalg.norm(
+            T_ca.t - centre
+        )
+        for x in (
+            DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions])
+        ):
             start, left = _displaced(T_ca, centre, radius, x), budget.left
             if dearest + kept > left:
                 return found, False
@@ -135,22 +179,33 @@ class Neighbourhood:
         return found, True
 
     def with_size(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
-        """Return an alignment with what its scan (n, 3) in {A} says about the size, if that is still to be fitted.
+        """Return an alignment with what its scan (n, 3) in {A} says about the size, if that is
+        still to be fitted.
 
-        The covariance is enlarged by the change of the pose that an error of the size of two standard errors causes.
+        The covariance is enlarged by the change of the pose that an error of the size of two
+        standard errors causes.
         """
         P, part = found.covariance, found.systematic
         if found.size_1s is None or P is None or part is None:
             return found
         budget.spend(SIZE_WORK)
         T_ca, target = found.T_ac.inverse(), self._target
-        size = size_error(target.index, scan, T_ca, target.visibility.camera_c(target.index, scan, T_ca))
+        size = size_error(
+            target.index, scan, T_ca, target.visibility.camera_c(target.index, scan, T_ca)
+        )
         if size is not None and size.likely:
             P, part = (geometry.frozen(C + np.outer(size.shift, size.shift)) for C in (P, part))
-        return replace(found, covariance=P, systematic=part, message=size_remark(size, found.size_1s), size_1s=None)
+        return replace(
+            found,
+            covariance=P,
+            systematic=part,
+            message=size_remark(size, found.size_1s),
+            size_1s=None,
+        )
 
     def of_one(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
-        """Return the alignment of a scan (n, 3) in {A}, not accepted if the view shows faces of many bodies.
+        """Return the alignment of a scan (n, 3) in {A}, not accepted if the view shows faces of
+        many bodies.
 
         They do not determine the pose, or no error of the size.
         """
@@ -160,7 +215,8 @@ class Neighbourhood:
         return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
 
     def finished(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
-        """Return the alignment with its size; an attitude that noise leaves uncertain is stated if nothing else is.
+        """Return the alignment with its size; an attitude that noise leaves uncertain is stated if
+        nothing else is.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -175,11 +231,16 @@ class Neighbourhood:
         if sigma <= UNCERTAIN_RAD:
             return found
         return replace(
-            found, message=f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma) only"
+            found,
+            message=(
+                f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma)"
+                " only"
+            ),
         )
 
     def along_valley(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> Pose | None:
-        """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
+        """Return the best pose along the two directions in which the scan determines it least, or
+        the pose itself.
 
         Args:
             points: (n, 3) in {A} [m].
@@ -198,19 +259,32 @@ class Neighbourhood:
             return T_ca
         centre, radius, floor, at, camera_c = weak
         width = self._restarter.width(at)
-        steps = 0.5 * target.limits.gate_m * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+        steps = (
+            0.5
+            * target.limits.gate_m
+            * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+        )
         tried = np.concatenate([np.zeros((1, 6)), np.multiply.outer(steps, floor).reshape(-1, 6)])
         turns = geometry.exp(tried[:, :3] / radius)
         moved = np.einsum("kij,nj->kni", geometry.matrix(turns), T_ca.apply(few) - centre)
         moved += (centre + tried[:, 3:])[:, None]
-        d2 = target.index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
+        d2 = target.index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(
+            len(tried), -1
+        )
         best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
         return _displaced(T_ca, centre, radius, tried[best]) if best else T_ca
 
     def regraded(
-        self, scan: NDArray[Any], few: NDArray[Any], kept: Restart | Pose, budget: Budget, halves: bool, carried: bool
+        self,
+        scan: NDArray[Any],
+        few: NDArray[Any],
+        kept: Restart | Pose,
+        budget: Budget,
+        halves: bool,
+        carried: bool,
     ) -> Alignment:
-        """Return an alignment with a rejection distance that follows the noise; among other objects along the valley.
+        """Return an alignment with a rejection distance that follows the noise; among other objects
+        along the valley.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -227,14 +301,19 @@ class Neighbourhood:
             return found
         moved = self.along_valley(few, found.T_ac.inverse(), budget)
         if moved is None:
-            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
+            return replace(
+                found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED
+            )
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
         again = self._grader.graded(scan, moved.inverse(), budget, width, halves, carried)
         return self._restarter.nearest(few, [found, again], width, budget)
 
-    def replaced(self, scan: NDArray[Any], found: Alignment, T_ca: Pose, budget: Budget, carried: bool) -> Alignment:
-        """Return the alignment at a pose for which the rays decide against an accepted one; IMPLAUSIBLE as tested.
+    def replaced(
+        self, scan: NDArray[Any], found: Alignment, T_ca: Pose, budget: Budget, carried: bool
+    ) -> Alignment:
+        """Return the alignment at a pose for which the rays decide against an accepted one;
+        IMPLAUSIBLE as tested.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -244,17 +323,27 @@ class Neighbourhood:
             carried: as of ``Grader.graded``.
         """
         if not budget.allows(LAST_WORK):
-            return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED)
+            return replace(
+                found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_COMPARED
+            )
         few = self._restarter.part(scan)
         found = self.regraded(scan, few, T_ca, budget, True, carried)
         reason = self._restarter.reason(few, found, budget, None)
-        return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason) if reason else found
+        return (
+            replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
+            if reason
+            else found
+        )
 
-    def at_pose(self, scan: NDArray[Any], T_ca: Pose, budget: Budget, halves: bool, carried: bool) -> Alignment:
-        """Return an alignment of a scan (n, 3) in {A} at a pose that is known to be the best of several minima.
+    def at_pose(
+        self, scan: NDArray[Any], T_ca: Pose, budget: Budget, halves: bool, carried: bool
+    ) -> Alignment:
+        """Return an alignment of a scan (n, 3) in {A} at a pose that is known to be the best of
+        several minima.
 
-        A wide rejection distance can lead to another minimum, and with a narrow one the few points of a mark may not
-        determine the pose. Of both the nearer one is returned, and the wide one if they end at the same pose.
+        A wide rejection distance can lead to another minimum, and with a narrow one the few points
+        of a mark may not determine the pose. Of both the nearer one is returned, and the wide one
+        if they end at the same pose.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -275,10 +364,11 @@ class Neighbourhood:
     def _weak(
         self, few: NDArray[Any], T_ca: Pose, count: int, budget: Budget
     ) -> tuple[Array, float, Array, Restart, Array | None] | None:
-        """Centroid and rms radius of the inliers, and the motions x (count, 6) that they determine least.
+        """Centroid and rms radius of the inliers, and the motions x (count, 6) that they determine
+        least.
 
-        Also the distances at the pose, and the position of the camera in {C} if only faces towards it are matched. None
-        with fewer than six inliers, which do not determine a pose.
+        Also the distances at the pose, and the position of the camera in {C} if only faces towards
+        it are matched. None with fewer than six inliers, which do not determine a pose.
         """
         target, gate = self._target, self._target.limits.gate_m
         at = self._restarter.measure(few, T_ca, budget)
@@ -293,12 +383,17 @@ class Neighbourhood:
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:
-    """The pose moved by x = [L theta; u] (6,) about a centre (3,) in {C} [m], with the rms radius L."""
+    """The pose moved by x = [L theta.
+
+    U] (6,) about a centre (3,) in {C} [m], with the rms radius L.
+    """
     turn = geometry.exp(x[:3] / radius_m)
     return Pose(turn, centre + x[3:] - geometry.matrix(turn) @ centre) @ T_ca
 
 
 def _as_good(best: Restart, other: Restart, width_m: float) -> bool:
-    """Whether the excess cost of the other pose, point by point, is below ``SIGMAS`` standard errors of its mean."""
+    """Whether the excess cost of the other pose, point by point, is below ``SIGMAS`` standard
+    errors of its mean.
+    """
     excess = other.costs(width_m) - best.costs(width_m)
     return bool(excess.mean() < SIGMAS * excess.std() / np.sqrt(len(excess)))

@@ -11,7 +11,8 @@ from avsreplay.settings import Settings, given, setting
 class Camera(Enum):
     """Where the scans were taken from."""
 
-    AUTO = "auto"  # origin of {A}, if the mesh has a closed part and the origin is well outside the model
+    # origin of {A}, if the mesh has a closed part and the origin is well outside the model
+    AUTO = "auto"
     ORIGIN = "origin"  # origin of {A}
     NONE = "none"  # unknown: both sides of a face are matched
 
@@ -42,28 +43,29 @@ class AcquireParams(Settings):
 
     starts: int = setting(
         600,
-        "Number of initial attitudes of the search; its second round tries seven times as many. With more of them,"
-        " poses of difficult shapes are found more often, in more time.",
+        "Number of initial attitudes of the search; its second round tries seven times as many."
+        " With more of them, poses of difficult shapes are found more often, in more time.",
         low=1,
     )
     least_ratio: float = setting(
         0.7,
-        "Smallest inlier ratio of a pose that the search returns. A larger value rejects more wrong poses, and more"
-        " poses of partly hidden targets.",
+        "Smallest inlier ratio of a pose that the search returns. A larger value rejects more wrong"
+        " poses, and more poses of partly hidden targets.",
         low=0.0,
         high=1.0,
     )
     least_separate: float = setting(
         0.4,
-        "Smallest inlier ratio of a pose that the search returns if the other points are far from the model, as those"
-        " of another object are.",
+        "Smallest inlier ratio of a pose that the search returns if the other points are far from"
+        " the model, as those of another object are.",
         low=0.0,
         high=1.0,
     )
     margin: float = setting(
         0.01,
-        "The result is ambiguous if the share of the points that a second pose leaves unexplained exceeds that of the"
-        " best pose by less than this. A larger value rejects more poses of nearly symmetric targets.",
+        "The result is ambiguous if the share of the points that a second pose leaves unexplained"
+        " exceeds that of the best pose by less than this. A larger value rejects more poses of"
+        " nearly symmetric targets.",
         low=0.0,
         high=1.0,
     )
@@ -73,82 +75,95 @@ class AcquireParams(Settings):
 class RegisterParams(Settings):
     """Parameters of registration."""
 
-    backend: str = setting("horn", "Registration back end, by its entry-point name ('avsreplay backends' lists them).")
+    backend: str = setting(
+        "horn", "Registration back end, by its entry-point name ('avsreplay backends' lists them)."
+    )
     reach_m: float | None = setting(
         None,
-        "Rejection distance of a correspondence in the first iteration. A larger value corrects larger errors"
-        " of the initial guess, but uses more points that are not on the target.",
+        "Rejection distance of a correspondence in the first iteration. A larger value corrects"
+        " larger errors of the initial guess, but uses more points that are not on the target.",
         unit="m",
         above=0.0,
         of_extent=0.15,
     )
     gate_m: float | None = setting(
         None,
-        "Largest rejection distance in the last iteration; a point closer to the model than this is an inlier. A"
-        " larger value accepts a less accurate model, but uses more points that are not on the target.",
+        "Largest rejection distance in the last iteration; a point closer to the model than this is"
+        " an inlier. A larger value accepts a less accurate model, but uses more points that are"
+        " not on the target.",
         unit="m",
         above=0.0,
         of_extent=0.01,
     )
     n_max: int = setting(
         200,
-        "Iterations after which a registration counts as not converged. A larger value helps views with a weakly"
-        " determined direction and takes more time.",
+        "Iterations after which a registration counts as not converged. A larger value helps views"
+        " with a weakly determined direction and takes more time.",
         low=1,
     )
     eps_rad: float = setting(
         1e-5,
-        "The iteration ends when a step rotates the pose by less than this. A larger value ends it earlier, at"
-        " a less exact pose.",
+        "The iteration ends when a step rotates the pose by less than this. A larger value ends it"
+        " earlier, at a less exact pose.",
         unit="rad",
         above=0.0,
     )
     eps_m: float | None = setting(
         None,
-        "The iteration ends when a step moves the pose by less than this. A larger value ends it earlier, at a"
-        " less exact pose.",
+        "The iteration ends when a step moves the pose by less than this. A larger value ends it"
+        " earlier, at a less exact pose.",
         unit="m",
         above=0.0,
         of_extent=1e-6,
     )
     noise_m: float | None = setting(
         None,
-        "1 sigma of a point's error normal to the surface. A larger value increases the covariance of the pose.",
+        "1 sigma of a point's error normal to the surface. A larger value increases the covariance"
+        " of the pose.",
         unit="m",
         above=0.0,
         unset="estimated from the residuals of each scan",
     )
     min_inliers: int = setting(
-        30, "Smallest number of inliers; a scan with fewer gets the status no_overlap and is not used.", low=1
+        30,
+        "Smallest number of inliers; a scan with fewer gets the status no_overlap and is not used.",
+        low=1,
     )
     min_inlier_ratio: float = setting(
         0.02,
-        "Smallest ratio of inliers to points; a scan with a smaller one gets the status no_overlap and is not used.",
+        "Smallest ratio of inliers to points; a scan with a smaller one gets the status no_overlap"
+        " and is not used.",
         low=0.0,
         high=1.0,
     )
     camera: Camera = setting(
         Camera.AUTO,
-        "Position of the camera, which decides the side of a face on which a point can be: the origin of the frame of"
-        " the clouds (origin), unknown (none), or the origin where model and scan agree with it (auto).",
+        "Position of the camera, which decides the side of a face on which a point can be: the"
+        " origin of the frame of the clouds (origin), unknown (none), or the origin where model and"
+        " scan agree with it (auto).",
     )
     subsample_m: float = setting(
         0.0,
-        "Edge length of the voxels in each of which one point is kept. A larger value takes less time and gives"
-        " a less accurate pose; 0 keeps all points.",
+        "Edge length of the voxels in each of which one point is kept. A larger value takes less"
+        " time and gives a less accurate pose; 0 keeps all points.",
         unit="m",
         low=0.0,
     )
     split_every: int = setting(
         5,
-        "The poses from two halves of the scan are compared on every n-th scan (column split_nis). A larger"
-        " value takes less time and tests fewer scans.",
+        "The poses from two halves of the scan are compared on every n-th scan (column split_nis)."
+        " A larger value takes less time and tests fewer scans.",
         low=1,
     )
     threads: int = setting(
-        1, "Largest number of threads of a back end; the result does not depend on it.", low=1, high=1024
+        1,
+        "Largest number of threads of a back end; the result does not depend on it.",
+        low=1,
+        high=1024,
     )
-    index_cache: bool = setting(True, "Keep the index of a large model in the user's cache folder between runs.")
+    index_cache: bool = setting(
+        True, "Keep the index of a large model in the user's cache folder between runs."
+    )
     acquire: AcquireParams = setting(AcquireParams, "The global search.")
 
     def check(self) -> None:
@@ -160,11 +175,17 @@ class RegisterParams(Settings):
         """Return the parameters of a back end for a model of a given size.
 
         Args:
-            extent_m: diagonal of the model's bounding box [m]; automatic lengths are proportional to it.
+            extent_m: diagonal of the model's bounding box [m]; automatic lengths are proportional
+                to it.
         """
         auto = replace(self, reach_m=None, gate_m=None).resolved(extent_m)
         reach = given(auto.reach_m) if self.reach_m is None else self.reach_m
         gate = given(auto.gate_m) if self.gate_m is None else self.gate_m
         return RegistrationLimits(
-            max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(auto.eps_m), self.threads
+            max(reach, gate),
+            min(gate, reach),
+            self.n_max,
+            self.eps_rad,
+            given(auto.eps_m),
+            self.threads,
         )

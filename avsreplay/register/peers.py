@@ -1,15 +1,18 @@
-"""Back ends for comparison with ``horn``: the ICP of the paper, and libraries that use sampled points of the model.
+"""Back ends for comparison with ``horn``: the ICP of the paper, and libraries that use sampled
+points of the model.
 
-``reference`` is the ICP of the paper (eq:ICP), corrected: every pass matches each point with its closest point on the
-model, then applies Horn's closed-form motion. ``KissOdometry`` tracks scans where there is no model.
+``reference`` is the ICP of the paper (eq:ICP), corrected: every pass matches each point with its
+closest point on the model, then applies Horn's closed-form motion. ``KissOdometry`` tracks scans
+where there is no model.
 
-Properties of small_gicp 1.0: clouds far apart are returned as converged with no inlier; one and two threads differ in
-the last digits; an unknown method name returns the identity.
+Properties of small_gicp 1.0: clouds far apart are returned as converged with no inlier; one and two
+threads differ in the last digits; an unknown method name returns the identity.
 
-Properties of kiss-icp 1.2 and 1.3: Correspondences reach over one voxel. ``kernel`` is used as a squared length. With
-more than one thread results are not repeatable to the bit. A guess whose rotation is not orthonormal by 2e-9 aborts the
-interpreter; so do points that all have one instant if it deskews. It returns only a pose, and the guess if nothing
-matched. Scans are deskewed to the end of the sweep.
+Properties of kiss-icp 1.2 and 1.3: Correspondences reach over one voxel. ``kernel`` is used as a
+squared length. With more than one thread results are not repeatable to the bit. A guess whose
+rotation is not orthonormal by 2e-9 aborts the interpreter; so do points that all have one instant
+if it deskews. It returns only a pose, and the guess if nothing matched. Scans are deskewed to the
+end of the sweep.
 """
 
 from __future__ import annotations
@@ -36,9 +39,11 @@ LEAST_POINTS = 20  # fewer points have no neighbourhood of NEIGHBOURS
 POINTS_PER_VOXEL = 20
 SETTLED_OF_GATE = 0.01
 FINE_CALLS = 6  # calls with the finest map, each with at most n_max iterations
-STEP_OF_EPS = 10.0  # 1e-4 as by default in the library, whose last steps change from one map point to the next
+# 1e-4 as by default in the library, whose last steps change from one map point to the next
+STEP_OF_EPS = 10.0
 FAR_M = 1e9  # no part of the map is deleted because of its distance
-THINNED = 1.5  # voxel of the points used in the coarse stages over the voxel of the map, the rule of the library
+# voxel of the points used in the coarse stages over the voxel of the map, the rule of the library
+THINNED = 1.5
 THRESHOLD_VOXELS = 2.0  # first threshold of the library over its voxel
 MIN_MOTION_VOXELS = 0.1
 VOXELS = 100.0  # the library's rule: range over voxel
@@ -48,16 +53,19 @@ RECENTRE_VOXELS = 50.0
 class ReferenceBackend:
     """Horn's quaternion ICP, point to surface, from the first pass to the fixed point.
 
-    Rejection: a point is used while its distance to the model is below the gate. The gate starts at ``reach_m``; after
-    each pass it is min(gate, max(gate_m, 3 rms)): wide while the guess is off, narrow at the end, never growing.
-    Stopping: a pass that rotates by less than ``eps_rad`` and moves the centroid of the inliers by less than ``eps_m``
-    after the gate has settled.
+    Rejection: a point is used while its distance to the model is below the gate. The gate starts at
+    ``reach_m``; after each pass it is min(gate, max(gate_m, 3 rms)): wide while the guess is off,
+    narrow at the end, never growing.
+    Stopping: a pass that rotates by less than ``eps_rad`` and moves the centroid of the inliers by
+    less than ``eps_m`` after the gate has settled.
     """
 
     name: ClassVar[str] = "reference"
     accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
     same_bytes: ClassVar[bool] = True  # on every x86-64 processor
-    about: ClassVar[str] = "Horn's quaternion ICP against the mesh itself, in numpy: slow, for comparison"
+    about: ClassVar[str] = (
+        "Horn's quaternion ICP against the mesh itself, in numpy: slow, for comparison"
+    )
 
     def __init__(self, target: Target) -> None:
         self._limits, self._visibility, self._index = target.limits, target.visibility, target.index
@@ -65,7 +73,9 @@ class ReferenceBackend:
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
-        return self._visibility.consistent(self._index, scan, guess, lambda *start: self._align(scan, *start))
+        return self._visibility.consistent(
+            self._index, scan, guess, lambda *start: self._align(scan, *start)
+        )
 
     def _align(self, scan: Array, T_ca: Pose, facing: bool) -> Fit:
         gate = self._limits.reach_m
@@ -77,8 +87,13 @@ class ReferenceBackend:
                 return Fit(T_ca, passes, False)
             step = best_motion(moved[inlier], found.foot[inlier])
             T_ca = step @ T_ca
-            tighter = min(gate, max(self._limits.gate_m, TIGHTEN * float(np.sqrt(found.d2[inlier].mean()))))
-            if self._small(step, moved[inlier].mean(axis=0)) and gate - tighter <= SETTLED_GATE * gate:
+            tighter = min(
+                gate, max(self._limits.gate_m, TIGHTEN * float(np.sqrt(found.d2[inlier].mean())))
+            )
+            if (
+                self._small(step, moved[inlier].mean(axis=0))
+                and gate - tighter <= SETTLED_GATE * gate
+            ):
                 return Fit(T_ca, passes, True)
             gate = tighter
         return Fit(T_ca, self._limits.n_max, False)
@@ -89,7 +104,9 @@ class ReferenceBackend:
 
 
 def horn_matrix(N: Array) -> Array:
-    """Horn's M (4, 4) of N = mean(c d') - c_bar d_bar' (3, 3) (eq:M), for SCALAR-FIRST quaternions."""
+    """Horn's M (4, 4) of N = mean(c d') - c_bar d_bar' (3, 3) (eq:M), for SCALAR-FIRST
+    quaternions.
+    """
     M = np.empty((4, 4))
     M[0, 0] = np.trace(N)
     M[0, 1:] = M[1:, 0] = (N[1, 2] - N[2, 1], N[2, 0] - N[0, 2], N[0, 1] - N[1, 0])
@@ -101,7 +118,9 @@ def best_motion(moving: Array, fixed: Array) -> Pose:
     """Least-squares rigid motion T with ``fixed ~ T.apply(moving)``; both (n, 3) [m], n >= 1."""
     c_bar, d_bar = moving.mean(axis=0), fixed.mean(axis=0)
     N = (moving - c_bar).T @ (fixed - d_bar) / len(moving)
-    w, x, y, z = np.linalg.eigh(horn_matrix(N))[1][:, -1]  # the eigenvector of M is [w x y z]; Pose is scalar last
+    w, x, y, z = np.linalg.eigh(horn_matrix(N))[1][
+        :, -1
+    ]  # the eigenvector of M is [w x y z]; Pose is scalar last
     turn = Pose(np.array([x, y, z, w]), np.zeros(3))
     return Pose(turn.q, d_bar - turn.R @ c_bar)
 
@@ -109,7 +128,8 @@ def best_motion(moving: Array, fixed: Array) -> Pose:
 class SmallGicpBackend:
     """GICP, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
 
-    ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second, if it had an inlier.
+    ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second,
+    if it had an inlier.
     """
 
     name: ClassVar[str] = "small_gicp"
@@ -145,20 +165,25 @@ class SmallGicpBackend:
                 translation_epsilon=SETTLED * self._limits.eps_m,
             )
             T_ca, passes = Pose.from_matrix(found.T_target_source), passes + int(found.iterations)
-        return Fit(T_ca, passes, found is not None and bool(found.converged) and int(found.num_inliers) > 0)
+        return Fit(
+            T_ca, passes, found is not None and bool(found.converged) and int(found.num_inliers) > 0
+        )
 
     def _prepared(self, points: Array) -> tuple[Any, Any]:
         cloud = self._library.PointCloud(points)
         tree = self._library.KdTree(cloud, num_threads=1)
-        self._library.estimate_normals_covariances(cloud, tree, num_neighbors=NEIGHBOURS, num_threads=1)
+        self._library.estimate_normals_covariances(
+            cloud, tree, num_neighbors=NEIGHBOURS, num_threads=1
+        )
         return cloud, tree
 
 
 class Open3dBackend:
-    """Point-to-plane, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
+    """Point-to-plane, coarse to fine: first with correspondences up to ``reach_m``, then up to
+    ``gate_m``.
 
-    The library returns no iteration count and no flag: ``Fit.iterations`` counts its calls, and ``converged`` means
-    that the last one ended with matched points.
+    The library returns no iteration count and no flag: ``Fit.iterations`` counts its calls, and
+    ``converged`` means that the last one ended with matched points.
     """
 
     name: ClassVar[str] = "open3d"
@@ -188,19 +213,22 @@ class Open3dBackend:
         method = self._library.TransformationEstimationPointToPlane()
         T_ca, matched = guess, 0
         for reach in (self._limits.reach_m, self._limits.gate_m):
-            found = self._library.registration_icp(scan, self._cloud, reach, T_ca.matrix, method, rule)
+            found = self._library.registration_icp(
+                scan, self._cloud, reach, T_ca.matrix, method, rule
+            )
             T_ca, matched = Pose.from_matrix(found.transformation), len(found.correspondence_set)
         return Fit(T_ca, 2, matched > 0)
 
 
 class KissBackend:
-    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric mean in between.
+    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric
+    mean in between.
 
-    The coarse maps are used with points thinned by the library's rule, the middle one with the library's adaptive
-    threshold, which follows the error of the guess. Deskewing is the pipeline's, by the predicted
-    motion. The library does not return its iteration count, so ``Fit.iterations`` counts its calls. ``converged``
-    means that one more call, started from the last result, moved the outermost points of the model by less than 0.01
-    ``gate_m``.
+    The coarse maps are used with points thinned by the library's rule, the middle one with the
+    library's adaptive threshold, which follows the error of the guess. Deskewing is the pipeline's,
+    by the predicted motion. The library does not return its iteration count, so ``Fit.iterations``
+    counts its calls. ``converged`` means that one more call, started from the last result, moved
+    the outermost points of the model by less than 0.01 ``gate_m``.
     """
 
     name: ClassVar[str] = "kiss"
@@ -221,7 +249,9 @@ class KissBackend:
             voxel_map: Any = VoxelHashMap(voxel, FAR_M, POINTS_PER_VOXEL)
             voxel_map.add_points(points)
             self._maps.append((voxel, voxel_map))
-        self._registration = Registration(target.limits.n_max, STEP_OF_EPS * target.limits.eps_rad, 1)
+        self._registration = Registration(
+            target.limits.n_max, STEP_OF_EPS * target.limits.eps_rad, 1
+        )
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
@@ -238,7 +268,8 @@ class KissBackend:
         return Fit(T_ca, len(self._maps) + FINE_CALLS - 1, False)
 
     def threshold(self, guess: Pose, found: Pose) -> float:
-        """Return the library's adaptive threshold [m] after the first stage, which measured the error of the guess.
+        """Return the library's adaptive threshold [m] after the first stage, which measured the
+        error of the guess.
 
         Args:
             guess: initial T_ca.
@@ -259,23 +290,29 @@ class KissBackend:
     def _run(self, scan: Array, voxel_map: Any, T_ca: Pose, reach_m: float) -> Pose:
         # Pose re-orthonormalises: the matrix of a unit quaternion is a rotation to 1e-16.
         kernel = (reach_m / 3.0) ** 2
-        return Pose.from_matrix(self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, reach_m, kernel))
+        return Pose.from_matrix(
+            self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, reach_m, kernel)
+        )
 
     def _settled(self, before: Pose, after: Pose) -> bool:
-        step = after @ before.inverse()  # in {C}, where a rotation of the target does not appear as a translation
+        step = (
+            after @ before.inverse()
+        )  # in {C}, where a rotation of the target does not appear as a translation
         turn, move = float(geometry.angle(step.q)), float(np.linalg.norm(step.t))
         small = SETTLED_OF_GATE * self._limits.gate_m
         return move < small and turn * self._radius_m < small
 
 
 class KissOdometry:
-    """The odometry of KISS-ICP relative to the target instead of the surroundings; it needs no model.
+    """The odometry of KISS-ICP relative to the target instead of the surroundings; it needs no
+    model.
 
-    Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's. Lengths are given to
-    it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1, range 100) hold for a target of any
-    size: the voxel is a hundredth of the extent. The first motion is that of the centroid, where the library would
-    begin at rest. {C} is parallel to {A} of the first scan, its origin at the centroid of that scan. Points that do not
-    move with the target must be cropped first.
+    Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's.
+    Lengths are given to it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1,
+    range 100) hold for a target of any
+    size: the voxel is a hundredth of the extent. The first motion is that of the centroid, where
+    the library would begin at rest. {C} is parallel to {A} of the first scan, its origin at the
+    centroid of that scan. Points that do not move with the target must be cropped first.
     """
 
     def __init__(self, extent_m: float, deskew: bool = True) -> None:
@@ -313,7 +350,9 @@ class KissOdometry:
         return T_ca.inverse(), float(instants.max()) if timed else 0.0
 
     def _recentre(self, middle: Array) -> None:
-        """Keep the origin of the library's points near the target, so that its limit on the range applies as usual."""
+        """Keep the origin of the library's points near the target, so that its limit on the range
+        applies as usual.
+        """
         if self._odometry is None:
             from kiss_icp.config.parser import load_config
             from kiss_icp.kiss_icp import KissICP
@@ -333,7 +372,9 @@ class KissOdometry:
 
 
 def _thinned_at(scan: Array, T_ca: Pose, voxel_m: float) -> Array:
-    """The points thinned by voxels of {C}, where moving the camera together with the guess changes nothing."""
+    """The points thinned by voxels of {C}, where moving the camera together with the guess changes
+    nothing.
+    """
     return T_ca.inverse().apply(thinned(T_ca.apply(scan), voxel_m))
 
 

@@ -1,7 +1,8 @@
 """Quality of a registered pose, measured in the same way for every back end.
 
-With p_c = T_ca p_a, closest point c and face normal n, the error d = [theta; v] in {C}, T_ac_true = T_ac @ Exp(d),
-appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the inliers give all that follows.
+With p_c = T_ca p_a, closest point c and face normal n, the error d = [theta; v] in {C}, T_ac_true =
+T_ac @ Exp(d), appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the
+inliers give all that follows.
 """
 
 from __future__ import annotations
@@ -32,21 +33,29 @@ from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
-WELL_OFF, PART = 2.0, 1000  # gates from which a point is well off; points per which those are counted
+WELL_OFF, PART = (
+    2.0,
+    1000,
+)  # gates from which a point is well off; points per which those are counted
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # keeps the information of an exact scan finite
 AS_MANY, AS_NEAR = 0.99, 1.02  # ratios of inliers and rms for which a pose fits as well
-SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # error of size from sums of patches: over the least reported one, sigmas
+SUGGESTED, SUGGESTED_SIGMAS = (
+    0.4,
+    2.5,
+)  # error of size from sums of patches: over the least reported one, sigmas
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
-UNCHANGED = 0.06  # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
+# a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
+UNCHANGED = 0.06
 NUMBERS = 1024  # normal numbers of the simulated noise
 SIMULATED, SHARES = (
     1024,
     (3, 12, 8),
 )  # points that are simulated; one of so many at most, at least, at most of small noise
-SMALL_NOISE = 0.002  # of the extent: with less noise a part of the simulated points decides whether the others are
+# of the extent: with less noise a part of the simulated points decides whether the others are
+SMALL_NOISE = 0.002
 UNCERTAIN_BIAS = 0.5  # of the bias of the noise: standard error
 ACCURACY = (0.1, 1e-3)  # accuracy [deg, share of the extent] of a back end that states none
 
@@ -56,18 +65,25 @@ class PoseQuality:
     """The quality of a pose by the kernel; from ``bounded`` on it holds only if ``observable``.
 
     Attributes:
-        points, inliers: of the scan.  used: inliers in the patches that are not left out.
-        rms_m, noise_m, centre: as in ``covariance.Evidence``.  total: (6, 6) sum of J'J over the inliers used.
+        points, inliers: of the scan.
+        used: inliers in the patches that are not left out.
+        rms_m, noise_m, centre: as in ``covariance.Evidence``.
+        total: (6, 6) sum of J'J over the inliers used.
         statistic: g' N^+ g / noise^2 of all inliers; 0 at a minimum of the distances.
         overlap, observable: there are enough inliers; they determine every motion.
         bounded: the standard deviations are below the extent and 1 rad.
-        beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
-        covariance, systematic: (6, 6) and the part of it from systematic errors.  dof: its degrees of freedom.
+        beyond: the residuals require a step above the accuracy of the back end and three standard
+            deviations.
+        covariance, systematic: (6, 6) and the part of it from systematic errors.
+        dof: its degrees of freedom.
         split_nis: the test of halves, NaN where it was not made.
-        size, size_1s: as of ``covariance.patch_size``.  well_off: of ``PART`` points, those two gates away.
-        bias, left, chance: (6,) of the pose, caused by the noise, as far as it is not by chance: T_ac_true = T_ac
-            Exp(bias); (6,) the rest of the estimate; (6, 6) covariance of the bias.
-        patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion is observable.
+        size, size_1s: as of ``covariance.patch_size``.
+        well_off: of ``PART`` points, those two gates away.
+        bias, left, chance: (6,) of the pose, caused by the noise, as far as it is not by chance:
+            T_ac_true = T_ac Exp(bias); (6,) the rest of the estimate; (6, 6) covariance of the
+            bias.
+        patches: the arrays of ``covariance.Evidence`` of the patches used; empty where every motion
+            is observable.
     """
 
     points: int
@@ -104,13 +120,17 @@ def evidence(
     noise_m: float | None = None,
     matches: Any = None,
 ) -> Evidence:
-    """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from the residuals.
+    """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated
+    from the residuals.
 
-    A patch is the points that project onto their faces in one cube, or one point with at most ``LEAST_PATCHES`` cubes.
+    A patch is the points that project onto their faces in one cube, or one point with at most
+    ``LEAST_PATCHES`` cubes.
     """
     facing = visibility.camera_c(index, points, T_ca) is not None
     size = PATCH_OF_EXTENT * index.extent_m
-    found = index.evidence(points, T_ca, gate_m, size, LEAST_PATCHES, facing=facing, matches=matches)
+    found = index.evidence(
+        points, T_ca, gate_m, size, LEAST_PATCHES, facing=facing, matches=matches
+    )
     rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
     noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
     sums = (found.counts, found.normals, found.gradients, found.offsets, found.errors, found.places)
@@ -125,16 +145,20 @@ def instants(
     T_ca: Pose,
     gate_m: float,
 ) -> Array:
-    """Return M (6, 6) [s]: a pose error d(t) = d0 + t d1 during the scan is registered as d0 + M d1.
+    """Return M (6, 6) [s]: a pose error d(t) = d0 + t d1 during the scan is registered as d0 + M
+    d1.
 
-    Point k, measured at ``times_s[k]``, has the residual J_k d(t_k). Least squares give M = N^-1 (sum of t J'J) with
-    N = J'J. Motions that no inlier observes are given the mean of all times.
+    Point k, measured at ``times_s[k]``, has the residual J_k d(t_k). Least squares give M = N^-1
+    (sum of t J'J) with N = J'J. Motions that no inlier observes are given the mean of all times.
     """
     moved, found, near = _matched(index, visibility, points, T_ca, gate_m)
     times = np.asarray(times_s, dtype=np.float64)
     mean = float(times.mean()) if len(times) else 0.0
     J = normal_jacobian(moved[near], found.normal[near])
-    return frozen(mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J))
+    return frozen(
+        mean * np.eye(6)
+        + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
+    )
 
 
 def _matched(
@@ -161,27 +185,45 @@ def grade(
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
-    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``: compare the poses
-    from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
-    ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
-    end began. A pose that equals this guess, although the residuals require a step, is FAILED. The pose of a degenerate
-    view has its unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the pose is
-    one of least squared distances. The bias that noise causes in it is taken from the pose, and the mean that noise
-    adds to the residuals from the covariance, see ``kernel/noise.hpp``. The size is not fitted; if it should be
-    (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it for the pose that is returned in the end.
+    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``:
+    compare the poses from two halves of the scan. ``accuracy``: of the back end on an exact scan
+    [deg, share of the extent]. ``systematic``: the covariance includes errors that vary slowly over
+    the target. ``guess``: T_ca from which the back end began. A pose that equals this guess,
+    although the residuals require a step, is FAILED. The pose of a degenerate view has its
+    unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the
+    pose is one of least squared distances. The bias that noise causes in it is taken from the pose,
+    and the mean that noise adds to the residuals from the covariance, see ``kernel/noise.hpp``. The
+    size is not fitted; if it should be (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it
+    for the pose that is returned in the end.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic, simulated)
+    found = _grade(
+        index,
+        visibility,
+        points,
+        fit,
+        limits.gate_m,
+        params,
+        across,
+        accuracy,
+        systematic,
+        simulated,
+    )
     step = found.overlap and found.statistic > UNCHANGED
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
-        return replace(failed, message="returned its guess unchanged, although the residuals require a step")
+        return replace(
+            failed, message="returned its guess unchanged, although the residuals require a step"
+        )
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
     weakest, free = tuple[str, ...](), None
     if found.observable:
-        b, uncertain = found.bias, UNCERTAIN_BIAS**2 * np.outer(found.bias, found.bias) + found.chance
+        b, uncertain = (
+            found.bias,
+            UNCERTAIN_BIAS**2 * np.outer(found.bias, found.bias) + found.chance,
+        )
         P = found.covariance + uncertain + np.outer(found.left, found.left)
         if not found.bounded:
             weakest, free = unbounded_directions(P, index.extent_m)
@@ -190,16 +232,25 @@ def grade(
         elif b.any():
             T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
     elif found.overlap:
-        used = Evidence(found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches)
+        used = Evidence(
+            found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
+        )
         view = _directions(used)
         info = _observable_information(view, used, index.extent_m, systematic)
         weakest, free = view.words, view.motions
         if guess is not None and fit.converged:
-            kept = view.nearest(T_ca, guess)  # passes over a curved surface drift along the unobservable directions
+            kept = view.nearest(
+                T_ca, guess
+            )  # passes over a curved surface drift along the unobservable directions
             facing = visibility.camera_c(index, points, kept) is not None
             at = index.normal_equations(points, kept, limits.gate_m, facing=facing)
-            fits = at.inliers >= AS_MANY * found.inliers and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
-            T_ca = view.refined(kept, at.info, at.gradient) if fits else T_ca  # corrects the observable directions
+            fits = (
+                at.inliers >= AS_MANY * found.inliers
+                and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
+            )
+            T_ca = (
+                view.refined(kept, at.info, at.gradient) if fits else T_ca
+            )  # corrects the observable directions
     settled = P is None or not found.beyond
     fitted = P is not None and settled and systematic and _other_size(found)
     return Alignment(
@@ -214,7 +265,9 @@ def grade(
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
-        message=_message(settled, found.size_1s if P is not None and systematic and not fitted else 0.0),
+        message=_message(
+            settled, found.size_1s if P is not None and systematic and not fitted else 0.0
+        ),
         dof=np.inf if P is None else found.dof,
         free=free if weakest else None,
         well_off=found.well_off,
@@ -225,7 +278,10 @@ def grade(
 
 
 def _other_size(found: PoseQuality) -> bool:
-    """Whether size is fitted: the sums of patches suggest another size, or many points are not on the model."""
+    """Whether size is fitted.
+
+    The sums of patches suggest another size, or many points are not on the model.
+    """
     suggested = abs(found.size) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
     return found.inliers < MANY_INLIERS * found.points or suggested
 
@@ -248,30 +304,55 @@ def _grade(
     systematic: bool,
     simulated: bool,
 ) -> PoseQuality:
-    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the test of halves."""
+    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}.
+
+    Directions of the test of halves.
+    """
     extent = index.extent_m
     camera = (visibility.faced(index, points, fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
     noise = (params.noise_m or 0.0, NOISE_FLOOR_OF_GATE * gate_m)
     overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
     step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
-    rule = (min(gate_m, index.reach_m), PATCH_OF_EXTENT * extent, LEAST_PATCHES, *camera, *noise, *overlap, *step)
+    rule = (
+        min(gate_m, index.reach_m),
+        PATCH_OF_EXTENT * extent,
+        LEAST_PATCHES,
+        *camera,
+        *noise,
+        *overlap,
+        *step,
+    )
     counted = (np.ascontiguousarray(across), WELL_OFF * gate_m, MANY_INLIERS, PART)
-    drawn = (normal_numbers(NUMBERS) if simulated else np.empty(0), SIMULATED, *SHARES, SMALL_NOISE * extent)
+    drawn = (
+        normal_numbers(NUMBERS) if simulated else np.empty(0),
+        SIMULATED,
+        *SHARES,
+        SMALL_NOISE * extent,
+    )
     return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, *drawn, 1, fit.matches))
 
 
-def _observable_information(view: Directions, found: Evidence, extent_m: float, systematic: bool) -> Array:
-    """The information (6, 6) of a degenerate view, by the same covariance estimate as for any other view."""
+def _observable_information(
+    view: Directions, found: Evidence, extent_m: float, systematic: bool
+) -> Array:
+    """The information (6, 6) of a degenerate view, by the same covariance estimate as for any other
+    view.
+    """
     held = view.held(found)
     if systematic:
-        P, _ = registration_covariance(held, systematic_errors(held, extent_m, PATCH_OF_EXTENT * extent_m))
+        P, _ = registration_covariance(
+            held, systematic_errors(held, extent_m, PATCH_OF_EXTENT * extent_m)
+        )
     else:
         P, _ = sandwich_covariance(held.normals, held.gradients)
     return view.observable_information(P)
 
 
 def left_undetermined(found: Alignment, motions: Array) -> Alignment:
-    """Return an alignment whose information is independent of motions d (6, k) of the model: DEGENERATE."""
+    """Return an alignment whose information is independent of motions d (6, k) of the model.
+
+    DEGENERATE.
+    """
     N, D = found.info, motions / np.linalg.norm(motions, axis=0)
     info = N - N @ D @ np.linalg.pinv(D.T @ N @ D, hermitian=True) @ D.T @ N
     motions = motions if found.free is None else np.hstack([found.free, motions])
@@ -282,7 +363,9 @@ def left_undetermined(found: Alignment, motions: Array) -> Alignment:
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
     """Return an alignment without a measurement: the guess is kept, no inliers, no information."""
-    return Alignment(T_ac or Pose.identity(), 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
+    return Alignment(
+        T_ac or Pose.identity(), 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status
+    )
 
 
 def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
@@ -296,7 +379,10 @@ def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
 def view_directions(
     index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> Directions:
-    """Return the directions that a view determines at a pose, and the others; arguments as in ``evidence``."""
+    """Return the directions that a view determines at a pose, and the others.
+
+    Arguments as in ``evidence``.
+    """
     return _directions(without_dominant_patches(evidence(index, visibility, points, T_ca, gate_m)))
 
 

@@ -1,9 +1,11 @@
-"""Restarts of a registration whose fit is poor or whose pose is implausible, within a budget of point searches.
+"""Restarts of a registration whose fit is poor or whose pose is implausible, within a budget of
+point searches.
 
-A restart is a graduated registration of part of the scan: point-to-plane passes while the rejection distance falls
-geometrically from ``START_OF_EXTENT`` (or the reach) to ``STOP_OF_EXTENT`` of the extent. The falling distance rejects
-outliers, which the rms rule of the normal loop cannot do if they are the majority. Starts: the guess and the first
-result, then rotations about them. The best pose is found by truncated squared distances at a common width.
+A restart is a graduated registration of part of the scan: point-to-plane passes while the rejection
+distance falls geometrically from ``START_OF_EXTENT`` (or the reach) to ``STOP_OF_EXTENT`` of the
+extent. The falling distance rejects outliers, which the rms rule of the normal loop cannot do if
+they are the majority. Starts: the guess and the first result, then rotations about them. The best
+pose is found by truncated squared distances at a common width.
 """
 
 from __future__ import annotations
@@ -34,19 +36,38 @@ from avsreplay.register.quality import PART
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
-POOR_OF_GATE = 0.3  # with at least LEAST_RATIO of inliers and a smaller rms (in units of the gate) a fit is close
-POINTS, FEW = PART, 150  # points of the scan used by restarts, and those that show whether a guess is hopeful
+# with at least LEAST_RATIO of inliers and a smaller rms (in units of the gate) a fit is close
+POOR_OF_GATE = 0.3
+POINTS, FEW = (
+    PART,
+    150,
+)  # points of the scan used by restarts, and those that show whether a guess is hopeful
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
-COMPLETE = 0.985  # with more inliers too few points are left that could continue beyond an edge of the model
-PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
-SHARED_OF_GATE = 0.2  # with a larger rms distance and points off the model it is tested what neighbours share
-SHARED = 0.4  # of the rms distance; a correct pose of a correct model has less than 0.3 in common to neighbours
-BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
+# with more inliers too few points are left that could continue beyond an edge of the model
+COMPLETE = 0.985
+PATCH_OF_EXTENT, CELLS = (
+    0.05,
+    64,
+)  # side of a cube of neighbouring points; cubes along the extent, at least
+SHARED_OF_GATE = (
+    0.2  # with a larger rms distance and points off the model it is tested what neighbours share
+)
+# of the rms distance; a correct pose of a correct model has less than 0.3 in common to neighbours
+SHARED = 0.4
+BETTER_THAN, NEARER = (
+    0.9,
+    0.999,
+)  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
-NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
-HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise at the result of a search it is not registered to the whole scan
+NEAR, MOSTLY = (
+    5.0,
+    0.9,
+)  # a rest is another object if this share of points nearer than so many widths is on the model
+HOPELESS = (
+    1.5 * NOISE_OF_EXTENT
+)  # with more noise at the result of a search it is not registered to the whole scan
 
 
 @value_class
@@ -66,8 +87,12 @@ class Restart:
         return float(np.mean(self.costs(width_m)))
 
     def separate(self, width_m: float) -> bool:
-        """Return whether the points off the model are well away from it, as those of another object are."""
-        on, near = (int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR))
+        """Return whether the points off the model are well away from it, as those of another object
+        are.
+        """
+        on, near = (
+            int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR)
+        )
         return on >= MOSTLY * near
 
 
@@ -84,39 +109,67 @@ class Restarter:
         self._stages = {start: self._stages_from(start) for start in (self.narrow_m, self._wide)}
 
     def _stages_from(self, start_m: float) -> list[dict[bool, IcpParams]]:
-        """The rules of the stages with falling rejection distance, without and with the facing test."""
+        """The rules of the stages with falling rejection distance, without and with the facing
+        test.
+        """
         gates, gate = [], start_m
         while gate > STOP_OF_EXTENT * self._extent:
             gates.append(gate)
             gate *= FALL
-        rule = IcpParams(n_max=PASSES, n_plane=PASSES, tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * self._extent)
-        return [{facing: replace(rule, gate_m=gate, facing=facing) for facing in (False, True)} for gate in gates]
+        rule = IcpParams(
+            n_max=PASSES, n_plane=PASSES, tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * self._extent
+        )
+        return [
+            {facing: replace(rule, gate_m=gate, facing=facing) for facing in (False, True)}
+            for gate in gates
+        ]
 
     def part(self, points: NDArray[Any]) -> NDArray[Any]:
         """Return about ``POINTS`` points of the scan (n, 3), evenly over its order."""
-        return points[np.linspace(0, len(points) - 1, POINTS).astype(np.intp)] if len(points) > POINTS else points
+        return (
+            points[np.linspace(0, len(points) - 1, POINTS).astype(np.intp)]
+            if len(points) > POINTS
+            else points
+        )
 
-    def measure(self, points: NDArray[Any], T_ca: Pose, budget: Budget, guess: Pose | None = None) -> Restart:
-        """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of ``PlausibilityTest.noise``."""
+    def measure(
+        self, points: NDArray[Any], T_ca: Pose, budget: Budget, guess: Pose | None = None
+    ) -> Restart:
+        """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``.
+
+        As of ``PlausibilityTest.noise``.
+        """
         at, work = self._target.visibility.distances(self._target.index, points, T_ca, np.inf)
         budget.spend(work + CALL_WORK)
         return Restart(T_ca, at, self._test.noise(at, T_ca, guess))
 
-    def starts(self, points: NDArray[Any], first: Alignment, guess: Pose, budget: Budget) -> list[Restart]:
-        """Return a registered pose, and its guess T_ac if part of ``points`` (n, 3) in {A} is off and it is as near.
+    def starts(
+        self, points: NDArray[Any], first: Alignment, guess: Pose, budget: Budget
+    ) -> list[Restart]:
+        """Return a registered pose, and its guess T_ac if part of ``points`` (n, 3) in {A} is off
+        and it is as near.
 
-        The wide rejection distance of the first passes can lead away from a good guess on a target that is hidden.
+        The wide rejection distance of the first passes can lead away from a good guess on a target
+        that is hidden.
         """
-        at, before = (self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (first.T_ac, guess))
-        worse = BETTER_THAN * before.cost(self._target.limits.gate_m) > at.cost(self._target.limits.gate_m)
+        at, before = (
+            self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (first.T_ac, guess)
+        )
+        worse = BETTER_THAN * before.cost(self._target.limits.gate_m) > at.cost(
+            self._target.limits.gate_m
+        )
         return [at] if worse or first.inlier_ratio >= LEAST_RATIO else [at, before]
 
-    def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> Alignment:
-        """Return the alignment with a covariance that is not contradicted by the distances at the predicted pose.
+    def consistent(
+        self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
+    ) -> Alignment:
+        """Return the alignment with a covariance that is not contradicted by the distances at the
+        predicted pose.
 
-        Where little of the target is in the scan, the distances can be nearly as small along a curve of poses, far
-        beyond the covariance at its lowest point. With d the step to the prediction, x its chi-square by the
-        distances and y that by the covariance P, P + d d' (1 / x - 1 / y) has the chi-square x if x < y.
+        Where little of the target is in the scan, the distances can be nearly as small along a
+        curve of poses, far beyond the covariance at its lowest point. With d the step to the
+        prediction, x its chi-square by the distances and y that by the covariance P, P + d d' (1 /
+        x - 1 / y) has the chi-square x if x < y.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.
@@ -125,67 +178,103 @@ class Restarter:
             budget: of the scan.
         """
         P = found.covariance
-        if P is None or found.inlier_ratio >= LEAST_RATIO or not self._test.predicted(found.T_ac.inverse(), guess):
+        if (
+            P is None
+            or found.inlier_ratio >= LEAST_RATIO
+            or not self._test.predicted(found.T_ac.inverse(), guess)
+        ):
             return found
-        at, before = (self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (found.T_ac, guess))
+        at, before = (
+            self.measure(points, T_ac.inverse(), budget, guess) for T_ac in (found.T_ac, guess)
+        )
         step = found.T_ac.inverse() @ guess
         d = np.concatenate([geometry.log(step.q), step.t])
         width, noise = self.width(at), max(at.noise_m, before.noise_m, np.finfo(float).tiny)
         by_distances = found.points * (before.cost(width) - at.cost(width)) * (width / noise) ** 2
-        missing = 1.0 / max(by_distances, 1.0) - 1.0 / max(float(d @ np.linalg.solve(P, d)), np.finfo(float).tiny)
+        missing = 1.0 / max(by_distances, 1.0) - 1.0 / max(
+            float(d @ np.linalg.solve(P, d)), np.finfo(float).tiny
+        )
         if missing <= 0.0:
             return found
         wider = P + missing * np.outer(d, d)
-        return replace(found, covariance=geometry.frozen(wider), info=geometry.frozen(np.linalg.inv(wider)))
+        return replace(
+            found, covariance=geometry.frozen(wider), info=geometry.frozen(np.linalg.inv(wider))
+        )
 
     def width(self, at: Restart) -> float:
-        """Return the rejection distance [m] for a scan that is not clean: three standard deviations of its noise.
+        """Return the rejection distance [m] for a scan that is not clean: three standard deviations
+        of its noise.
 
-        A larger distance would include points of other objects next to the surface, which bias the pose.
+        A larger distance would include points of other objects next to the surface, which bias the
+        pose.
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
 
-    def nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float, budget: Budget) -> Alignment:
-        """Return the second alignment if the points, none farther than ``width_m``, are nearer to the model there."""
+    def nearest(
+        self, few: NDArray[Any], found: list[Alignment], width_m: float, budget: Budget
+    ) -> Alignment:
+        """Return the second alignment if the points, none farther than ``width_m``, are nearer to
+        the model there.
+        """
         cost = [self.measure(few, each.T_ac.inverse(), budget).cost(width_m) for each in found]
         return found[cost[1] < NEARER * cost[0]]
 
-    def reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose | None) -> str:
+    def reason(
+        self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose | None
+    ) -> str:
         """Return why a pose is not plausible; "" if it is, or nothing was measured."""
         budget.spend(TEST_WORK)
-        return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
+        return (
+            self._test.check(few, found.T_ac.inverse(), None, guess).reason
+            if found.measured
+            else ""
+        )
 
     def misfit(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> bool:
-        """Return whether neighbouring points on the model share most of their distances from it, (n, 3) in {A}.
+        """Return whether neighbouring points on the model share most of their distances from it,
+        (n, 3) in {A}.
 
-        Then the pose or the model is wrong, and another pose may fit better, however few points are off the model.
+        Then the pose or the model is wrong, and another pose may fit better, however few points are
+        off the model.
         """
         distance, gate = self.measure(points, T_ca, budget).distance, self._target.limits.gate_m
         budget.spend(STRUCTURE_WORK)
-        shared, rms = self.structure(points, T_ca, gate), np.sqrt(np.mean(distance[distance < gate] ** 2))
+        shared, rms = (
+            self.structure(points, T_ca, gate),
+            np.sqrt(np.mean(distance[distance < gate] ** 2)),
+        )
         return bool(np.isfinite(shared) and shared > SHARED * rms)
 
     def structure(
-        self, points: NDArray[Any], T_ca: Pose, most_m: float = np.inf, side: float = PATCH_OF_EXTENT
+        self,
+        points: NDArray[Any],
+        T_ca: Pose,
+        most_m: float = np.inf,
+        side: float = PATCH_OF_EXTENT,
     ) -> float:
         """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
 
-        From the products of the sums of two halves of each patch: noise of single points cancels in the mean, a wrong
-        pose and errors of the model do not. A point belongs to the patch in which its projection onto its face lies.
-        With patches of the measured points, noise as large as a patch would divide a face by the sign of the noise.
+        From the products of the sums of two halves of each patch: noise of single points cancels in
+        the mean, a wrong pose and errors of the model do not. A point belongs to the patch in which
+        its projection onto its face lies. With patches of the measured points, noise as large as a
+        patch would divide a face by the sign of the noise.
 
         Args:
             points: (n, 3) in {A} [m].
             T_ca: the pose.
-            most_m: points farther from the model are left out [m], as are those farther than ``START_OF_EXTENT``.
+            most_m: points farther from the model are left out [m], as are those farther than
+                ``START_OF_EXTENT``.
             side: side of a cube of neighbouring points, over the extent.
 
         Returns:
-            The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near the model.
+            The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near
+            the model.
         """
         target, p = self._target, T_ca.apply(points)
-        found = target.index.closest(p, camera_c=target.visibility.camera_c(target.index, points, T_ca))
+        found = target.index.closest(
+            p, camera_c=target.visibility.camera_c(target.index, points, T_ca)
+        )
         near = found.d2 < min(most_m, START_OF_EXTENT * self._extent) ** 2
         if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
             return float("inf")
@@ -194,16 +283,21 @@ class Restarter:
         cells = np.floor((on - self._middle) / (side * self._extent)).astype(np.int64) + CELLS // 2
         patch = np.unique(cells @ np.array([CELLS * CELLS, CELLS, 1]), return_inverse=True)[1]
         half = 2 * patch + np.arange(len(patch)) % 2
-        sums, counts = (np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None))
+        sums, counts = (
+            np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None)
+        )
         shared = float(sums.prod(axis=1).sum()) / max(float(counts.prod(axis=1).sum()), 1.0)
         return float(np.sqrt(max(shared, 0.0)))
 
     def healthy(self, inlier_ratio: float, rms_m: float) -> bool:
-        """Return whether an alignment is a close fit of nearly all points, which needs no further test."""
+        """Return whether an alignment is a close fit of nearly all points, which needs no further
+        test.
+        """
         return inlier_ratio >= LEAST_RATIO and rms_m <= POOR_OF_GATE * self._target.limits.gate_m
 
     def sound(self, points: NDArray[Any], found: Alignment, budget: Budget) -> bool:
-        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues beyond the model.
+        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues
+        beyond the model.
 
         Where some points are off the model, the others must not share a distance from it.
         """
@@ -212,16 +306,19 @@ class Restarter:
             return close
         few, T_ca = self.part(points), found.T_ac.inverse()
         budget.spend(STRUCTURE_WORK)
-        if found.rms_m > SHARED_OF_GATE * self._target.limits.gate_m and self.misfit(few, T_ca, budget):
+        if found.rms_m > SHARED_OF_GATE * self._target.limits.gate_m and self.misfit(
+            few, T_ca, budget
+        ):
             return False
         return not self._test.continued(few, T_ca)
 
     def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> bool:
         """Return whether an alignment may be a local minimum.
 
-        After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess. A misfit of nearly
-        all points of which neighbours share less than half is noise and no sign of a local minimum. The neighbours are
-        close together, because on small parts of a target the distances at a wrong pose change their sign.
+        After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess.
+        A misfit of nearly all points of which neighbours share less than half is noise and no sign
+        of a local minimum. The neighbours are close together, because on small parts of a target
+        the distances at a wrong pose change their sign.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.
@@ -242,8 +339,12 @@ class Restarter:
         shared = self.structure(points, T_ca, side=0.5 * PATCH_OF_EXTENT)
         return bool(shared > max(poor, np.sqrt(0.5) * found.rms_m))
 
-    def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
-        """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
+    def graduated(
+        self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget
+    ) -> Restart:
+        """Return the pose after passes with a falling rejection distance, from ``start_m``
+        [m] on.
+        """
         index = self._target.index
         for rules in self._stages[start_m]:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
@@ -253,7 +354,9 @@ class Restarter:
         return self.measure(points, T_ca, budget)
 
     def hopeful(self, scan: NDArray[Any], guess: Pose, budget: Budget) -> bool:
-        """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are mostly on the model."""
+        """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are
+        mostly on the model.
+        """
         few = scan[:: max(1, len(scan) // FEW)]
         found = self.graduated(few, guess.inverse(), self._wide, budget)
         width = max(self._target.limits.gate_m, 3.0 * found.noise_m)
@@ -269,14 +372,16 @@ class Restarter:
         before: Restart | None = None,
         kept: int = 0,
     ) -> Restart:
-        """Return the best of the first result and the restarts, all T_ca; ends at the first plausible pose.
+        """Return the best of the first result and the restarts, all T_ca; ends at the first
+        plausible pose.
 
         Args:
             points: the part of the scan in {A} [m].
             guess: initial pose of the first registration.
             result: its result.
             budget: work that is left.
-            before: best of the restarts from guess and result; the starts are then poses turned by ``TURN_RAD``.
+            before: best of the restarts from guess and result; the starts are then poses turned by
+                ``TURN_RAD``.
             kept: work that is kept for a later step.
         """
         found = [self.measure(points, result, budget), *([before] if before else [])]
@@ -286,7 +391,9 @@ class Restarter:
                 break
             found.append(self.graduated(points, T_ca, start, budget))
             best = self.least(found)
-            if best is tested or not any(self.same(best.T_ca, each.T_ca) for each in found if each is not best):
+            if best is tested or not any(
+                self.same(best.T_ca, each.T_ca) for each in found if each is not best
+            ):
                 continue  # not yet confirmed by a second start
             budget.spend(TEST_WORK)
             if not self._test.check(points, best.T_ca).reason:
@@ -315,8 +422,12 @@ class Restarter:
         """Return by how much a motion in {C} moves the middle of the model [m]."""
         return float(np.linalg.norm(step.apply(self._middle) - self._middle))
 
-    def _starts(self, guess: Pose, result: Pose, centre_a: Array, turned: bool) -> Iterator[tuple[Pose, float]]:
-        """Guess and result with a narrow and a wide start, or both rotated by TURN_RAD about each axis of {C}."""
+    def _starts(
+        self, guess: Pose, result: Pose, centre_a: Array, turned: bool
+    ) -> Iterator[tuple[Pose, float]]:
+        """Guess and result with a narrow and a wide start, or both rotated by TURN_RAD about each
+        axis of {C}.
+        """
         narrow = self.narrow_m
         apart = np.abs(guess.matrix - result.matrix) / np.array([1.0, 1.0, 1.0, self._extent])
         bases = (guess, result) if apart.max() > SAME_POSE else (guess,)

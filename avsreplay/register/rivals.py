@@ -1,13 +1,16 @@
-"""Decision between poses that differ by a near-symmetry of the model, by the rays that contradict each of them.
+"""Decision between poses that differ by a near-symmetry of the model, by the rays that contradict
+each of them.
 
-A nearly symmetric body differs from its turned copies only by its marks: the parts that no near-symmetry carries onto
-the surface. Three kinds of rays decide between two poses. Some points are on the model at one pose and well off it at
-the other. Some rays pass through a mark of one pose, because the point measured in that direction lies behind it. In
-some directions a mark should be visible and nothing was measured; they count if the visible side of the model is
-complete in the scan.
+A nearly symmetric body differs from its turned copies only by its marks: the parts that no
+near-symmetry carries onto the surface. Three kinds of rays decide between two poses. Some points
+are on the model at one pose and well off it at the other. Some rays pass through a mark of one
+pose, because the point measured in that direction lies behind it. In some directions a mark should
+be visible and nothing was measured; they count if the visible side of the model is complete in the
+scan.
 
-With a share e of rays that contradict the true pose (other objects, errors of the model), a ray that contradicts one
-pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is below ``LEAST_LIKELIHOOD`` stay rivals.
+With a share e of rays that contradict the true pose (other objects, errors of the model), a ray
+that contradicts one pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is
+below ``LEAST_LIKELIHOOD`` stay rivals.
 """
 
 from __future__ import annotations
@@ -41,16 +44,25 @@ SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around 
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
-NEAR = 0.004  # a point within this (over the extent), or within three sigma of the noise, is on the model
-TURNED_RAD = np.radians(12.0)  # rotation from the guess above which a pose is far, with near-symmetries
-NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
+# a point within this (over the extent), or within three sigma of the noise, is on the model
+NEAR = 0.004
+TURNED_RAD = np.radians(
+    12.0
+)  # rotation from the guess above which a pose is far, with near-symmetries
+NOT_VERIFIED = (
+    f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a"
+    " search"
+)
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
-MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
+MOST_POINTS, SCREENED = (
+    6000,
+    150,
+)  # points of the scan; those on and off the model with which all motions are compared
 
 
 class NearSymmetry:
@@ -60,12 +72,26 @@ class NearSymmetry:
         search: the global search of the same target.
     """
 
-    def __init__(self, target: Target, test: PlausibilityTest, search: Search, kept: dict[str, Array]) -> None:
-        """Find the axis of revolution, if there is one, and sample the marks; or take both from ``kept``."""
-        self._target, self._test, self.search, self._gate = target, test, search, target.limits.gate_m
+    def __init__(
+        self, target: Target, test: PlausibilityTest, search: Search, kept: dict[str, Array]
+    ) -> None:
+        """Find the axis of revolution, if there is one, and sample the marks.
+
+        Or take both from ``kept``.
+        """
+        self._target, self._test, self.search, self._gate = (
+            target,
+            test,
+            search,
+            target.limits.gate_m,
+        )
         surface = target.surface
         if "kinds" not in kept:
-            found = near_symmetries(search, target.index, *sample(surface, SAMPLES)) if len(surface.faces) else NONE
+            found = (
+                near_symmetries(search, target.index, *sample(surface, SAMPLES))
+                if len(surface.faces)
+                else NONE
+            )
             kept["kinds"] = np.concatenate([np.zeros((0, 4, 4)), *found.kinds])
             kept["ends"] = np.cumsum([len(motions) for motions in found.kinds], dtype=np.int64)
             kept["least"] = np.array(found.least_rad)
@@ -77,9 +103,11 @@ class NearSymmetry:
         self._share, self._area = (float(x) for x in kept["marked"])
 
     def _found(self) -> tuple[Array, Array]:
-        """Points on the marks and their normals (2, n, 3); the share of the surface that they have, and a point's area.
+        """Points on the marks and their normals (2, n, 3); the share of the surface that they have,
+        and a point's area.
 
-        Few points show which parts are marks and how large they are together; more are then sampled around these.
+        Few points show which parts are marks and how large they are together; more are then sampled
+        around these.
         """
         surface, none = self._target.surface, np.zeros((2, 0, 3))
         if not len(self._kinds):
@@ -99,7 +127,10 @@ class NearSymmetry:
         return found, np.array([len(marks) / DENSE, stride * area / DENSE])
 
     def _carried_off(self, points: Array, most: float) -> NDArray[np.bool_]:
-        """Which points some near-symmetry does not carry onto the surface; ends when this share of them is exceeded."""
+        """Which points some near-symmetry does not carry onto the surface.
+
+        Ends when this share of them is exceeded.
+        """
         moved, width = np.zeros(len(points), dtype=bool), OFF * self._gate
         for motions in self._kinds:
             for T in motions[:: max(1, len(motions) // TRIED)]:
@@ -129,30 +160,44 @@ class NearSymmetry:
         return 2 * SCREENED * sum(len(motions) for motions in self._kinds)
 
     def work(self, points: int, others: int = 0) -> int:
-        """Return the usual cost of a decision between so many other poses and the turned ones in point searches."""
+        """Return the usual cost of a decision between so many other poses and the turned ones in
+        point searches.
+        """
         finalists = FINALISTS * len(self._kinds)
         rays = RAY_WORK * len(self._marks)
         measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
-        return self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
+        return (
+            self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
+        )
 
     def elsewhere_work(self, points: int, measured: int, partial: bool) -> int:
-        """Return the usual cost of :meth:`elsewhere` for a scan with so many points on the model, and in all."""
+        """Return the usual cost of :meth:`elsewhere` for a scan with so many points on the model,
+        and in all.
+        """
         return self.search.elsewhere_work(points, partial) + self._compared_work(measured)
 
     def _compared_work(self, points: int) -> int:
         return (1 + COMPARED) * (min(points, MOST_POINTS) + RAY_WORK * len(self._marks))
 
     def after_search(self, points: int) -> int:
-        """Return the usual cost of what follows a search for a scan of so many points, in point searches."""
+        """Return the usual cost of what follows a search for a scan of so many points, in point
+        searches.
+        """
         turned = self.work(points, FINALISTS) if self.marked else 0
         return TEST_WORK + healthy_work(points, self._target.near_work) + turned
 
     def search_work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` of the search and of registering its result."""
-        return self.search.work(points, number) + TEST_WORK + healthy_work(points, self._target.near_work)
+        return (
+            self.search.work(points, number)
+            + TEST_WORK
+            + healthy_work(points, self._target.near_work)
+        )
 
     def better(self, scan: NDArray[np.floating], T_ca: Pose) -> tuple[list[Pose], int]:
-        """Return the poses turned by a near-symmetry that explain more of a scan (n, 3) in {A}, and the work."""
+        """Return the poses turned by a near-symmetry that explain more of a scan (n, 3) in {A}, and
+        the work.
+        """
         turned, tested = self._turned(self._rays(scan), T_ca, True)
         return turned, self.turning_work + (1 + tested) * self._ray_work
 
@@ -167,15 +212,18 @@ class NearSymmetry:
         complete: bool,
         turned: list[Pose] | None = None,
     ) -> tuple[Pose, list[Pose], int]:
-        """Return the pose for which the rays decide, the others that explain the scan as well, and extra work.
+        """Return the pose for which the rays decide, the others that explain the scan as well, and
+        extra work.
 
-        The extra work is what the comparison took beyond ``work``, because the rays spoke against many motions.
+        The extra work is what the comparison took beyond ``work``, because the rays spoke against
+        many motions.
 
         Args:
             scan: (n, 3) in {A} [m].
             T_ca: registered pose.
             others: other poses that explain the scan.
-            complete: the visible side of the model is complete in the scan, so that empty directions count.
+            complete: the visible side of the model is complete in the scan, so that empty
+                directions count.
             turned: poses turned by a near-symmetry; None: the best ones.
         """
         rays = self._rays(scan)
@@ -203,7 +251,8 @@ class NearSymmetry:
     def elsewhere(
         self, scan: NDArray[np.floating], T_ca: Pose, partial: bool, left: int
     ) -> tuple[Pose, list[Pose], int]:
-        """Return the pose for which the rays decide among those far from a result that explain its points as well.
+        """Return the pose for which the rays decide among those far from a result that explain its
+        points as well.
 
         Args:
             scan: (n, 3) in {A} [m].
@@ -212,10 +261,14 @@ class NearSymmetry:
             left: work that is left.
 
         Returns:
-            The pose, the others that explain the points on the model as well, and the work in point searches.
+            The pose, the others that explain the points on the model as well, and the work in point
+            searches.
         """
         rays, gate = self._rays(scan), self._gate
-        on, compared = self._test.measure(rays.points, T_ca) < gate, self._compared_work(len(rays.points))
+        on, compared = (
+            self._test.measure(rays.points, T_ca) < gate,
+            self._compared_work(len(rays.points)),
+        )
         poses, work = self.search.elsewhere(rays.points[on], T_ca, partial, left - compared)
         found = [self._measured(rays, each) for each in (T_ca, *poses)]
         width = max(NEAR * self._target.index.extent_m, 3.0 * self.search.noise_of(found))
@@ -228,11 +281,16 @@ class NearSymmetry:
         others = [each for each in found if not self.search.same(best.T_ca, each.T_ca)]
         as_near = [each for each in others if as_good(best, each, max(gate, width), margin)]
         repeated = len(as_near) >= COMPARED  # there may be more of them, which were not compared
-        rivals = [each.T_ca for each in as_near if repeated or not decides(best, each, width, not partial)]
+        rivals = [
+            each.T_ca for each in as_near if repeated or not decides(best, each, width, not partial)
+        ]
         return best.T_ca, rivals, work + compared
 
     def rivalled(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> Alignment:
-        """Return the alignment; AMBIGUOUS with rivals that differ not only along its unobservable directions."""
+        """Return the alignment.
+
+        AMBIGUOUS with rivals that differ not only along its unobservable directions.
+        """
         at, target = found.T_ac.inverse(), self._target
         if rivals and found.status is AlignStatus.DEGENERATE:
             free = view_directions(target.index, target.visibility, scan, at, self._gate)
@@ -246,18 +304,22 @@ class NearSymmetry:
         return distances(self._target.index, points, motions, most_m)
 
     def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
-        """The best poses that the near-symmetries give, registered, and at how many of them the marks were tested.
+        """The best poses that the near-symmetries give, registered, and at how many of them the
+        marks were tested.
 
-        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose pass through a mark.
-        ``better``: only poses that explain more rays, by ``LEAST_RAYS`` at least; also those turned by a few degrees,
-        because a body of revolution with marks has a minimum wherever a mark of the model meets some of the points.
+        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose
+        pass through a mark. ``better``: only poses that explain more rays, by ``LEAST_RAYS`` at
+        least; also those turned by a few degrees, because a body of revolution with marks has a
+        minimum wherever a mark of the model meets some of the points.
         """
         stride, tested = self._stride, 0
         passed = self._passed(rays, T_ca, stride)[0]
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
         few = [k[:: max(1, -(-len(k) // SCREENED))] for k in kinds]
-        weights = np.concatenate([np.full(len(f), len(k) / max(1, len(f))) for k, f in zip(kinds, few, strict=True)])
+        weights = np.concatenate(
+            [np.full(len(f), len(k) / max(1, len(f))) for k, f in zip(kinds, few, strict=True)]
+        )
         part = np.ascontiguousarray(rays.points[np.concatenate(few)])
         width = OFF * self._gate
         kept = list[Pose]()
@@ -265,16 +327,22 @@ class NearSymmetry:
         for motions in self._kinds:
             excess = (self._distances(T_ca.apply(part), motions, width) / width) ** 2 - here
             cost, most, most_cost = excess @ weights, len(kept) + FINALISTS, np.inf
-            if better:  # where rays pass through marks, also poses that the few points do not exclude
+            if (
+                better
+            ):  # where rays pass through marks, also poses that the few points do not exclude
                 most_cost = passed - LEAST_RAYS
                 cost -= SCREEN_SIGMAS * np.sqrt(excess**2 @ weights**2) * (passed > LEAST_RAYS)
             order = np.argsort(cost, kind="stable")
             for k in order[cost[order] < most_cost]:
                 start = Pose.from_matrix(motions[k]) @ T_ca
-                if any(self.search.same(start, other) for other in (kept if better else (T_ca, *kept))):
+                if any(
+                    self.search.same(start, other) for other in (kept if better else (T_ca, *kept))
+                ):
                     continue
                 tested += 1
-                if self._passed(rays, start, stride)[0] < min(passed + LEAST_RAYS, most_cost - cost[k]):
+                if self._passed(rays, start, stride)[0] < min(
+                    passed + LEAST_RAYS, most_cost - cost[k]
+                ):
                     kept.append(start)
                 if len(kept) == most:
                     break
@@ -295,7 +363,8 @@ class NearSymmetry:
         return RAY_WORK * -(-len(self._marks) // self._stride)
 
     def _passed(self, rays: Rays, T_ca: Pose, stride: int = 1) -> tuple[float, float]:
-        """Rays that passed through marks that should be visible at a pose, and those expected where nothing is.
+        """Rays that passed through marks that should be visible at a pose, and those expected where
+        nothing is.
 
         Only one in ``stride`` of the marks is tested, and counts for so many.
         """
@@ -312,7 +381,8 @@ class NearSymmetry:
         return float(expected[passed].sum()), float(expected[empty].sum())
 
     def _visible(self, T_ca: Pose, stride: int) -> NDArray[np.intp]:
-        """One in ``stride`` of the marks, if they face the camera and no other part of the model hides them.
+        """One in ``stride`` of the marks, if they face the camera and no other part of the model
+        hides them.
 
         None if the camera is unknown.
         """
@@ -326,8 +396,11 @@ class NearSymmetry:
         return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
 
 
-def prepared(target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None) -> NearSymmetry:
-    """Return the near-symmetries of a target with its search. They are kept in a folder where one is given.
+def prepared(
+    target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None
+) -> NearSymmetry:
+    """Return the near-symmetries of a target with its search. They are kept in a folder where one
+    is given.
 
     Args:
         target: what is searched.
@@ -337,8 +410,13 @@ def prepared(target: Target, test: PlausibilityTest, params: AcquireParams, fold
     """
     kernel, surface, limits, path = kernel_module(), target.surface, target.limits, None
     if folder is not None:
-        layout = f"{kernel.LAYOUT} {VERSION} {target.visibility.sided} {params.starts} {limits.gate_m.hex()}"
-        path = index_cache.cache_path(folder, layout, surface.vertices, surface.faces, limits.reach_m)
+        layout = (
+            f"{kernel.LAYOUT} {VERSION} {target.visibility.sided} {params.starts}"
+            f" {limits.gate_m.hex()}"
+        )
+        path = index_cache.cache_path(
+            folder, layout, surface.vertices, surface.faces, limits.reach_m
+        )
     kept = index_cache.read_arrays(path, kernel.checksum)
     known = len(kept)
     search = Search(target, params, kept)

@@ -1,4 +1,7 @@
-"""Points of a surface and parts of a scan: evenly distributed, on a surface, and such as may be the target."""
+"""Points of a surface and parts of a scan.
+
+Evenly distributed, on a surface, and such as may be the target.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,34 @@ from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
 from avsreplay.register.surface_index import kernel_module
 
-CLOUD_POINTS = 20  # factor: the points of a cloud are first thinned evenly to this many times the number needed
+# factor: the points of a cloud are first thinned evenly to this many times the number needed
+CLOUD_POINTS = 20
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
 STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
-R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
+R2 = np.array(
+    [0.7548776662466927, 0.5698402909980532]
+)  # plastic-number sequence: low discrepancy in the unit square
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
-NEIGHBOUR, TESTED = 8, 200  # neighbour whose distance counts; points that show whether any are scattered
-EMPTY, SPACED = 2.5, 125  # for the density of rays; no ray within so many spacings: nothing was measured
-AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
-SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
+NEIGHBOUR, TESTED = (
+    8,
+    200,
+)  # neighbour whose distance counts; points that show whether any are scattered
+EMPTY, SPACED = (
+    2.5,
+    125,
+)  # for the density of rays; no ray within so many spacings: nothing was measured
+AMONG, SURROUNDED = (
+    4,
+    2.0,
+)  # nearest rays, all of them within so many spacings: not beyond the border of the scan
+# distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
+SCATTERED = 2.0
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
-BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
-PARTIAL = 0.85  # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
+BIMODAL = (
+    2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
+)
+# a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
+PARTIAL = 0.85
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
 GROUPED = 3000  # points of a scan in which connected groups are looked for
 MOST_SEGMENTS = 3
@@ -46,8 +65,11 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
     return sample_faces(surface.vertices, surface.faces, count)[:2]
 
 
-def sample_faces(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return ``count`` points of a mesh, uniform by area, the normals of their faces, (n, 3) each, and the faces (n,).
+def sample_faces(
+    vertices: Array, faces: NDArray[np.int32], count: int
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return ``count`` points of a mesh, uniform by area, the normals of their faces, (n, 3) each,
+    and the faces (n,).
 
     Args:
         vertices: (n, 3) [m].
@@ -68,7 +90,10 @@ def sample_faces(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple
 
 
 def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:
-    """Return about ``count`` points and normals as :func:`sample`; the points of a cloud are thinned to this number."""
+    """Return about ``count`` points and normals as :func:`sample`.
+
+    The points of a cloud are thinned to this number.
+    """
     points, normals = sample(surface, count)
     if len(surface.faces):
         return points, normals
@@ -77,11 +102,16 @@ def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:
 
 
 def attitudes(count: int) -> Array:
-    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations: super-Fibonacci spiral (Alexa 2022)."""
+    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations.
+
+    Super-Fibonacci spiral (Alexa 2022).
+    """
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
     a, b = 2.0 * np.pi * s / np.sqrt(2.0), 2.0 * np.pi * s / PSI
-    return np.stack([inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=1)
+    return np.stack(
+        [inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=1
+    )
 
 
 def directions(count: int) -> Array:
@@ -93,7 +123,9 @@ def directions(count: int) -> Array:
 
 
 def thin(points: Array, voxel_m: float) -> Array:
-    """Return the first point of every occupied voxel of this size, in scan order. (n, 3) -> (k, 3)."""
+    """Return the first point of every occupied voxel of this size, in scan order. (n, 3) ->
+    (k, 3).
+    """
     if len(points) == 0:
         return points
     cells = np.floor(points / voxel_m).astype(np.int64)
@@ -102,14 +134,19 @@ def thin(points: Array, voxel_m: float) -> Array:
 
 
 def usable_points(points: NDArray[Any], voxel_m: float) -> NDArray[Any]:
-    """Return the points (n, 3) that are finite, thinned by voxels of this size where it is above 0."""
+    """Return the points (n, 3) that are finite, thinned by voxels of this size where it is
+    above 0.
+    """
     known = np.isfinite(points)
     scan = points if known.all() else points[known.all(axis=1)]
     return thin(scan, voxel_m) if voxel_m > 0.0 else scan
 
 
 def thin_to(points: Array, count: int) -> Array:
-    """Return about ``count`` of the points: the first of every voxel, whose size is found iteratively."""
+    """Return about ``count`` of the points.
+
+    The first of every voxel, whose size is found iteratively.
+    """
     if len(points) <= count:
         return points
     voxel = max(3.0 * _spread(points) / np.sqrt(count), np.finfo(float).tiny)
@@ -122,10 +159,12 @@ def thin_to(points: Array, count: int) -> Array:
 
 
 def without_sparse_points(points: Array) -> Array:
-    """Return the points in voxels that hold at least 0.15 of the number that the median point has in its voxel.
+    """Return the points in voxels that hold at least 0.15 of the number that the median point has
+    in its voxel.
 
-    A single outlier far from everything would occupy a voxel of its own and, after thinning by voxels, weigh as much as
-    a piece of surface. About 150 voxels cover the scan; a scan with fewer than ten points per voxel is not changed.
+    A single outlier far from everything would occupy a voxel of its own and, after thinning by
+    voxels, weigh as much as a piece of surface. About 150 voxels cover the scan; a scan with fewer
+    than ten points per voxel is not changed.
     """
     if len(points) < STRAY_VOXELS * STRAY_POINTS:
         return points
@@ -138,10 +177,15 @@ def _spread(points: Array) -> float:
     return float(np.sqrt(np.median(np.sum((points - np.median(points, axis=0)) ** 2, axis=1))))
 
 
-def _voxels(points: Array, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """First point of every occupied voxel, the voxel of every point, and the number of points in each voxel."""
+def _voxels(
+    points: Array, voxel_m: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """First point of every occupied voxel, the voxel of every point, and the number of points in
+    each voxel.
+    """
     found: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]] = kernel_module().voxels(
-        np.subtract(points, points.min(axis=0), dtype=np.float64), max(voxel_m, np.finfo(float).tiny)
+        np.subtract(points, points.min(axis=0), dtype=np.float64),
+        max(voxel_m, np.finfo(float).tiny),
     )
     return found
 
@@ -163,13 +207,16 @@ def at_instant(points: Array, times_s: NDArray[Any], rate: Array, velocity: Arra
 def without_scattered_points(points: Array) -> Array:
     """Return the points that lie on a surface, if the scan has many that do not; (n, 3) -> (k, 3).
 
-    The distance to the eighth neighbour is small on a surface and large among outliers spread over a volume.
+    The distance to the eighth neighbour is small on a surface and large among outliers spread over
+    a volume.
     """
     if len(points) < 10 * NEIGHBOUR:
         return points
     points = np.ascontiguousarray(points, dtype=np.float64)
     tree = kernel_module().PointTree(points)
-    few: Array = tree.query(points[:: max(1, len(points) // TESTED)].copy(), k=NEIGHBOUR + 1)[0][:, -1]
+    few: Array = tree.query(points[:: max(1, len(points) // TESTED)].copy(), k=NEIGHBOUR + 1)[0][
+        :, -1
+    ]
     low, high = np.quantile(few, [0.25, 0.75])
     if high < BIMODAL * low:
         return points
@@ -178,13 +225,19 @@ def without_scattered_points(points: Array) -> Array:
 
 
 def scan_axes(points: Array) -> list[Array]:
-    """Return both directions of each principal axis of points (n, 3); without axes, those of the frame."""
+    """Return both directions of each principal axis of points (n, 3).
+
+    Without axes, those of the frame.
+    """
     axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
     return [*axes, *-axes]
 
 
-def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Iterator[tuple[Array, int]]:
-    """Yield what is searched and by which round of the search: the whole scan, its parts, then with other starts.
+def attempts(
+    target: Array, extent_m: float, found: Callable[[], bool]
+) -> Iterator[tuple[Array, int]]:
+    """Yield what is searched and by which round of the search: the whole scan, its parts, then with
+    other starts.
 
     Args:
         target: (n, 3) the scan without scattered points.
@@ -192,7 +245,9 @@ def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Itera
         found: whether the first round gave a plausible pose.
     """
     size = geometry.bounding_diagonal(target)
-    first, next_one = (1, 0) if size < PARTIAL * extent_m else (0, 1)  # a part of the target is not at its centroid
+    first, next_one = (
+        (1, 0) if size < PARTIAL * extent_m else (0, 1)
+    )  # a part of the target is not at its centroid
     yield target, first
     small = size <= LARGER * extent_m or found()  # probably the target alone
     if small:
@@ -205,9 +260,11 @@ def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Itera
 
 
 def segments(points: Array, extent_m: float) -> Iterator[Array]:
-    """Yield the parts of a scan (n, 3) that may be the target, the largest first; none if the scan is one such part.
+    """Yield the parts of a scan (n, 3) that may be the target, the largest first; none if the scan
+    is one such part.
 
-    Connected parts of the scan; parts larger than the target are split by leaving out their largest planes.
+    Connected parts of the scan; parts larger than the target are split by leaving out their largest
+    planes.
     """
     least = max(LEAST_POINTS, int(LEAST_SHARE * len(points)))
     parts = list(_small_parts(points, extent_m, least, PLANES))
@@ -240,7 +297,10 @@ def _connected(points: Array, voxel_m: float) -> Iterator[Array]:
 
 
 def _without_plane(points: Array, width_m: float) -> Array:
-    """The points off the plane that holds most of them; all if no plane holds ``PLANE_SHARE``. Seeded RANSAC."""
+    """The points off the plane that holds most of them; all if no plane holds ``PLANE_SHARE``.
+
+    Seeded RANSAC.
+    """
     rng = np.random.Generator(np.random.PCG64(0))
     few = points[:: max(1, len(points) // PLANE_POINTS)]
     triples = few[rng.integers(len(few), size=(TRIALS, 3))]
@@ -281,7 +341,9 @@ def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
     return float(np.linalg.norm(points - second, axis=1).max())
 
 
-def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float], gap: float = 0.1) -> Array | None:
+def part_of_size(
+    points: NDArray[Any], size_m: float, share: tuple[float, float], gap: float = 0.1
+) -> Array | None:
     """Return the largest connected group of points with the size of the model.
 
     Args:
@@ -291,12 +353,17 @@ def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float]
         gap: largest distance over ``size_m`` between neighbours of one group.
 
     Returns:
-        The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the size.
+        The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the
+        size.
     """
     few = np.array(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64, order="C")
     member = kernel_module().PointTree(few).groups(gap * size_m)
-    groups = [few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))]
-    fitting = [group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]]
+    groups = [
+        few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))
+    ]
+    fitting = [
+        group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]
+    ]
     return max(fitting, key=len, default=None)
 
 
@@ -327,15 +394,21 @@ class Rays:
         if self.tree is None:
             return np.inf
         stride = max(1, len(self.points) // SPACED)
-        apart = self.tree.query(self.points[::stride] / self.ranges[::stride, None], k=NEIGHBOUR + 1)[0][:, -1]
+        apart = self.tree.query(
+            self.points[::stride] / self.ranges[::stride, None], k=NEIGHBOUR + 1
+        )[0][:, -1]
         return float(np.median(apart) * np.sqrt(np.pi / NEIGHBOUR))
 
-    def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return through which points (k, 3) in {A} rays passed, and which are in directions without rays.
+    def through(
+        self, points: Array, behind_m: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return through which points (k, 3) in {A} rays passed, and which are in directions
+        without rays.
 
         Args:
             points: where the model should be.
-            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind, and all are near.
+            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind,
+                and all are near.
         """
         far = np.linalg.norm(points, axis=1)
         if not len(points) or self.tree is None:

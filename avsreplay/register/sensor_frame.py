@@ -1,8 +1,9 @@
 """Registration in the frame of the sensor, for scans that were transformed to a fixed frame.
 
-The facing test, the search without a guess and the test of free space take the origin of the points as the position of
-the sensor. A fixed frame may have its origin anywhere, so that a scan is registered in the sensor's own frame, and its
-pose is transformed. The covariance is that of d in {C} and does not change.
+The facing test, the search without a guess and the test of free space take the origin of the points
+as the position of the sensor. A fixed frame may have its origin anywhere, so that a scan is
+registered in the sensor's own frame, and its pose is transformed. The covariance is that of d in
+{C} and does not change.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ class SensorFrame:
         if self.sensor is None:
             return self.registrar.register(points, guess, *more)
         T_sa = self.sensor.inverse()
-        return self._in_a(self.registrar.register(T_sa.apply(points), T_sa @ guess, *more), self.sensor)
+        return self._in_a(
+            self.registrar.register(T_sa.apply(points), T_sa @ guess, *more), self.sensor
+        )
 
     def acquire(self, points: NDArray[Any], *more: Any) -> Alignment:
         """Find the pose without a guess, as ``Registrar.acquire`` does.
@@ -58,7 +61,9 @@ class SensorFrame:
         """
         if self.sensor is None:
             return self.registrar.acquire(points, *more)
-        return self._in_a(self.registrar.acquire(self.sensor.inverse().apply(points), *more), self.sensor)
+        return self._in_a(
+            self.registrar.acquire(self.sensor.inverse().apply(points), *more), self.sensor
+        )
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, as ``Registrar.instants`` does.

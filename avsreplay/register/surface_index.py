@@ -1,17 +1,16 @@
 """Exact closest points on the target model, and the ICP loop and normal equations that use them.
 
-The work is done by the C++ extension ``_kernel``; this module checks the input and names the results. An index is built
-once for one maximum distance and is read-only afterwards.
+The work is done by the C++ extension ``_kernel``; this module checks the input and names the
+results. An index is built once for one maximum distance and is read-only afterwards.
 
-Closest point
-    The nearest point of the surface to a query point: on a face, an edge or a vertex. A query at ``reach_m`` or farther
-    from the surface has none: id -1, d2 inf, foot and normal NaN.
-Ties
-    Among faces at the same distance (to 1e-10, on edges and vertices) the face whose plane is farthest from the query
-    point is chosen, then the lower index. Among points of a cloud the lower index is chosen.
-Normal
-    The face normal by the right-hand rule of the chosen triangle, also on an edge or a vertex. For a point cloud: the
-    eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points, with any sign.
+Closest point The nearest point of the surface to a query point: on a face, an edge or a vertex. A
+    query at ``reach_m`` or farther from the surface has none: id -1, d2 inf, foot and normal NaN.
+Ties Among faces at the same distance (to 1e-10, on edges and vertices) the face whose plane is
+    farthest from the query point is chosen, then the lower index. Among points of a cloud the lower
+    index is chosen.
+Normal The face normal by the right-hand rule of the chosen triangle, also on an edge or a vertex.
+    For a point cloud: the eigenvector of the smallest eigenvalue of the scatter of the 10 nearest
+    points, with any sign.
 """
 
 from __future__ import annotations
@@ -30,7 +29,10 @@ from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.settings import Settings, setting
 
-LARGEST_M, LARGEST_REACH = 1e9, 1e5  # largest coordinate [m], and largest reach in units of the model's extent
+LARGEST_M, LARGEST_REACH = (
+    1e9,
+    1e5,
+)  # largest coordinate [m], and largest reach in units of the model's extent
 MOST_PRIMITIVES = 50_000_000
 
 
@@ -38,27 +40,48 @@ MOST_PRIMITIVES = 50_000_000
 class IcpParams(Settings):
     """Parameters of the ICP loop.
 
-    Rejection rule: a point is used while its distance to the surface is below the gate; after each pass
-    gate = min(gate, max(floor_m, tighten * rms of that pass)), so the gate never grows. ``tighten`` 0: constant gate.
-    Stopping rule: Horn's step (point to point) of a pass rotates by less than ``eps_rad`` and moves the centroid of the
-    inliers by less than ``eps_m``, the gate changed by less than 1 %, and with ``newton`` Newton's step is as small.
+    Rejection rule: a point is used while its distance to the surface is below the gate; after each
+    pass gate = min(gate, max(floor_m, tighten * rms of that pass)), so the gate never grows.
+    ``tighten`` 0: constant gate. Stopping rule: Horn's step (point to point) of a pass rotates by
+    less than ``eps_rad`` and moves the centroid of the inliers by less than ``eps_m``, the gate
+    changed by less than 1 %, and with ``newton`` Newton's step is as small.
     """
 
     n_max: int = setting(100, "Largest number of passes of both kinds.", low=1)
     n_plane: int = setting(3, "Largest number of point-to-plane passes before Horn's.", low=0)
     newton: bool = setting(True, "Take Newton steps towards the fixed point of Horn's iteration.")
-    gate_m: float | None = setting(None, "First rejection distance.", unit="m", low=0.0, unset="the reach of the index")
-    tighten: float = setting(3.0, "Gate in units of the rms of the last pass; 0 keeps it constant.", low=0.0)
-    floor_m: float | None = setting(None, "Smallest gate.", unit="m", low=0.0, unset="1/500 of the model's extent")
+    gate_m: float | None = setting(
+        None, "First rejection distance.", unit="m", low=0.0, unset="the reach of the index"
+    )
+    tighten: float = setting(
+        3.0, "Gate in units of the rms of the last pass; 0 keeps it constant.", low=0.0
+    )
+    floor_m: float | None = setting(
+        None, "Smallest gate.", unit="m", low=0.0, unset="1/500 of the model's extent"
+    )
     eps_rad: float = setting(1e-5, "Stopping rule: rotation of the last step.", unit="rad", low=0.0)
     eps_m: float | None = setting(
-        None, "Stopping rule: displacement of the inliers' centroid.", unit="m", low=0.0, of_extent=1e-6
+        None,
+        "Stopping rule: displacement of the inliers' centroid.",
+        unit="m",
+        low=0.0,
+        of_extent=1e-6,
     )
-    threads: int = setting(1, "Largest number of threads; no result depends on it.", low=1, high=1024)
-    facing: bool = setting(False, "Match only faces that face the camera (origin of {A}); needs outward faces.")
-    few: int = setting(0, "Points of the scan with which a much larger scan is aligned first; 0: none.", low=0)
-    poor_m: float = setting(0.0, "End with them where their rms is larger, and few are off.", unit="m", low=0.0)
-    keep: bool = setting(True, "Keep a correspondence while it provably cannot change; does not change a result.")
+    threads: int = setting(
+        1, "Largest number of threads; no result depends on it.", low=1, high=1024
+    )
+    facing: bool = setting(
+        False, "Match only faces that face the camera (origin of {A}); needs outward faces."
+    )
+    few: int = setting(
+        0, "Points of the scan with which a much larger scan is aligned first; 0: none.", low=0
+    )
+    poor_m: float = setting(
+        0.0, "End with them where their rms is larger, and few are off.", unit="m", low=0.0
+    )
+    keep: bool = setting(
+        True, "Keep a correspondence while it provably cannot change; does not change a result."
+    )
 
     def check(self) -> None:
         """Raise ValueError where ``n_plane`` exceeds ``n_max``."""
@@ -68,7 +91,10 @@ class IcpParams(Settings):
 
 @value_class
 class Closest:
-    """Closest points of n queries: foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,) face or point, normal."""
+    """Closest points of n queries.
+
+    Foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,) face or point, normal.
+    """
 
     foot: Array
     d2: Array
@@ -82,11 +108,17 @@ class IcpResult:
 
     Attributes:
         T_ca: (4, 4) scan {A} into model {C}.
-        iterations: passes over all points; those over a part count as its share of the points, rounded up together.
-        converged: the stopping rule held before n_max.  inliers, rms_m: of the last pass, before its step.
-        gate_m: rejection distance after the last pass.  step_rad, step_m: the last step.  ignored: points not finite.
-        searched: neighbour searches made over all passes.  work: of all passes, counted in ordinary searches.
-        matches: opaque; shortens :meth:`SurfaceIndex.evidence` of the same points. None: it ended with a part of them.
+        iterations: passes over all points; those over a part count as its share of the points,
+            rounded up together.
+        converged: the stopping rule held before n_max.
+        inliers, rms_m: of the last pass, before its step.
+        gate_m: rejection distance after the last pass.
+        step_rad, step_m: the last step.
+        ignored: points not finite.
+        searched: neighbour searches made over all passes.
+        work: of all passes, counted in ordinary searches.
+        matches: opaque; shortens :meth:`SurfaceIndex.evidence` of the same points. None: it ended
+            with a part of them.
     """
 
     T_ca: Array
@@ -110,8 +142,11 @@ class NormalEquations:
     With p_c = T_ca p_a, e = n . (foot - p_c) and J = de/dd = [p_c x n, n].
 
     Attributes:
-        info: (6, 6) sum J'J, not divided by the variance of the noise.  gradient: (6,) sum J'e.
-        inliers: points nearer than the gate.  points: finite points.  ignored: points that are not finite.
+        info: (6, 6) sum J'J, not divided by the variance of the noise.
+        gradient: (6,) sum J'e.
+        inliers: points nearer than the gate.
+        points: finite points.
+        ignored: points that are not finite.
         sum_e2, sum_d2: sums of e^2 and of the squared distances to the closest points [m^2].
     """
 
@@ -126,14 +161,20 @@ class NormalEquations:
 
 @value_class
 class PatchSums:
-    """Sums over the inliers at a pose by patches of the model, with J and e as in :class:`NormalEquations`, e negated.
+    """Sums over the inliers at a pose by patches of the model, with J and e as in
+    :class:`NormalEquations`, e negated.
 
     Attributes:
-        points: of the scan, also those that are not finite.  inliers: points nearer than the gate.
-        sum_d2: sum of the squared distances to the closest points [m^2].  median_m: median of |e| [m].
-        centre: (3,) centroid of the inliers in {C} [m].  counts: (m,) inliers of each patch.
-        normals: (m, 6, 6) sums of J'J.  gradients: (m, 6) sums of e J with e = n . (p_c - foot).
-        offsets, errors, places: sums of J (m, 6) and of e (m,), and the centroid (m, 3) of each patch.
+        points: of the scan, also those that are not finite.
+        inliers: points nearer than the gate.
+        sum_d2: sum of the squared distances to the closest points [m^2].
+        median_m: median of |e| [m].
+        centre: (3,) centroid of the inliers in {C} [m].
+        counts: (m,) inliers of each patch.
+        normals: (m, 6, 6) sums of J'J.
+        gradients: (m, 6) sums of e J with e = n . (p_c - foot).
+        offsets, errors, places: sums of J (m, 6) and of e (m,), and the centroid (m, 3) of each
+            patch.
     """
 
     points: int
@@ -151,12 +192,15 @@ class PatchSums:
 
 @value_class
 class SurfaceIndex:
-    """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by threads.
+    """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by
+    threads.
 
     Attributes:
         reach_m: no closest point is searched at this distance or farther.
         extent_m: diagonal of the bounding box of the surface.
-        primitives: triangles or points in the index.  dropped: triangles without area.  restored: read from the cache.
+        primitives: triangles or points in the index.
+        dropped: triangles without area.
+        restored: read from the cache.
     """
 
     reach_m: float
@@ -182,23 +226,38 @@ class SurfaceIndex:
             surface: mesh or point cloud, vertices in {C} [m].
             reach_m: largest distance at which a closest point is searched [m].
             threads: threads that build the index; the result does not depend on it.
-            portable: use only the instructions that every processor of this kind has; the results are identical.
-            cache_dir: folder in which the index is looked up and, where possible, saved under the hash of the surface.
+            portable: use only the instructions that every processor of this kind has; the results
+                are identical.
+            cache_dir: folder in which the index is looked up and, where possible, saved under the
+                hash of the surface.
 
         Raises:
-            UsageError: a surface with no primitive, too many or too large a surface, a coordinate that is not finite,
-                a face that refers to a missing vertex, or a reach that is not positive.
+            UsageError: a surface with no primitive, too many or too large a surface, a coordinate
+                that is not finite, a face that refers to a missing vertex, or a reach that is not
+                positive.
             MissingBackend: the C++ extension is not built.
         """
         vertices, faces = _checked(surface, reach_m)
         kernel = kernel_module()
-        path = None if cache_dir is None else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
-        index = None if path is None else _restored(kernel, path, len(faces) or len(vertices), len(faces) > 0, portable)
+        path = (
+            None
+            if cache_dir is None
+            else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
+        )
+        index = (
+            None
+            if path is None
+            else _restored(kernel, path, len(faces) or len(vertices), len(faces) > 0, portable)
+        )
         restored = index is not None
         if index is None:
             kept = mesh.numbers_with_area(vertices, faces)
             if len(faces) and not len(kept):
-                raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
+                raise UsageError(
+                    "no face has an area",
+                    where=surface.name,
+                    hint="give a mesh with proper triangles",
+                )
             index = kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
             if path is not None:
                 index_cache.write(path, index.save(), kernel.checksum)
@@ -211,31 +270,51 @@ class SurfaceIndex:
         return int(self._index.nbytes)
 
     def closest(
-        self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None, most_m: float = np.inf
+        self,
+        points: NDArray[Any],
+        *,
+        threads: int = 1,
+        camera_c: ArrayLike | None = None,
+        most_m: float = np.inf,
     ) -> Closest:
-        """Closest points of ``points`` (n, 3) [m] in {C}; one that is not finite, or ``most_m`` [m] away, has none.
+        """Closest points of ``points`` (n, 3) [m] in {C}; one that is not finite, or ``most_m`` [m]
+        away, has none.
 
-        With ``camera_c`` (3,) [m] only faces that face this position are searched; a point cloud is searched whole.
+        With ``camera_c`` (3,) [m] only faces that face this position are searched; a point cloud is
+        searched whole.
         """
         camera = None if camera_c is None else tuple(float(x) for x in np.reshape(camera_c, 3))
         return Closest(*self._index.closest(_points(points), threads, camera, most_m))
 
     def icp(
-        self, points: NDArray[Any], T_ca: Any, params: IcpParams | None = None, most_work: int = 2**62
+        self,
+        points: NDArray[Any],
+        T_ca: Any,
+        params: IcpParams | None = None,
+        most_work: int = 2**62,
     ) -> IcpResult:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
 
-        Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point iteration (eq:ICP), a
-        stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. At
-        the last pass, over all points, the steps of Horn and of Newton are both within the stopping rule, and Newton's
-        is made. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
+        Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point
+        iteration (eq:ICP), a stationary point of the sum of squared distances. A Newton step that
+        raises the sum is replaced by Horn's. At the last pass, over all points, the steps of Horn
+        and of Newton are both within the stopping rule, and Newton's is made. With fewer than 6
+        inliers, or after ``most_work``, it ends, not converged.
         """
         params = params or IcpParams()
         gate = min(self.reach_m, self.reach_m if params.gate_m is None else params.gate_m)
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        flags = (params.threads, params.keep, params.facing, params.newton, params.few, most_work, params.poor_m)
+        flags = (
+            params.threads,
+            params.keep,
+            params.facing,
+            params.newton,
+            params.few,
+            most_work,
+            params.poor_m,
+        )
         return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
 
     def normal_equations(
@@ -247,9 +326,14 @@ class SurfaceIndex:
         threads: int = 1,
         facing: bool = False,
     ) -> NormalEquations:
-        """Point-to-plane sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4); ``facing``: as in :class:`IcpParams`."""
+        """Point-to-plane sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4); ``facing``.
+
+        As in :class:`IcpParams`.
+        """
         gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
-        return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing))
+        return NormalEquations(
+            *self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing)
+        )
 
     def evidence(
         self,
@@ -265,34 +349,57 @@ class SurfaceIndex:
     ) -> PatchSums:
         """Return sums over the inliers of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
 
-        A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most ``least_patches`` occupied cubes
-        each point is a patch. ``facing``: as in :class:`IcpParams`. ``matches``: of an alignment of the same points.
+        A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most
+        ``least_patches`` occupied cubes each point is a patch. ``facing``: as in
+        :class:`IcpParams`. ``matches``: of an alignment of the same points.
         """
         rule = (min(gate_m, self.reach_m), patch_m, least_patches, facing, threads, matches)
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
     def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
-        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in ``kernel/grade.hpp``."""
+        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``.
+
+        As in ``kernel/grade.hpp``.
+        """
         return tuple(self._index.grade(_points(points), T_ca.matrix, *rule))
 
-    def distances(self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any) -> tuple[Array, int]:
-        """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``: ``kernel/evidence.hpp``."""
-        at, work = self._index.distances(_points(points), T_ca.matrix, min(most_m, self.reach_m), *sight)
+    def distances(
+        self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any
+    ) -> tuple[Array, int]:
+        """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``.
+
+        ``kernel/evidence.hpp``.
+        """
+        at, work = self._index.distances(
+            _points(points), T_ca.matrix, min(most_m, self.reach_m), *sight
+        )
         return at, work
 
     def cast(self, eye_c: Array, directions: Array) -> tuple[Array, int]:
-        """Ranges (n,) [m] of the first faces of a mesh on rays (n, 3) from ``eye_c`` (3,), inf: none; and the work."""
+        """Ranges (n,) [m] of the first faces of a mesh on rays (n, 3) from ``eye_c`` (3,), inf.
+
+        None; and the work.
+        """
         ranges, work = self._index.cast(eye_c.tolist(), np.ascontiguousarray(directions))
         return ranges, work
 
-    def size_step(self, points: Array, camera_c: Array | None, *rule: Any) -> tuple[float, Array, Array] | None:
-        """Step of the size, pose d (6,) about a centre (3,), that (n, 3) in {C} ask for; see ``kernel/size.hpp``."""
+    def size_step(
+        self, points: Array, camera_c: Array | None, *rule: Any
+    ) -> tuple[float, Array, Array] | None:
+        """Step of the size, pose d (6,) about a centre (3,), that (n, 3) in {C} ask for.
+
+        See ``kernel/size.hpp``.
+        """
         camera = None if camera_c is None else tuple(float(x) for x in camera_c)
-        step: tuple[float, Array, Array] | None = self._index.size_step(np.ascontiguousarray(points), camera, *rule)
+        step: tuple[float, Array, Array] | None = self._index.size_step(
+            np.ascontiguousarray(points), camera, *rule
+        )
         return step
 
     def faces_camera(self, points: NDArray[Any], T_ca: Pose, tested: int, least: float) -> bool:
-        """Return whether at least a share of the faces closest to about ``tested`` points (n, 3) face the camera."""
+        """Return whether at least a share of the faces closest to about ``tested`` points (n, 3)
+        face the camera.
+        """
         return bool(self._index.faces_camera(_points(points), T_ca.matrix, tested, least))
 
 
@@ -302,7 +409,9 @@ def kernel_module() -> Any:
         from avsreplay.register import _kernel
     except ImportError:
         hint = "run 'pip install .' in the source folder (needs a C++17 compiler)"
-        raise MissingBackend("the C++ extension is not built", where="avsreplay.register._kernel", hint=hint) from None
+        raise MissingBackend(
+            "the C++ extension is not built", where="avsreplay.register._kernel", hint=hint
+        ) from None
     return _kernel
 
 
@@ -332,10 +441,15 @@ def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]
         what = "has a coordinate that is not finite" if len(vertices) else "has no point"
         raise UsageError(f"the model {what}", where=surface.name, hint="repair the model")
     if not (most := LARGEST_REACH * (surface.extent or 1.0)) >= reach_m > 0.0:
-        raise UsageError(f"reach is {reach_m:g} m, must be above 0 and at most {most:g} m", where="register.reach_m")
+        raise UsageError(
+            f"reach is {reach_m:g} m, must be above 0 and at most {most:g} m",
+            where="register.reach_m",
+        )
     _check_size(surface, vertices, faces)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise UsageError("a face refers to a missing vertex", where=surface.name, hint="repair the model")
+        raise UsageError(
+            "a face refers to a missing vertex", where=surface.name, hint="repair the model"
+        )
     return vertices, faces
 
 
@@ -344,7 +458,12 @@ def _check_size(surface: Surface, vertices: Array, faces: NDArray[np.int32]) -> 
     largest = float(np.abs(vertices).max())
     if largest > LARGEST_M:
         hint = "remove stray vertices, or scale the model to metres"
-        raise UsageError(f"a coordinate of {largest:.3g} m is too large", where=surface.name, hint=hint)
+        raise UsageError(
+            f"a coordinate of {largest:.3g} m is too large", where=surface.name, hint=hint
+        )
     if max(len(vertices), len(faces)) > MOST_PRIMITIVES:
-        what = f"{len(vertices)} vertices and {len(faces)} faces are more than the limit of {MOST_PRIMITIVES}"
+        what = (
+            f"{len(vertices)} vertices and {len(faces)} faces are more than the limit of"
+            f" {MOST_PRIMITIVES}"
+        )
         raise UsageError(what, where=surface.name, hint="simplify the model")

@@ -1,8 +1,10 @@
-"""The motions that carry most of a model onto itself: turns about an axis, a finite group, or single ones.
+"""The motions that carry most of a model onto itself: turns about an axis, a finite group, or
+single ones.
 
-A body of revolution has any turn about its axis. The turns of a gear carry its teeth onto one another, and between them
-the rest of it is on itself as well. They are the least distances along a fine circle of turns. Other bodies have a
-finite group, which the products of a few motions give, or single motions.
+A body of revolution has any turn about its axis. The turns of a gear carry its teeth onto one
+another, and between them the rest of it is on itself as well. They are the least distances along a
+fine circle of turns. Other bodies have a finite group, which the products of a few motions give, or
+single motions.
 """
 
 from __future__ import annotations
@@ -19,14 +21,34 @@ from avsreplay.register.global_search import SYMMETRIC, SYMMETRIES, GlobalSearch
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import SurfaceIndex
 
-TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; to recognise the axis
-REVOLVED, FITS, LEAST_FITTED = 0.02, 2, 60  # distance of turned surface on the model [extent]; fits of the axis, points
-AXIS_STRIDE, GROUP_STRIDE, CIRCLE_STRIDE = 3, 40, 20  # every n-th point for the axis, a product, the circle of turns
+TURNS, GENERIC_TURNS = (
+    72,
+    (5, 11, 23, 31, 43, 59),
+)  # about an axis of revolution; to recognise the axis
+REVOLVED, FITS, LEAST_FITTED = (
+    0.02,
+    2,
+    60,
+)  # distance of turned surface on the model [extent]; fits of the axis, points
+AXIS_STRIDE, GROUP_STRIDE, CIRCLE_STRIDE = (
+    3,
+    40,
+    20,
+)  # every n-th point for the axis, a product, the circle of turns
 FINALISTS = 2  # poses of each kind of motion that are refined; kinds of single motions
-CIRCLE, LOW = 360, 0.75  # turns along the circle; largest cost at the teeth of a gear over the median cost
-LEAST_COST, LEAST_TEETH = 0.02, 5  # median cost, below which a body is one of revolution; fewest teeth
+CIRCLE, LOW = (
+    360,
+    0.75,
+)  # turns along the circle; largest cost at the teeth of a gear over the median cost
+LEAST_COST, LEAST_TEETH = (
+    0.02,
+    5,
+)  # median cost, below which a body is one of revolution; fewest teeth
 PRODUCTS, ROUNDS = 96, 4  # most motions of a finite group, and rounds of products
-WIDTH_OF_EXTENT, DIFFERENT_RAD = 0.03, np.radians(3.0)  # distance beyond which a point is not carried onto the surface
+WIDTH_OF_EXTENT, DIFFERENT_RAD = (
+    0.03,
+    np.radians(3.0),
+)  # distance beyond which a point is not carried onto the surface
 
 
 @value_class
@@ -45,7 +67,9 @@ class Symmetries:
 NONE = Symmetries((), np.inf)
 
 
-def near_symmetries(search: GlobalSearch, index: SurfaceIndex, points: Array, normals: Array) -> Symmetries:
+def near_symmetries(
+    search: GlobalSearch, index: SurfaceIndex, points: Array, normals: Array
+) -> Symmetries:
     """Return the near-symmetries of a model.
 
     Args:
@@ -58,17 +82,25 @@ def near_symmetries(search: GlobalSearch, index: SurfaceIndex, points: Array, no
     if not len(found):
         return NONE
     on_axis = (points[::AXIS_STRIDE], normals[::AXIS_STRIDE])
-    axis = _axis(index, *on_axis, 0.5) or next(_axes_of(index, on_axis[0], found), None) or _axis(index, *on_axis, 0.0)
+    axis = (
+        _axis(index, *on_axis, 0.5)
+        or next(_axes_of(index, on_axis[0], found), None)
+        or _axis(index, *on_axis, 0.0)
+    )
     if axis is not None:
         turns, least = _turns(index, points[::CIRCLE_STRIDE], *axis)
         flips = [T for T in found if axis[0] @ T[:3, :3] @ axis[0] < -0.9]
         return Symmetries((turns[1:], *(turns @ flip for flip in flips[:1])), least)
-    group = _group(search, index, points[::GROUP_STRIDE], found) if len(found) == SYMMETRIES else found
+    group = (
+        _group(search, index, points[::GROUP_STRIDE], found) if len(found) == SYMMETRIES else found
+    )
     return Symmetries(tuple(group[k::FINALISTS] for k in range(min(FINALISTS, len(group)))), np.inf)
 
 
 def distances(index: SurfaceIndex, points: Array, motions: Array, most_m: float) -> Array:
-    """Return the distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most ``most_m`` and the reach."""
+    """Return the distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most
+    ``most_m`` and the reach.
+    """
     moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
     most_m = min(most_m, index.reach_m)
     d2 = index.closest(moved.reshape(-1, 3), most_m=most_m).d2
@@ -76,7 +108,10 @@ def distances(index: SurfaceIndex, points: Array, motions: Array, most_m: float)
 
 
 def revolved(axis: Array, centre: Array, count: int) -> Array:
-    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}; the first is the identity."""
+    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}.
+
+    The first is the identity.
+    """
     R = geometry.matrix(geometry.exp(2.0 * np.pi / count * np.arange(count)[:, None] * axis))
     T = np.tile(np.eye(4), (count, 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R, centre - R @ centre
@@ -84,7 +119,8 @@ def revolved(axis: Array, centre: Array, count: int) -> Array:
 
 
 def _group(search: GlobalSearch, index: SurfaceIndex, points: Array, found: Array) -> Array:
-    """The finite group, without the identity, that motions (k, 4, 4) generate; themselves if it is too large.
+    """The finite group, without the identity, that motions (k, 4, 4) generate; themselves if it is
+    too large.
 
     Each product is registered, so that errors do not add up.
     """
@@ -116,10 +152,14 @@ def _among(T: Array, others: list[Array]) -> bool:
     return bool((trace > 1.0 + 2.0 * np.cos(DIFFERENT_RAD)).any())
 
 
-def _axis(index: SurfaceIndex, points: Array, normals: Array, least: float) -> tuple[Array, Array] | None:
-    """Direction and a point of the axis about which most of the surface is a surface of revolution, or None.
+def _axis(
+    index: SurfaceIndex, points: Array, normals: Array, least: float
+) -> tuple[Array, Array] | None:
+    """Direction and a point of the axis about which most of the surface is a surface of revolution,
+    or None.
 
-    Large marks displace the first fit, after which a smaller share of the surface, ``least``, leads to the next one.
+    Large marks displace the first fit, after which a smaller share of the surface, ``least``, leads
+    to the next one.
     """
     on = np.ones(len(points), dtype=bool)
     for _ in range(FITS):
@@ -157,8 +197,13 @@ def _revolved(index: SurfaceIndex, points: Array, direction: Array, centre: Arra
     return np.asarray(np.all(distances(index, points, turns, width) < width, axis=0))
 
 
-def _turns(index: SurfaceIndex, points: Array, direction: Array, centre: Array) -> tuple[Array, float]:
-    """The turns (k, 4, 4) about an axis, the identity first: those of teeth, or else any; the least of teeth [rad]."""
+def _turns(
+    index: SurfaceIndex, points: Array, direction: Array, centre: Array
+) -> tuple[Array, float]:
+    """The turns (k, 4, 4) about an axis, the identity first: those of teeth, or else any.
+
+    The least of teeth [rad].
+    """
     width = 0.5 * REVOLVED * index.extent_m
     circle = distances(index, points, revolved(direction, centre, CIRCLE), width)
     count = _teeth(np.mean((circle / width) ** 2, axis=1))
@@ -166,7 +211,10 @@ def _turns(index: SurfaceIndex, points: Array, direction: Array, centre: Array) 
 
 
 def _teeth(cost: Array) -> int:
-    """The number of teeth by the cost (k,) of turns along a circle, low at each tooth: the main frequency; or 0."""
+    """The number of teeth by the cost (k,) of turns along a circle, low at each tooth.
+
+    The main frequency; or 0.
+    """
     k, middle = len(cost), float(np.median(cost))
     power = np.abs(np.fft.rfft(cost - cost.mean())) ** 2
     count = LEAST_TEETH + int(np.argmax(power[LEAST_TEETH : k // 3]))

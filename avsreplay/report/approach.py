@@ -1,4 +1,7 @@
-"""The picture of the approach in the frame of the fixture {C}: flown path, cones, target, begin and grasp point."""
+"""The picture of the approach in the frame of the fixture {C}.
+
+Flown path, cones, target, begin and grasp point.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,28 @@ from avsreplay.report.view import View
 from avsreplay.rows import Row
 
 WIDTH, HEIGHT, BORDER = 440, 380, 26  # of one panel [px]
-FLOWN = frozenset(("approach", "approach_on_prediction", "capture"))  # actions during which the plan is followed
+FLOWN = frozenset(
+    ("approach", "approach_on_prediction", "capture")
+)  # actions during which the plan is followed
 _POSITION, _ATTITUDE = ("x_m", "y_m", "z_m"), ("qx", "qy", "qz", "qw")
 _BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
 def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
-    """Return the parts (n, 3) of the planned paths that were flown, in {C} at the estimate of each scan [m].
+    """Return the parts (n, 3) of the planned paths that were flown, in {C} at the estimate of each
+    scan [m].
 
-    A path is followed until the next one begins or its end is reached. A part ends where the robot follows no plan.
+    A path is followed until the next one begins or its end is reached. A part ends where the robot
+    follows no plan.
 
     Args:
         rows: one per scan.
         view: its paths.
     """
     t = np.array([row.t_ns for row in rows], np.int64)
-    r, q = (np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE))
+    r, q = (
+        np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE)
+    )
     y, flown = np.full((len(rows), 3), np.nan), np.array([row.action in FLOWN for row in rows])
     begins = [path.t_ns for path in view.paths[1:]]
     for path, next_ns in zip(view.paths, [*begins, np.iinfo(np.int64).max], strict=False):
@@ -48,7 +57,9 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
     return [part for part in parts if len(part) > 1 and np.isfinite(part).all()]
 
 
-def approach_picture(rows: Sequence[Row], view: View | None, header: Mapping[str, Any]) -> dict[str, Any] | None:
+def approach_picture(
+    rows: Sequence[Row], view: View | None, header: Mapping[str, Any]
+) -> dict[str, Any] | None:
     """Return the values of ``approach.svg``; None where nothing was flown.
 
     Args:
@@ -63,10 +74,15 @@ def approach_picture(rows: Sequence[Row], view: View | None, header: Mapping[str
     side = geometry.across(axis)
     body, corners = np.asarray(view.vertices, np.float64), view.faces
     limits = header.get("approach", {})
-    cones = [(limits.get(f"{name}_deg"), limits.get(f"{name}_range_m")) for name in ("cone", "final")]
+    cones = [
+        (limits.get(f"{name}_deg"), limits.get(f"{name}_range_m")) for name in ("cone", "final")
+    ]
     outlines = [_outline(*cone, limits.get("mouth_m") or 0.0) for cone in cones if None not in cone]
     panels = []
-    for name, second in (("from one side", side), ("turned by 90° about the axis", np.cross(axis, side))):
+    for name, second in (
+        ("from one side", side),
+        ("turned by 90° about the axis", np.cross(axis, side)),
+    ):
         flat = np.stack([axis, second], axis=1)
         shown = [body @ flat, *(part @ flat for part in parts), *outlines, np.zeros((1, 2))]
         panels.append((name, shown[0], shown[1 : 1 + len(parts)], np.concatenate(shown)))
@@ -85,8 +101,15 @@ def approach_picture(rows: Sequence[Row], view: View | None, header: Mapping[str
         "bar": round(bar_m * scale, 1),
         "bar_text": f"{bar_m:g} m",
         "cone_name": "cone or corridor in which the approach stays",
-        "note": "Frame of the fixture {C}, in which the target is at rest; the axis of the fixture points to the right."
-        + (" The gaps of the path are the times at which the robot did not follow a plan." if len(parts) > 1 else ""),
+        "note": (
+            "Frame of the fixture {C}, in which the target is at rest; the axis of the fixture"
+            " points to the right."
+            + (
+                " The gaps of the path are the times at which the robot did not follow a plan."
+                if len(parts) > 1
+                else ""
+            )
+        ),
         "panels": [
             {
                 "title": name,
@@ -113,7 +136,10 @@ def _outline(degrees: float, length: float, mouth: float) -> Array:
 
 
 def _triangles(points: Array, faces: Any) -> str:
-    """The path data of triangles of one orientation, whose fillings join; of small squares without faces."""
+    """The path data of triangles of one orientation, whose fillings join.
+
+    Of small squares without faces.
+    """
     if not len(faces):
         return "".join(f"M{x:g} {y:g}h2v2h-2z" for x, y in points.tolist())
     corners = points[faces]

@@ -1,4 +1,7 @@
-"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``; arrays as base64 text."""
+"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``.
+
+Arrays as base64 text.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
 from avsreplay.records import State
-from avsreplay.report import NEES_BAND, NIS_BAND
 from avsreplay.report.episodes import Episode
+from avsreplay.report.summary import NEES_BAND, NIS_BAND
 from avsreplay.report.summary_parts import add_rows
 from avsreplay.rows import Row
 
@@ -63,7 +66,15 @@ KINDS = {  # colour and pattern of each place
         *("empty", "noise_burst", "stamp_jump"),
         *("outliers", "subsampled", "frame_rate"),
     ),
-    "action": ("approach", "hold", "stand_still", "capture", "retreat", "abort", "approach_on_prediction"),
+    "action": (
+        "approach",
+        "hold",
+        "stand_still",
+        "capture",
+        "retreat",
+        "abort",
+        "approach_on_prediction",
+    ),
 }
 _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
@@ -74,7 +85,11 @@ def derived(rows: Sequence[Row]) -> Columns:
     add_rows(taken, rows)
     out = {name: np.array(column, dtype=np.float64) for name, column in taken.items()}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
-    for name, sigma in (("sigma1", "sigma1_1s"), ("sigma2", "sigma2_1s"), *((f"c{a}_m", "c_1s_m") for a in "xyz")):
+    for name, sigma in (
+        ("sigma1", "sigma1_1s"),
+        ("sigma2", "sigma2_1s"),
+        *((f"c{a}_m", "c_1s_m") for a in "xyz"),
+    ):
         _band(out, name, values(rows, sigma))
     for axis in "xyz":
         _band(out, f"mu_{axis}_deg", values(rows, "mu_1s_deg"))
@@ -101,12 +116,16 @@ def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     recent: list[float] = []
     for k, value in enumerate(capture_s):
         if np.isfinite(value):
-            recent = recent if recent and recent[-1] == value else [*recent, float(value)][-_WINDOW:]
+            recent = (
+                recent if recent and recent[-1] == value else [*recent, float(value)][-_WINDOW:]
+            )
             low[k], high[k] = min(recent), max(recent)
     return low, high
 
 
-def _line(name: str, label: str, colour: int, *, dash: bool = False, points: bool = False) -> dict[str, Any]:
+def _line(
+    name: str, label: str, colour: int, *, dash: bool = False, points: bool = False
+) -> dict[str, Any]:
     return {"column": name, "label": label, "colour": colour, "dash": dash, "points": points}
 
 
@@ -121,9 +140,11 @@ def _chart(
     log: bool | None = False,
     sigma: bool = True,
 ) -> Chart:
-    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi`` (1 sigma each if ``sigma``).
+    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi`` (1 sigma each if
+    ``sigma``).
 
-    The axis is logarithmic if ``log``; if it is None, where the largest value is far above the typical one.
+    The axis is logarithmic if ``log``; if it is None, where the largest value is far above the
+    typical one.
     """
     return {
         "key": key,
@@ -136,7 +157,9 @@ def _chart(
     }
 
 
-def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, float] | None = None) -> list[Chart]:
+def charts(
+    columns: Columns, truth: State | None = None, limits: Mapping[str, float] | None = None
+) -> list[Chart]:
     """The charts that have data, in reading order.
 
     Args:
@@ -144,13 +167,22 @@ def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, fl
         truth: true parameters, drawn as horizontal lines.
         limits: limits of the fault detector: ``rms_max_m``, ``alpha_max_m`` and ``length_m`` [m].
     """
-    whole = [*_error_charts(), *_measurement_charts(limits or {}), *_parameter_charts(truth), *_plan_charts()]
+    whole = [
+        *_error_charts(),
+        *_measurement_charts(limits or {}),
+        *_parameter_charts(truth),
+        *_plan_charts(),
+    ]
     kept = []
     for chart in whole:
         chart["series"] = [s for s in chart["series"] if s["column"] in columns]
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
-        if chart["key"] in ("position", "attitude") and not any("_err_" in s["column"] for s in chart["series"]):
-            chart["title"] = chart["title"].replace("error", "uncertainty")  # no truth: the predicted 1 sigma alone
+        if chart["key"] in ("position", "attitude") and not any(
+            "_err_" in s["column"] for s in chart["series"]
+        ):
+            chart["title"] = chart["title"].replace(
+                "error", "uncertainty"
+            )  # no truth: the predicted 1 sigma alone
         if chart["series"]:
             kept.append(_scaled(chart, columns))
     return kept
@@ -160,23 +192,34 @@ def flight_charts(columns: Columns) -> list[Chart]:
     """The charts of one planned flight that have data.
 
     Args:
-        columns: ``distance_m`` and ``speed_mps`` relative to the grasp point, ``ux_mps2`` to ``uz_mps2`` in {A}, and
-            ``margin_NAME_m`` of each constraint.
+        columns: ``distance_m`` and ``speed_mps`` relative to the grasp point, ``ux_mps2`` to
+            ``uz_mps2`` in {A}, and ``margin_NAME_m`` of each constraint.
     """
     margins = [name for name in columns if name.startswith("margin_")]
     lines = [_line(name, name[7:-2], k, dash=k % 2 == 1) for k, name in enumerate(margins)]
     thrust = [_line(f"u{a}_mps2", a, k, dash=k == 1) for k, a in _XYZ]
     whole = [
-        _chart("distance", "Distance to the grasp point", "m", [_line("distance_m", "distance", 0)]),
-        _chart("speed", "Speed relative to the grasp point", "m/s", [_line("speed_mps", "speed", 0)]),
+        _chart(
+            "distance", "Distance to the grasp point", "m", [_line("distance_m", "distance", 0)]
+        ),
+        _chart(
+            "speed", "Speed relative to the grasp point", "m/s", [_line("speed_mps", "speed", 0)]
+        ),
         _chart("thrust", "Acceleration of the robot in {A}", "m/s2", thrust),
         _chart("margin", "Margin of the constraints", "m", lines, levels=[(0.0, "limit", 3)]),
     ]
-    return [_scaled(chart, columns) for chart in whole if any(s["column"] in columns for s in chart["series"])]
+    return [
+        _scaled(chart, columns)
+        for chart in whole
+        if any(s["column"] in columns for s in chart["series"])
+    ]
 
 
 def _scaled(chart: Chart, columns: Columns) -> Chart:
-    """The chart with its axis; typical values in metres below 1 m are drawn in millimetres, as in the tables."""
+    """The chart with its axis.
+
+    Typical values in metres below 1 m are drawn in millimetres, as in the tables.
+    """
     sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]
     typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)
     if chart["log"] is None:
@@ -212,12 +255,42 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
     nis = [(NIS_BAND[0], "2.5 %", 3), (NIS_BAND[1], "97.5 %", 3)]
     nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
     return [
-        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit, log=None),
+        _chart(
+            "fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit, log=None
+        ),
         _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
-        _chart("nis", "Innovation squared (NIS)", "", [_line("nis", "NIS", 0, points=True)], levels=nis, log=True),
-        _chart("innovation", "Position innovation", "m", [_line("innov_m", "length", 0)], levels=jump, log=True),
-        _chart("turn", "Attitude innovation", "deg", [_line("innov_deg", "angle", 0)], levels=turn, log=True),
-        _chart("nees", "Estimation error squared (NEES)", "", [_line("nees", "NEES", 0)], levels=nees, log=True),
+        _chart(
+            "nis",
+            "Innovation squared (NIS)",
+            "",
+            [_line("nis", "NIS", 0, points=True)],
+            levels=nis,
+            log=True,
+        ),
+        _chart(
+            "innovation",
+            "Position innovation",
+            "m",
+            [_line("innov_m", "length", 0)],
+            levels=jump,
+            log=True,
+        ),
+        _chart(
+            "turn",
+            "Attitude innovation",
+            "deg",
+            [_line("innov_deg", "angle", 0)],
+            levels=turn,
+            log=True,
+        ),
+        _chart(
+            "nees",
+            "Estimation error squared (NEES)",
+            "",
+            [_line("nees", "NEES", 0)],
+            levels=nees,
+            log=True,
+        ),
     ]
 
 
@@ -228,9 +301,30 @@ def _parameter_charts(truth: State | None) -> list[Chart]:
     turn = [_line(f"mu_{a}_deg", a, k, dash=k == 1) for k, a in enumerate("xyz")]
     rate = [_line(f"w{a}_radps", a, k, dash=k == 1) for k, a in enumerate("xyz")]
     return [
-        _chart("sigma", "Inertia ratios", "", ratios, bands=[("sigma1", 0), ("sigma2", 1)], levels=sigma),
-        _chart("arm", "Fixture from the mass centre", "m", arm, bands=[(f"c{a}_m", k) for k, a in _XYZ], levels=c),
-        _chart("mu", "Fixture attitude mu", "deg", turn, bands=[(f"mu_{a}_deg", k) for k, a in _XYZ], levels=mu),
+        _chart(
+            "sigma",
+            "Inertia ratios",
+            "",
+            ratios,
+            bands=[("sigma1", 0), ("sigma2", 1)],
+            levels=sigma,
+        ),
+        _chart(
+            "arm",
+            "Fixture from the mass centre",
+            "m",
+            arm,
+            bands=[(f"c{a}_m", k) for k, a in _XYZ],
+            levels=c,
+        ),
+        _chart(
+            "mu",
+            "Fixture attitude mu",
+            "deg",
+            turn,
+            bands=[(f"mu_{a}_deg", k) for k, a in _XYZ],
+            levels=mu,
+        ),
         _chart("rate", "Angular rate", "rad/s", rate),
     ]
 
@@ -243,7 +337,10 @@ def _truths(truth: State | None) -> list[list[tuple[float, str, int]]]:
     if truth is None:
         return [[], [], []]
     mu = np.degrees(geometry.log(truth.q_bc))
-    return [[(float(v), "truth", k) for k, v in enumerate(vector)] for vector in (truth.sigma, truth.c_b, mu)]
+    return [
+        [(float(v), "truth", k) for k, v in enumerate(vector)]
+        for vector in (truth.sigma, truth.c_b, mu)
+    ]
 
 
 def _plan_charts() -> list[Chart]:
@@ -255,12 +352,21 @@ def _plan_charts() -> list[Chart]:
         _chart("gramian", "Gramian condition, log10", "", condition),
         _chart("rank", "Gramian rank of 20", "", [_line("ogm_rank", "rank", 0)]),
         _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)], log=None),
-        _chart("noise_turn", "Adapted noise, attitude", "deg", [_line("r_rot_deg", "1 sigma", 0)], log=None),
+        _chart(
+            "noise_turn",
+            "Adapted noise, attitude",
+            "deg",
+            [_line("r_rot_deg", "1 sigma", 0)],
+            log=None,
+        ),
         _chart(
             "capture",
             "Planned capture time",
             "s",
-            [_line("capture_time_s", "planned", 0), _line("earliest_capture_s", "certified lower bound", 1, dash=True)],
+            [
+                _line("capture_time_s", "planned", 0),
+                _line("earliest_capture_s", "certified lower bound", 1, dash=True),
+            ],
             bands=[("capture_time_s", 0)],
             sigma=False,
         ),
@@ -273,14 +379,20 @@ def _plan_charts() -> list[Chart]:
 
 
 def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[str, Any]]:
-    """Intervals of flagged scans (lane "flagged", by reason), of injected faults ("injected"), of actions ("action").
+    """Intervals of flagged scans (lane "flagged", by reason), of injected faults ("injected"), of
+    actions ("action").
 
     Of ``episodes`` only those without any scan are drawn, over their window.
     """
     flagged = [None if row.gamma == 1 else row.reason for row in rows]
     bare = [_bare(e, rows) for e in episodes if not e.scans and rows]
     actions = _runs(rows, [row.action or None for row in rows], "action")
-    found = _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected") + bare + actions
+    found = (
+        _runs(rows, flagged, "flagged")
+        + _runs(rows, [row.fault for row in rows], "injected")
+        + bare
+        + actions
+    )
     return [span | _style(span["lane"], span["word"]) for span in found]
 
 
@@ -312,7 +424,8 @@ def _runs(rows: Sequence[Row], words: Sequence[str | None], lane: str) -> list[d
 
 
 def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> list[int]:
-    """Indices of at most about ``most`` rows: of every interval the first row and those with the largest errors.
+    """Indices of at most about ``most`` rows: of every interval the first row and those with the
+    largest errors.
 
     Rows at which gamma, reason, fault or action change are kept, and those in ``always``.
     """
@@ -324,7 +437,10 @@ def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> 
         turns.update(k for k, (before, now) in enumerate(pairwise(column), 1) if now != before)
     kept = {0, len(rows) - 1, *always, *(turns if len(turns) <= most // 4 else ())}
     step = -(-len(rows) * 5 // (most - len(kept)))
-    peaks = [np.nan_to_num(values(rows, name), nan=-1.0) for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")]
+    peaks = [
+        np.nan_to_num(values(rows, name), nan=-1.0)
+        for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")
+    ]
     for begin in range(0, len(rows), step):
         kept |= {begin, *(begin + int(np.argmax(peak[begin : begin + step])) for peak in peaks)}
     return sorted(kept)

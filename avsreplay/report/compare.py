@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from avsreplay.errors import value_class
-from avsreplay.report import Errors, Summary
+from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
 from avsreplay.settings import dump, entries
@@ -16,7 +16,10 @@ from avsreplay.settings import dump, entries
 
 @value_class(eq=True)
 class Metric:
-    """One metric of a run: name with its unit as suffix, unit, meaning, function (None without a value)."""
+    """One metric of a run.
+
+    Name with its unit as suffix, unit, meaning, function (None without a value).
+    """
 
     name: str
     unit: str
@@ -24,7 +27,9 @@ class Metric:
     of: Callable[[Summary], float | None]
 
 
-def _spread(pick: Callable[[Summary], Statistics | None], figure: str) -> Callable[[Summary], float | None]:
+def _spread(
+    pick: Callable[[Summary], Statistics | None], figure: str
+) -> Callable[[Summary], float | None]:
     def get(summary: Summary) -> float | None:
         spread = pick(summary)
         return None if spread is None else float(getattr(spread, figure))
@@ -37,8 +42,14 @@ def _errors(prefix: str, words: str, pick: Callable[[Summary], Errors]) -> list[
     for figure in ("rmse", "median", "max"):
         position = _spread(lambda s: pick(s).position_m, figure)
         rotation = _spread(lambda s: pick(s).rotation_deg, figure)
-        out.append(Metric(f"{prefix}_pos_{figure}_m", "m", f"{figure} position error, {words}", position))
-        out.append(Metric(f"{prefix}_rot_{figure}_deg", "deg", f"{figure} attitude error, {words}", rotation))
+        out.append(
+            Metric(f"{prefix}_pos_{figure}_m", "m", f"{figure} position error, {words}", position)
+        )
+        out.append(
+            Metric(
+                f"{prefix}_rot_{figure}_deg", "deg", f"{figure} attitude error, {words}", rotation
+            )
+        )
     return out
 
 
@@ -76,40 +87,102 @@ def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None
 METRICS: tuple[Metric, ...] = (
     Metric("scans", "", "scans replayed", lambda s: s.scans),
     Metric("healthy", "", "scans used by the filter", lambda s: s.healthy),
-    Metric("healthy_ratio", "", "scans used over scans replayed", lambda s: s.healthy / s.scans if s.scans else None),
+    Metric(
+        "healthy_ratio",
+        "",
+        "scans used over scans replayed",
+        lambda s: s.healthy / s.scans if s.scans else None,
+    ),
     *_errors("all", "all scans, coasting included", lambda s: s.pose_all),
     *_errors("pose", "healthy scans", lambda s: s.pose_healthy),
     *_errors("coast", "coasting scans", lambda s: s.pose_coasting),
     *_errors("reg", "of the registration, healthy scans", lambda s: s.registration_healthy),
-    Metric("coast_end_pos_m", "m", "position error at the end of the longest coast", _coast("pos_err_m")),
-    Metric("coast_end_rot_deg", "deg", "attitude error at the end of the longest coast", _coast("rot_err_deg")),
-    Metric("fit_median_m", "m", "median fit error, healthy scans", _spread(lambda s: s.fit_error_m, "median")),
-    Metric("iterations_median", "", "median iterations of the registration", _spread(lambda s: s.iterations, "median")),
+    Metric(
+        "coast_end_pos_m",
+        "m",
+        "position error at the end of the longest coast",
+        _coast("pos_err_m"),
+    ),
+    Metric(
+        "coast_end_rot_deg",
+        "deg",
+        "attitude error at the end of the longest coast",
+        _coast("rot_err_deg"),
+    ),
+    Metric(
+        "fit_median_m",
+        "m",
+        "median fit error, healthy scans",
+        _spread(lambda s: s.fit_error_m, "median"),
+    ),
+    Metric(
+        "iterations_median",
+        "",
+        "median iterations of the registration",
+        _spread(lambda s: s.iterations, "median"),
+    ),
     Metric("faults_missed", "", "harmful faults not detected", _known(lambda s: s.faults.missed)),
     Metric("scans_missed", "", "harmful scans used", _known(lambda s: s.faults.missed_scans)),
-    Metric("false_alarms", "", "flagged scans without a fault", _known(lambda s: s.faults.false_alarms)),
-    Metric("false_alarm_rate", "", "of scans without a fault", _known(lambda s: s.faults.false_alarm_rate)),
+    Metric(
+        "false_alarms", "", "flagged scans without a fault", _known(lambda s: s.faults.false_alarms)
+    ),
+    Metric(
+        "false_alarm_rate",
+        "",
+        "of scans without a fault",
+        _known(lambda s: s.faults.false_alarm_rate),
+    ),
     Metric("recovery_s", "s", "longest time to recover", lambda s: s.faults.longest_recovery_s),
     Metric("sigma1_err", "", "error of sigma1 at the last scan", _parameter("sigma1")),
     Metric("sigma2_err", "", "error of sigma2 at the last scan", _parameter("sigma2")),
     Metric("c_err_m", "m", "error of varrho (c) at the last scan", _parameter("c (varrho)")),
     Metric("mu_err_deg", "deg", "error of mu at the last scan", _parameter("mu")),
     Metric("sigma_hits", "", "times a bound on sigma was active", lambda s: s.sigma_hits),
-    Metric("weighed_down", "", "healthy poses with a Cauchy weight below 1", lambda s: s.weighed_down),
+    Metric(
+        "weighed_down", "", "healthy poses with a Cauchy weight below 1", lambda s: s.weighed_down
+    ),
     Metric("reinitialised", "", "times the estimate was reinitialised", lambda s: s.reinitialised),
-    Metric("nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None),
-    Metric("nis_inside", "", "share of NIS inside its 95 % band", lambda s: s.nis.inside if s.nis else None),
-    Metric("nees_median", "", "median NEES (19.34 expected)", lambda s: s.nees.median if s.nees else None),
-    Metric("nees_inside", "", "share of NEES inside its 95 % band", lambda s: s.nees.inside if s.nees else None),
-    Metric("ogm_log10_cond", "", "log10 condition of the Gramian, at the end", lambda s: s.observability.log10_cond),
+    Metric(
+        "nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None
+    ),
+    Metric(
+        "nis_inside",
+        "",
+        "share of NIS inside its 95 % band",
+        lambda s: s.nis.inside if s.nis else None,
+    ),
+    Metric(
+        "nees_median",
+        "",
+        "median NEES (19.34 expected)",
+        lambda s: s.nees.median if s.nees else None,
+    ),
+    Metric(
+        "nees_inside",
+        "",
+        "share of NEES inside its 95 % band",
+        lambda s: s.nees.inside if s.nees else None,
+    ),
+    Metric(
+        "ogm_log10_cond",
+        "",
+        "log10 condition of the Gramian, at the end",
+        lambda s: s.observability.log10_cond,
+    ),
     Metric("ogm_rank", "", "rank of the Gramian, at the end", lambda s: s.observability.rank),
     Metric(
-        "t1_s", "s", "convergence time: first scan whose estimate the planner may use", lambda s: s.convergence.t1_s
+        "t1_s",
+        "s",
+        "convergence time: first scan whose estimate the planner may use",
+        lambda s: s.convergence.t1_s,
     ),
     Metric("withdrawn", "", "times convergence was withdrawn", lambda s: s.convergence.withdrawn),
     Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
     Metric(
-        "capture_std_s", "s", "standard deviation of the planned instant over the replans", lambda s: s.capture.std_s
+        "capture_std_s",
+        "s",
+        "standard deviation of the planned instant over the replans",
+        lambda s: s.capture.std_s,
     ),
     Metric(
         "plan_miss_median_m",
@@ -124,8 +197,12 @@ METRICS: tuple[Metric, ...] = (
         _spread(lambda s: s.capture.plan_miss_m, "max"),
     ),
     Metric("capture_miss_m", "m", "true distance when the gripper closed", _miss("position_m")),
-    Metric("capture_miss_mps", "m/s", "true relative speed when the gripper closed", _miss("speed_mps")),
-    Metric("capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")),
+    Metric(
+        "capture_miss_mps", "m/s", "true relative speed when the gripper closed", _miss("speed_mps")
+    ),
+    Metric(
+        "capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")
+    ),
     Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
     Metric("losses", "", "damaged places in the log", lambda s: s.counts.get("losses")),
 )
@@ -144,7 +221,11 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """A nested table of settings as dotted keys."""
     out: dict[str, Any] = {}
     for key, value in table.items():
-        out |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        out |= (
+            flat(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": value}
+        )
     return out
 
 
@@ -152,7 +233,8 @@ def changed_settings(*tables: Any) -> list[str]:
     """Return the settings that differ from their defaults, each as ``key = value (default ...)``.
 
     Args:
-        tables: dataclasses of settings, such as the configuration of a run and the options for reading its log.
+        tables: dataclasses of settings, such as the configuration of a run and the options for
+            reading its log.
     """
     found = []
     for table in tables:
@@ -161,12 +243,15 @@ def changed_settings(*tables: Any) -> list[str]:
         for key, value in flat(dump(table)).items():
             if value != defaults.get(key):
                 unset = words.get(key, "off")
-                found.append(f"{key} = {_value(value, unset)} (default {_value(defaults.get(key), unset)})")
+                found.append(
+                    f"{key} = {_value(value, unset)} (default {_value(defaults.get(key), unset)})"
+                )
     return found
 
 
 def different_logs(base: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Return the names of the logs of two runs, with the first digits of their SHA-256 if the names are equal.
+    """Return the names of the logs of two runs, with the first digits of their SHA-256 if the names
+    are equal.
 
     Args:
         base: ``run.json`` of the baseline.
@@ -183,7 +268,10 @@ def different_logs(base: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[s
 
 
 def _names(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[str, str]:
-    """Names of two different files; of equal names the first digits of the SHA-256 distinguish them."""
+    """Names of two different files.
+
+    Of equal names the first digits of the SHA-256 distinguish them.
+    """
     names = [str(given.get("name", "unknown")) for given in (first, second)]
     if names[0] == names[1]:
         names = [f"{names[0]} {str(given.get('sha256'))[:8]}" for given in (first, second)]
@@ -207,9 +295,14 @@ def different_inputs(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[
         ours, theirs = (header.get(part) for header in (other, base))
         if ours and theirs:
             ours, theirs = flat(ours), flat(theirs)
-            keys = [key for key in dict.fromkeys((*ours, *theirs)) if ours.get(key) != theirs.get(key)]
+            keys = [
+                key for key in dict.fromkeys((*ours, *theirs)) if ours.get(key) != theirs.get(key)
+            ]
             keys = [key for key in keys if key != "model"]  # compared above, by its content
-            found += [f"{key} = {_value(ours.get(key))} (baseline {_value(theirs.get(key))})" for key in keys]
+            found += [
+                f"{key} = {_value(ours.get(key))} (baseline {_value(theirs.get(key))})"
+                for key in keys
+            ]
     return found
 
 
@@ -220,5 +313,7 @@ def _value(value: Any, unset: str = "not set") -> str:
 def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:
     """The metrics of a single run."""
     meaning = {m.name: m.doc for m in METRICS}
-    rows = tuple((metric, meaning[metric], number(value)) for metric, value in figures if value is not None)
+    rows = tuple(
+        (metric, meaning[metric], number(value)) for metric, value in figures if value is not None
+    )
     return Table(name, ("metric", "meaning", "value"), rows, align="llr")

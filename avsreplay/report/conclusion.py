@@ -1,11 +1,13 @@
-"""The conclusion of a comparison: better, worse or no evidence, metric by metric and in one sentence.
+"""The conclusion of a comparison: better, worse or no evidence, metric by metric and in one
+sentence.
 
-A value that is missing in one run counts as worse; it is never skipped. A difference is better or worse only where its
-95 % interval excludes zero. For two runs, means over scans (RMSE, shares) get an interval by a paired bootstrap over
-blocks of consecutive scans, because successive errors are correlated. For groups of at least five runs, paired by name,
-every metric gets the interval of its mean paired difference. Counts of events need no interval; any other figure
-without one is reported as changed. Scans of different logs cannot be paired: every difference of such runs is reported
-as changed, and the sentence begins with the names of the logs.
+A value that is missing in one run counts as worse; it is never skipped. A difference is better or
+worse only where its 95 % interval excludes zero. For two runs, means over scans (RMSE, shares) get
+an interval by a paired bootstrap over blocks of consecutive scans, because successive errors are
+correlated. For groups of at least five runs, paired by name, every metric gets the interval of its
+mean paired difference. Counts of events need no interval; any other figure without one is reported
+as changed. Scans of different logs cannot be paired: every difference of such runs is reported as
+changed, and the sentence begins with the names of the logs.
 """
 
 from __future__ import annotations
@@ -18,11 +20,11 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.report import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.charts import values
 from avsreplay.report.compare import METRICS, different_inputs, different_logs, metrics
 from avsreplay.report.golden import GoldenResult, compare_rows
 from avsreplay.report.intervals import interval_of_mean, interval_of_roots
+from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 
@@ -39,10 +41,27 @@ HEADLINES = {  # the metrics of the conclusion: words, unit and factor
     "losses": ("lost parts of the log", "", 1.0),
 }
 _MORE = {"scans", "healthy", "healthy_ratio", "nis_inside", "nees_inside", "ogm_rank"}
-_NEUTRAL = {"nis_median", "nees_median", "sigma_hits", "ogm_log10_cond", "iterations_median", "weighed_down"}
+_NEUTRAL = {
+    "nis_median",
+    "nees_median",
+    "sigma_hits",
+    "ogm_log10_cond",
+    "iterations_median",
+    "weighed_down",
+}
 _MAY_BE_MISSING = ("coast_", "recovery_s")  # absent also where nothing went wrong
-_COUNTS = {"scans", "healthy", "faults_missed", "scans_missed", "false_alarms", "reinitialised", "withdrawn", "gaps",
-           "losses", "ogm_rank"}  # fmt: skip
+_COUNTS = {
+    "scans",
+    "healthy",
+    "faults_missed",
+    "scans_missed",
+    "false_alarms",
+    "reinitialised",
+    "withdrawn",
+    "gaps",
+    "losses",
+    "ogm_rank",
+}
 _MENTIONED = 0.1  # relative change of a main metric without an interval that the sentence mentions
 _MARKS = {"better": "good", "worse": "bad"}
 _BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
@@ -51,7 +70,10 @@ _BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
 def _scanwise(
     column: str, band: tuple[float, float] | None = None, *, healthy: bool = False
 ) -> Callable[[Sequence[Row]], Array]:
-    """A column squared, or whether it is inside a band; NaN where a scan has no value or is not to count."""
+    """A column squared, or whether it is inside a band.
+
+    NaN where a scan has no value or is not to count.
+    """
 
     def value(rows: Sequence[Row]) -> Array:
         found = values(rows, column)
@@ -72,14 +94,19 @@ _ROOTS = {  # metrics that are the root of a mean over scans
 }
 _MEANS = {  # metrics that are a mean over scans
     "healthy_ratio": lambda rows: values(rows, "gamma"),
-    "false_alarm_rate": lambda rows: np.where([bool(r.fault) for r in rows], np.nan, 1.0 - values(rows, "gamma")),
+    "false_alarm_rate": lambda rows: np.where(
+        [bool(r.fault) for r in rows], np.nan, 1.0 - values(rows, "gamma")
+    ),
     "nis_inside": _scanwise("nis", NIS_BAND, healthy=True),
     "nees_inside": _scanwise("nees", NEES_BAND),
 }
 
 
 class ComparedRun(Protocol):
-    """What a comparison needs of a saved result: its name, rows (one per scan), their summary and ``run.json``."""
+    """What a comparison needs of a saved result.
+
+    Its name, rows (one per scan), their summary and ``run.json``.
+    """
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -99,8 +126,9 @@ class Change:
         metric: its name.
         base, other: values; means over the runs of a group that have one; None where none has.
         low, high: 95 % interval of the difference other - base; None without enough pairs.
-        word: "better", "worse", "no evidence" (the interval contains 0, or there are too few pairs), "equal", or
-            "changed" for a metric without a direction or without an interval, and for runs of different logs.
+        word: "better", "worse", "no evidence" (the interval contains 0, or there are too few
+            pairs), "equal", or "changed" for a metric without a direction or without an interval,
+            and for runs of different logs.
         note: "lost" or "new" where one side has no value.
     """
 
@@ -122,7 +150,8 @@ class Conclusion:
         word: "better", "worse", "mixed", "no evidence" or "same" (all rows agree).
         sentence: the conclusion in one line.
         changes: of every metric that one of them has.
-        settings: log, model, reading options and settings that differ, as ``key = value (baseline ...)``.
+        settings: log, model, reading options and settings that differ, as ``key = value (baseline
+            ...)``.
         pairs: number of paired runs.
         divergence: of the rows of a single pair; None for several pairs or different logs.
     """
@@ -149,22 +178,32 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
     apart = [named for base, other in pairs if (named := different_logs(base.header, other.header))]
     paired = not apart or len(pairs) >= _LEAST_RUNS
-    changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None)
-    settings = dict.fromkeys(text for base, other in pairs for text in different_inputs(base.header, other.header))
+    changes = tuple(
+        change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None
+    )
+    settings = dict.fromkeys(
+        text for base, other in pairs for text in different_inputs(base.header, other.header)
+    )
     found = [compare_rows(base.rows, other.rows, first=1) for base, other in pairs]
     rows = sum(len(other.rows) for _, other in pairs)
     word, sentence = _overall(changes, same=all(f.ok for f in found), rows=rows, paired=paired)
     divergence = found[0] if len(found) == 1 and not apart else None
     if apart:
         sentence = f"{_apart(apart, len(pairs), comparable=paired or word == 'same')}{sentence}"
-    return Conclusion(name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs), divergence)
+    return Conclusion(
+        name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs), divergence
+    )
 
 
 def _apart(apart: Sequence[tuple[str, str]], pairs: int, *, comparable: bool) -> str:
     """The words before the conclusion where the logs of runs differ."""
     which = "the logs differ" if pairs == 1 else f"the logs of {len(apart)} of {pairs} pairs differ"
     names = f"{which} ('{apart[0][1]}', baseline '{apart[0][0]}')"
-    return f"{names}: " if comparable else f"{names}, so that a comparison scan by scan does not apply: "
+    return (
+        f"{names}: "
+        if comparable
+        else f"{names}, so that a comparison scan by scan does not apply: "
+    )
 
 
 def _change(
@@ -226,7 +265,11 @@ def _interval(
     found = _blocks(pairs[0], _ROOTS.get(name) or _MEANS[name])
     if found is None:
         return None
-    return interval_of_roots(*found) if name in _ROOTS else interval_of_mean(found[1] - found[0], correlated=True)
+    return (
+        interval_of_roots(*found)
+        if name in _ROOTS
+        else interval_of_mean(found[1] - found[0], correlated=True)
+    )
 
 
 def _blocks(
@@ -251,14 +294,35 @@ def _blocks(
 
 def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) -> tuple[str, str]:
     if same:
-        return "same", f"no difference; all {rows} rows agree within the tolerances of their columns"
-    found = {word: [c for c in changes if c.word == word and c.metric in HEADLINES] for word in ("worse", "better")}
-    said = [f"{word} in {', '.join(map(_said, listed))}" for word, listed in found.items() if listed]
-    word = ("mixed" if len(said) == 2 else "worse" if found["worse"] else "better") if said else "no evidence"
-    changed = [c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)]
+        return (
+            "same",
+            f"no difference; all {rows} rows agree within the tolerances of their columns",
+        )
+    found = {
+        word: [c for c in changes if c.word == word and c.metric in HEADLINES]
+        for word in ("worse", "better")
+    }
+    said = [
+        f"{word} in {', '.join(map(_said, listed))}" for word, listed in found.items() if listed
+    ]
+    word = (
+        ("mixed" if len(said) == 2 else "worse" if found["worse"] else "better")
+        if said
+        else "no evidence"
+    )
+    changed = [
+        c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)
+    ]
     if not paired:
         differ = ", ".join(map(_said, changed))
-        return word, f"the main metrics differ in {differ}" if differ else "the main metrics differ by less than 10 %"
+        return (
+            word,
+            (
+                f"the main metrics differ in {differ}"
+                if differ
+                else "the main metrics differ by less than 10 %"
+            ),
+        )
     said = said or ["no evidence of a difference in the main metrics"]
     if changed:
         said.append(f"changed, without an interval: {', '.join(map(_said, changed))}")
@@ -280,7 +344,9 @@ def _said(change: Change) -> str:
 def settings_table(conclusion: Conclusion) -> Table:
     """The settings in which a run differs from the baseline."""
     texts = conclusion.settings or ("none",)
-    return facts_table(f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts])
+    return facts_table(
+        f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts]
+    )
 
 
 def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = False) -> Table:
@@ -288,7 +354,9 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
 
     Without ``show_all`` the table has the main metrics and those that changed.
     """
-    shown = [c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"]
+    shown = [
+        c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"
+    ]
     meaning = {m.name: m.doc for m in METRICS}
     rows = tuple(
         (
@@ -306,7 +374,15 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
     left_out = len(conclusion.changes) - len(shown)
     return Table(
         f"{conclusion.name} against {baseline}{runs}",
-        ("metric", "baseline", "this", "change", "95 % interval", "conclusion", *(("meaning",) if show_all else ())),
+        (
+            "metric",
+            "baseline",
+            "this",
+            "change",
+            "95 % interval",
+            "conclusion",
+            *(("meaning",) if show_all else ()),
+        ),
         rows,
         align="nrrrrnl" if show_all else "nrrrrn",
         note=f"{left_out} equal metrics are not shown" if left_out else "",
@@ -321,7 +397,11 @@ def _interval_text(change: Change) -> str:
     if not change.base:
         return f"{change.low:+.2g} to {change.high:+.2g}"
     low, high = (100.0 * end / abs(change.base) for end in (change.low, change.high))
-    return f"{low:+.0f} to {high:+.0f} %" if max(abs(low), abs(high)) >= 10.0 else f"{low:+.1f} to {high:+.1f} %"
+    return (
+        f"{low:+.0f} to {high:+.0f} %"
+        if max(abs(low), abs(high)) >= 10.0
+        else f"{low:+.1f} to {high:+.1f} %"
+    )
 
 
 def _relative(change: Change) -> str:

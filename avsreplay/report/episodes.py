@@ -1,13 +1,14 @@
 """Injected faults against the detector's verdicts, and the time to recover.
 
-A label is *harmful* (the scan must be flagged) or not (either verdict is right). A harmful label is *detected* where at
-least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. Where all scans in its window
-carry the label of another fault, these scans decide. A flagged scan without a label is a *false alarm*. A *gap* is an
-interval between scans longer than 1.5 times the median interval.
+A label is *harmful* (the scan must be flagged) or not (either verdict is right). A harmful label is
+*detected* where at least one of its scans has gamma 0 or, where no scan came at all, where a gap
+covers it. Where all scans in its window carry the label of another fault, these scans decide. A
+flagged scan without a label is a *false alarm*. A *gap* is an interval between scans longer than
+1.5 times the median interval.
 
-Recovery is assessed by gamma alone: an estimate that followed wrong poses agrees with the next ones and counts as
-healthy. The effect of a fault is seen in the errors of the estimate over its flagged scans, its used scans and the
-scans after it.
+Recovery is assessed by gamma alone: an estimate that followed wrong poses agrees with the next ones
+and counts as healthy. The effect of a fault is seen in the errors of the estimate over its flagged
+scans, its used scans and the scans after it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ class Mark(NamedTuple):
 
 @value_class(eq=True)
 class Peak:
-    """Largest position and attitude error over some scans; None without truth or without such a scan."""
+    """Largest position and attitude error over some scans.
+
+    None without truth or without such a scan.
+    """
 
     pos_err_m: float | None = None
     rot_err_deg: float | None = None
@@ -57,10 +61,14 @@ class Episode:
     """One injected fault.
 
     Attributes:
-        start_s, end_s: its window, since the first scan.  scans: rows that carry it.  flagged: those with gamma 0.
-        detected: see the module.  recover_scans: scans without a label after it that were still flagged.
-        recover_s: from the first scan without a label after it to the first healthy scan (0: at once);
-            None where there was nothing to recover from (neither it nor the scan after it was flagged) or no recovery.
+        start_s, end_s: its window, since the first scan.
+        scans: rows that carry it.
+        flagged: those with gamma 0.
+        detected: see the module.
+        recover_scans: scans without a label after it that were still flagged.
+        recover_s: from the first scan without a label after it to the first healthy scan (0: at
+            once); None where there was nothing to recover from (neither it nor the scan after it
+            was flagged) or no recovery.
         strength: as its label states.
         delay_scans, delay_s: from its first scan to the first flagged one; None where none was.
         lost: scans without a label came after it, and not one of them was healthy.
@@ -91,8 +99,10 @@ class FaultAccount:
     """All labels of a log.
 
     Attributes:
-        known: whether the log states the injected faults; without that a flagged scan is no proven false alarm.
-        injected, detected, missed: harmful labels.  missed_scans: harmful scans with gamma 1.
+        known: whether the log states the injected faults; without that a flagged scan is no proven
+            false alarm.
+        injected, detected, missed: harmful labels.
+        missed_scans: harmful scans with gamma 1.
         false_alarms: flagged scans without a label, of ``unlabelled`` scans.
         peak_flagged, peak_used: of the scans without a label with gamma 0 and with gamma 1.
     """
@@ -148,7 +158,9 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
     holes = gaps([m.t_ns for m in marks])
     t0 = marks[0].t_ns if marks else 0
     nexts = _nexts(labels)
-    episodes = tuple(_episode(label, members[i], marks, holes, t0, nexts[i]) for i, label in enumerate(labels))
+    episodes = tuple(
+        _episode(label, members[i], marks, holes, t0, nexts[i]) for i, label in enumerate(labels)
+    )
     harmful = [i for i, label in enumerate(labels) if label.harmful]
     scans = [k for i in harmful for k in members[i]]
     free = [m for m in marks if m.fault is None]
@@ -171,10 +183,16 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
 def _replayed(
     marks: Sequence[Mark], labels: Sequence[Label], members: list[list[int]]
 ) -> tuple[list[Label], list[list[int]]]:
-    """The labels that have scans or lie within the replayed time, so that others do not count as missed."""
+    """The labels that have scans or lie within the replayed time, so that others do not count as
+    missed.
+    """
     stamps = [m.t_ns for m in marks if m.fault is None] or [m.t_ns for m in marks]
     first, last = min(stamps, default=0), max(stamps, default=-1)
-    kept = [i for i, label in enumerate(labels) if members[i] or (label.start_ns <= last and label.end_ns > first)]
+    kept = [
+        i
+        for i, label in enumerate(labels)
+        if members[i] or (label.start_ns <= last and label.end_ns > first)
+    ]
     return [labels[i] for i in kept], [members[i] for i in kept]
 
 
@@ -192,19 +210,24 @@ def _labels_of(marks: Sequence[Mark]) -> list[Label]:
 
 
 def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
-    """Rows of each label: those of its kind to whose stamp its window is the nearest (a fault may shift stamps)."""
+    """Rows of each label.
+
+    Those of its kind to whose stamp its window is the nearest (a fault may shift stamps).
+    """
     out: list[list[int]] = [[] for _ in labels]
     kinds: dict[str | None, list[int]] = {}
     for i, label in sorted(enumerate(labels), key=lambda item: item[1].start_ns):
         kinds.setdefault(label.kind, []).append(i)
     starts = {kind: [labels[i].start_ns for i in same] for kind, same in kinds.items()}
     apart = {
-        kind: all(labels[i].end_ns < labels[j].start_ns for i, j in pairwise(same)) for kind, same in kinds.items()
+        kind: all(labels[i].end_ns < labels[j].start_ns for i, j in pairwise(same))
+        for kind, same in kinds.items()
     }
     for k, mark in enumerate(marks):
         if same := kinds.get(mark.fault):
             place = bisect_right(starts[mark.fault], mark.t_ns)
-            # the windows do not overlap, so that only the neighbours of the stamp can be the nearest
+            # the windows do not overlap, so that only the neighbours of the stamp can be the
+            # nearest
             near = same[max(place - 1, 0) : place + 1] if apart[mark.fault] else same
             out[min(near, key=lambda i: (_distance(labels[i], mark.t_ns), i))].append(k)
     return out
@@ -258,7 +281,10 @@ def _episode(
 
 
 def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:
-    """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``; None where none has it."""
+    """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``.
+
+    None where none has it.
+    """
     begin: Mark | None = None
     for place, mark in enumerate(marks):
         begin = begin or mark
@@ -268,7 +294,10 @@ def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None,
 
 
 def _until_next(marks: Iterable[Mark], next_ns: int | None) -> Iterable[Mark]:
-    """The first of ``marks`` up to a label; one that begins at ``next_ns`` may have left no scan."""
+    """The first of ``marks`` up to a label.
+
+    One that begins at ``next_ns`` may have left no scan.
+    """
     return takewhile(lambda m: m.fault is None and (next_ns is None or m.t_ns < next_ns), marks)
 
 
@@ -280,7 +309,10 @@ def _nexts(labels: Sequence[Label]) -> list[int | None]:
 
 
 def coasts(marks: Sequence[Mark]) -> list[Coast]:
-    """Every run of scans with gamma 0; its duration is from the last healthy scan before it to its last scan."""
+    """Every run of scans with gamma 0.
+
+    Its duration is from the last healthy scan before it to its last scan.
+    """
     out: list[Coast] = []
     begin: int | None = None
     for k, mark in enumerate(marks):

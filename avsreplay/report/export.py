@@ -1,8 +1,9 @@
-"""Rows, poses and the summary in formats that other tools open: TUM, KITTI, CSV, Parquet, JSON; the schema of a row.
+"""Rows, poses and the summary in formats that other tools open: TUM, KITTI, CSV, Parquet, JSON; the
+schema of a row.
 
-Time stamps are written from integer nanoseconds, never through a float; values as the shortest text that reads back
-as the same float64. Run as a script, it prints docs/columns.md, or docs/rows.schema.json with ``--schema``, from the
-declaration of ``Row`` and from columns.toml.
+Time stamps are written from integer nanoseconds, never through a float; values as the shortest text
+that reads back as the same float64. Run as a script, it prints docs/columns.md, or
+docs/rows.schema.json with ``--schema``, from the declaration of ``Row`` and from columns.toml.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Array, Pose
-from avsreplay.report import Summary
 from avsreplay.report.jsonl import field_types, plain
+from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Column, Row, columns
 from avsreplay.settings import dump
@@ -46,7 +47,9 @@ def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | Non
     return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
 
 
-def row_poses(rows: Iterable[Row], which: Literal["estimate", "registration"]) -> Iterator[StampedPose]:
+def row_poses(
+    rows: Iterable[Row], which: Literal["estimate", "registration"]
+) -> Iterator[StampedPose]:
     """The estimated or the registered pose of every row that has one."""
     return ((row.t_ns, pose) for row in rows if (pose := row_pose(row, which)) is not None)
 
@@ -58,18 +61,27 @@ def stamp_text(t_ns: int) -> str:
 
 
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
-    """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return their number."""
-    return _write_lines(path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses))
+    """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m].
+
+    Return their number.
+    """
+    return _write_lines(
+        path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses)
+    )
 
 
 def write_kitti(path: str | Path, poses: Iterable[Pose | None]) -> int:
-    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per scan [m]; return the number of poses.
+    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per scan [m]; return the
+    number of poses.
 
-    KITTI has no time stamps, so that a line number must be a scan number: a scan without a pose is a line of ``nan``.
+    KITTI has no time stamps, so that a line number must be a scan number: a scan without a pose is
+        a line of ``nan``.
     """
     listed = list(poses)
     nothing = " ".join(["nan"] * 12)
-    _write_lines(path, (nothing if pose is None else _text(pose.matrix[:3].ravel()) for pose in listed))
+    _write_lines(
+        path, (nothing if pose is None else _text(pose.matrix[:3].ravel()) for pose in listed)
+    )
     return sum(pose is not None for pose in listed)
 
 
@@ -87,7 +99,10 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 
 
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
-    """Write all columns; their names (with units as suffixes) stand in the first line, null is an empty cell."""
+    """Write all columns.
+
+    Their names (with units as suffixes) stand in the first line, null is an empty cell.
+    """
     names = [c.name for c in columns()]
     with output_text(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -113,12 +128,19 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         pa: Any = import_module("pyarrow")
         pq: Any = import_module("pyarrow.parquet")
     except ModuleNotFoundError:
-        raise MissingBackend("pyarrow is not installed", where="Parquet", hint="install avsreplay[report]") from None
+        raise MissingBackend(
+            "pyarrow is not installed", where="Parquet", hint="install avsreplay[report]"
+        ) from None
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     types, meaning = field_types(), descriptions()
     schema = pa.schema(
         [
-            pa.field(c.name, kinds[types[c.name][0]], types[c.name][1], {"unit": c.unit, "doc": meaning[c.name]})
+            pa.field(
+                c.name,
+                kinds[types[c.name][0]],
+                types[c.name][1],
+                {"unit": c.unit, "doc": meaning[c.name]},
+            )
             for c in columns()
         ]
     )
@@ -127,8 +149,12 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         pq.write_table(pa.table(table, schema=schema), part)
 
 
-def run_document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return ``{"format", "verdict", "header", "summary", "rows"}`` as plain JSON values (NaN is null)."""
+def run_document(
+    rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return ``{"format", "verdict", "header", "summary", "rows"}`` as plain JSON values (NaN is
+    null).
+    """
     names = [f.name for f in dataclasses.fields(Row)]
     return {
         "format": FORMAT,
@@ -147,10 +173,14 @@ def summary_record(summary: Summary) -> dict[str, Any]:
     return record
 
 
-def dump_document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
+def dump_document(
+    rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
+) -> str:
     """The document as text with one line per row, ending in a line end."""
     whole = run_document(rows, summary, header)
-    lines = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows"))
+    lines = ",\n".join(
+        json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows")
+    )
     head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
     return f'{head[:-2]},\n "rows": [\n{lines}\n ]\n}}\n'
 
@@ -164,9 +194,14 @@ def _strict(value: Any) -> Any:
 
 
 def write_layout(path: str | Path) -> None:
-    """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view, plots, diagnostics."""
+    """Write the layout with which Foxglove and Lichtblick show ``result.mcap``.
+
+    3D view, plots, diagnostics.
+    """
     with output_text(path) as stream:
-        stream.write((files("avsreplay.report") / "assets" / "layout.json").read_text(encoding="utf-8"))
+        stream.write(
+            (files("avsreplay.report") / "assets" / "layout.json").read_text(encoding="utf-8")
+        )
 
 
 _HEAD = """# Columns of a row
@@ -200,7 +235,9 @@ def descriptions() -> dict[str, str]:
 @cache
 def listed_values() -> dict[str, dict[str, str]]:
     """Meaning of every value of the columns that hold one of a few words, by column and value."""
-    return {name: words for section in _sections() for name, words in section.get("values", {}).items()}
+    return {
+        name: words for section in _sections() for name, words in section.get("values", {}).items()
+    }
 
 
 def columns_page() -> str:
@@ -220,7 +257,12 @@ def columns_page() -> str:
 
 def _line(column: Column, kind: type, nullable: bool) -> str:
     tolerance = " + ".join(
-        text for value, text in ((column.atol, f"{column.atol:g}"), (column.rtol, f"{column.rtol:g} relative")) if value
+        text
+        for value, text in (
+            (column.atol, f"{column.atol:g}"),
+            (column.rtol, f"{column.rtol:g} relative"),
+        )
+        if value
     )
     word = kind.__name__ + (" or null" if nullable else "")
     meaning = descriptions()[column.name].replace("|", "\\|")
@@ -235,7 +277,9 @@ def row_schema() -> dict[str, Any]:
         kind, nullable = field_types()[column.name]
         properties[column.name] = {
             "type": [names[kind], "null"] if nullable else names[kind],
-            "description": descriptions()[column.name] + (f" [{column.unit}]" if column.unit else ""),
+            "description": (
+                descriptions()[column.name] + (f" [{column.unit}]" if column.unit else "")
+            ),
         }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -1,4 +1,6 @@
-"""Rules that a run must satisfy, read from a TOML file, and their outcomes as JUnit XML and GitHub annotations."""
+"""Rules that a run must satisfy, read from a TOML file, and their outcomes as JUnit XML and GitHub
+annotations.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +23,26 @@ _RELATIVE = _LIMITS[2:]
 class GateRule(Settings):
     """One rule on one metric; all given limits must hold.
 
-    A run without a value breaks the rule, unless it is ``optional`` and the baseline has no value either.
+    A run without a value breaks the rule, unless it is ``optional`` and the baseline has no value
+    either.
     """
 
     metric: str = setting(doc="The metric that is limited.")
     min: float | None = setting(None, "Smallest value that passes.")
     max: float | None = setting(None, "Largest value that passes.")
-    min_ratio: float | None = setting(None, "Smallest multiple of the baseline's value that passes.")
+    min_ratio: float | None = setting(
+        None, "Smallest multiple of the baseline's value that passes."
+    )
     max_ratio: float | None = setting(None, "Largest multiple of the baseline's value that passes.")
-    max_increase: float | None = setting(None, "Largest increase over the baseline's value that passes.")
-    max_decrease: float | None = setting(None, "Largest decrease below the baseline's value that passes.")
-    optional: bool = setting(False, "Whether a run without a value passes, if the baseline has none either.")
+    max_increase: float | None = setting(
+        None, "Largest increase over the baseline's value that passes."
+    )
+    max_decrease: float | None = setting(
+        None, "Largest decrease below the baseline's value that passes."
+    )
+    optional: bool = setting(
+        False, "Whether a run without a value passes, if the baseline has none either."
+    )
     note: str = setting("", "The reason, printed with the outcome.")
 
     def check(self) -> None:
@@ -40,7 +51,9 @@ class GateRule(Settings):
         if self.metric not in known:
             raise ValueError(f"unknown metric '{self.metric}'; known: {', '.join(known)}")
         if not self.limits:
-            raise ValueError(f"the rule on '{self.metric}' has no limit; give one of {', '.join(_LIMITS)}")
+            raise ValueError(
+                f"the rule on '{self.metric}' has no limit; give one of {', '.join(_LIMITS)}"
+            )
 
     @property
     def limits(self) -> dict[str, float]:
@@ -55,7 +68,9 @@ class GateRule(Settings):
     @property
     def text(self) -> str:
         """The rule in one line."""
-        return f"{self.metric}: " + ", ".join(f"{name} {value:g}" for name, value in self.limits.items())
+        return f"{self.metric}: " + ", ".join(
+            f"{name} {value:g}" for name, value in self.limits.items()
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +107,13 @@ def load_rules(path: str | Path) -> tuple[GateRule, ...]:
 
 
 def judge(
-    rules: Sequence[GateRule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
+    rules: Sequence[GateRule],
+    runs: Sequence[tuple[str, Mapping[str, float | None]]],
+    *,
+    baseline: bool = True,
 ) -> list[RuleOutcome]:
-    """Apply every rule to every run but the baseline, which is the first; a run that used no scan always fails.
+    """Apply every rule to every run but the baseline, which is the first; a run that used no scan
+    always fails.
 
     Args:
         rules: to apply.
@@ -107,19 +126,30 @@ def judge(
     if not baseline or len(runs) == 1:
         needy = next((rule for rule in rules if rule.relative), None)
         if needy is not None:
-            raise UsageError(f"'{needy.text}' needs a baseline", where="--gate", hint="name the baseline first")
-        return [outcome for name, figures in runs for outcome in _outcomes(rules, name, figures, {})]
+            raise UsageError(
+                f"'{needy.text}' needs a baseline", where="--gate", hint="name the baseline first"
+            )
+        return [
+            outcome for name, figures in runs for outcome in _outcomes(rules, name, figures, {})
+        ]
     base = runs[0][1]
-    return [outcome for name, figures in runs[1:] for outcome in _outcomes(rules, name, figures, base)]
+    return [
+        outcome for name, figures in runs[1:] for outcome in _outcomes(rules, name, figures, base)
+    ]
 
 
 def _outcomes(
-    rules: Sequence[GateRule], run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
+    rules: Sequence[GateRule],
+    run: str,
+    figures: Mapping[str, float | None],
+    base: Mapping[str, float | None],
 ) -> list[RuleOutcome]:
     """The outcome of every rule, and a broken rule on the healthy scans where the run has none."""
     outcomes = [_outcome(rule, run, figures, base) for rule in rules]
     if not figures.get("healthy"):
-        outcomes.append(RuleOutcome(run, GateRule("healthy", min=1.0), 0.0, False, "the run used no scan"))
+        outcomes.append(
+            RuleOutcome(run, GateRule("healthy", min=1.0), 0.0, False, "the run used no scan")
+        )
     return outcomes
 
 
@@ -128,18 +158,30 @@ def _outcome(
 ) -> RuleOutcome:
     value, reference = figures.get(rule.metric), base.get(rule.metric)
     if value is None and reference is not None:
-        return RuleOutcome(run, rule, None, False, f"the run has lost the value (baseline {reference:.6g})")
+        return RuleOutcome(
+            run, rule, None, False, f"the run has lost the value (baseline {reference:.6g})"
+        )
     if value is None:
-        return RuleOutcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no value")
+        return RuleOutcome(
+            run, rule, None, rule.optional, "" if rule.optional else "the run has no value"
+        )
     if rule.relative and reference is None:
-        return RuleOutcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no value")
+        return RuleOutcome(
+            run, rule, value, rule.optional, "" if rule.optional else "the baseline has no value"
+        )
     for name, limit in rule.limits.items():
         low, high = _bounds(name, limit, reference or 0.0)
         if not low <= value <= high:
             bound = high if value > high else low
             sign = ">" if value > high else "<"
             from_base = f" (baseline {reference:.6g})" if name in _RELATIVE else ""
-            return RuleOutcome(run, rule, value, False, f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}")
+            return RuleOutcome(
+                run,
+                rule,
+                value,
+                False,
+                f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}",
+            )
     return RuleOutcome(run, rule, value, True)
 
 
@@ -160,7 +202,10 @@ def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
     broken = [o for o in outcomes if not o.ok]
     if broken:
         o = broken[0]
-        what = f"{len(broken)} of {len(outcomes)} rules broken, the first by {o.run}: {o.rule.metric}: {o.why}"
+        what = (
+            f"{len(broken)} of {len(outcomes)} rules broken, the first by {o.run}: {o.rule.metric}:"
+            f" {o.why}"
+        )
         raise CheckFailed(what, where="--gate", hint=o.rule.note or None)
 
 
@@ -170,7 +215,9 @@ def junit(outcomes: Sequence[RuleOutcome]) -> str:
     for run in dict.fromkeys(o.run for o in outcomes):
         mine = [o for o in outcomes if o.run == run]
         failures = sum(not o.ok for o in mine)
-        suite = ET.SubElement(root, "testsuite", name=run, tests=str(len(mine)), failures=str(failures))
+        suite = ET.SubElement(
+            root, "testsuite", name=run, tests=str(len(mine)), failures=str(failures)
+        )
         for o in mine:
             case = ET.SubElement(suite, "testcase", classname=run, name=o.rule.text)
             if not o.ok:
@@ -185,7 +232,8 @@ def github_lines(outcomes: Sequence[RuleOutcome]) -> list[str]:
     if not broken:
         return [f"::notice title=avsreplay gate::{len(outcomes)} rules hold"]
     return [
-        f"::error title={_property(f'avsreplay gate: {o.run}')}::{_message(f'{o.rule.metric}: {o.why}')}"
+        "::error"
+        f" title={_property(f'avsreplay gate: {o.run}')}::{_message(f'{o.rule.metric}: {o.why}')}"
         for o in broken
     ]
 

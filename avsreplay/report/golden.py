@@ -1,7 +1,8 @@
-"""Comparison with golden rows in both directions: numbers within their column's tolerance, flags and states exactly.
+"""Comparison with golden rows in both directions: numbers within their column's tolerance, flags
+and states exactly.
 
-A value passes where ``|got - expected| <= atol + rtol |expected|``. A row or a column that is missing on one side is a
-difference; so is null against a value.
+A value passes where ``|got - expected| <= atol + rtol |expected|``. A row or a column that is
+missing on one side is a difference; so is null against a value.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class Difference:
 
     Attributes:
         seq: the scan, None where a column is missing from every row.
-        expected, got: the values, or ``ABSENT``.  tolerance: largest allowed difference, None where they must be equal.
+        expected, got: the values, or ``ABSENT``.
+        tolerance: largest allowed difference, None where they must be equal.
     """
 
     seq: int | None
@@ -46,8 +48,10 @@ class GoldenResult:
     """Result of a comparison.
 
     Attributes:
-        rows: rows on both sides.  differences: the first ones, in order of scan and column.
-        count: of all differences.  by_column: the same, column by column.
+        rows: rows on both sides.
+        differences: the first ones, in order of scan and column.
+        count: of all differences.
+        by_column: the same, column by column.
     """
 
     rows: int
@@ -65,11 +69,18 @@ class GoldenResult:
         if not self.ok:
             first = self.differences[0]
             at = "every scan" if first.seq is None else f"scan {first.seq}"
-            what = f"{self.count} differences from the golden rows, the first at {at}, column {first.column}"
-            raise CheckFailed(what, where=where, hint="if the new rows are right, write them with --update-golden")
+            what = (
+                f"{self.count} differences from the golden rows, the first at {at}, column"
+                f" {first.column}"
+            )
+            raise CheckFailed(
+                what, where=where, hint="if the new rows are right, write them with --update-golden"
+            )
 
 
-def compare_golden(expected_path: str | Path, rows: Iterable[Row], *, first: int = 20) -> GoldenResult:
+def compare_golden(
+    expected_path: str | Path, rows: Iterable[Row], *, first: int = 20
+) -> GoldenResult:
     """Compare rows with a golden file; ``first`` differences are kept, all are counted.
 
     Raises:
@@ -91,12 +102,17 @@ def read_golden(path: Path) -> dict[int, dict[str, Any]]:
         UnreadableInput: the file does not exist, or does not hold rows.
     """
     if not path.is_file():
-        raise UnreadableInput("no such golden file", where=str(path), hint="--update-golden writes it")
+        raise UnreadableInput(
+            "no such golden file", where=str(path), hint="--update-golden writes it"
+        )
     return _by_seq(read_records(path))
 
 
 def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20) -> GoldenResult:
-    """Compare the rows of two runs by the tolerances of golden files; ``first`` differences are kept."""
+    """Compare the rows of two runs by the tolerances of golden files.
+
+    ``first`` differences are kept.
+    """
     return _compare(_table(expected), _table(got), first)
 
 
@@ -111,17 +127,24 @@ def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str
     for where, record in records:
         seq = record.get("seq")
         if not isinstance(seq, int) or isinstance(seq, bool):
-            raise UnreadableInput("a row without a whole number 'seq'", where=where, hint="name a rows.jsonl file")
+            raise UnreadableInput(
+                "a row without a whole number 'seq'", where=where, hint="name a rows.jsonl file"
+            )
         if seq in out:
             raise UnreadableInput(
-                f"scan {seq} occurs twice", where=where, hint="write the file again with --update-golden"
+                f"scan {seq} occurs twice",
+                where=where,
+                hint="write the file again with --update-golden",
             )
         out[seq] = record
     return out
 
 
 def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
-    """Compare two tables column by column; ``got`` has every column. The differences of the first scans are kept."""
+    """Compare two tables column by column; ``got`` has every column.
+
+    The differences of the first scans are kept.
+    """
     left, right = ({seq: k for k, seq in enumerate(side["seq"])} for side in (expected, got))
     shared = sorted(left.keys() & right.keys())
     places: list[Sequence[int]] = [[side[seq] for seq in shared] for side in (left, right)]
@@ -139,7 +162,10 @@ def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
         if name in lacking:
             found = [k for k in found if a[k] is not ABSENT]
         counts[name] = counts.get(name, 0) + len(found)
-        kept += [(shared[k], order, _difference(column, shared[k], name, a[k], b[k])) for k in found[:first]]
+        kept += [
+            (shared[k], order, _difference(column, shared[k], name, a[k], b[k]))
+            for k in found[:first]
+        ]
     whole = [Difference(None, name, *_stated(False)) for name in lacking]
     listed = [*whole, *(difference for *_, difference in sorted(kept, key=itemgetter(0, 1)))]
     by_column = {name: count for name, count in counts.items() if count}
@@ -191,7 +217,9 @@ def _is_number(value: Any) -> bool:
 
 
 def update_golden(path: str | Path, rows: Iterable[Row], *, first: int = 20) -> GoldenResult | None:
-    """Replace the golden file and return the differences from the previous one (None if there was none)."""
+    """Replace the golden file and return the differences from the previous one (None if there was
+    none).
+    """
     rows = list(rows)
     former = compare_golden(path, rows, first=first) if Path(path).is_file() else None
     write_rows(path, rows)
@@ -202,12 +230,17 @@ def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
     """Where the rows of two runs that differ first do so, in one line."""
     first = found.differences[0]
     scan = "every scan" if first.seq is None else f"scan {first.seq}"
-    line = f"{other}: {found.count} cells differ from {baseline}, first at {scan}, column {first.column}"
+    line = (
+        f"{other}: {found.count} cells differ from {baseline}, first at {scan}, column"
+        f" {first.column}"
+    )
     return f"{line} ({first.expected} against {first.got})"
 
 
 def golden_table(result: GoldenResult) -> Table:
-    """The first differences from a golden file, and in the note how many there are in each column."""
+    """The first differences from a golden file, and in the note how many there are in each
+    column.
+    """
     counts = sorted(result.by_column.items(), key=lambda item: (-item[1], item[0]))
     more = f", and {len(counts) - 12} further columns" if len(counts) > 12 else ""
     return Table(

@@ -1,7 +1,8 @@
-"""Rows as JSON lines: one object per scan, keys in the order of ``Row``'s fields, floats as the shortest exact text.
+"""Rows as JSON lines: one object per scan, keys in the order of ``Row``'s fields, floats as the
+shortest exact text.
 
-A float that is not finite is written as null. Facts about the run are in ``run.json``, so that the same input gives
-the same bytes here.
+A float that is not finite is written as null. Facts about the run are in ``run.json``, so that the
+same input gives the same bytes here.
 """
 
 from __future__ import annotations
@@ -75,7 +76,12 @@ class RowWriter:
         self._stream = self._stack.enter_context(output_text(self._path))
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
         self._stack.__exit__(kind, error, tb)
 
     def write(self, row: Row) -> None:
@@ -99,8 +105,8 @@ def write_rows(path: str | Path, rows: Iterable[Row]) -> int:
 def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield each line as (``file:line``, object of columns).
 
-    The columns are not checked, but every name is printable text and every value is null, a bool, a number of 64 bits
-    or printable text.
+    The columns are not checked, but every name is printable text and every value is null, a bool, a
+    number of 64 bits or printable text.
 
     Raises:
         UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
@@ -110,13 +116,16 @@ def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _blocks(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield the number of the first line, the count of line ends, and whole lines, some MiB at a time.
+    """Yield the number of the first line, the count of line ends, and whole lines, some MiB at a
+    time.
 
     A line that is too long is cut.
     """
     try:
         if path.stat().st_size > _MAX_FILE or not path.is_file():
-            raise UnreadableInput("not a rows.jsonl file", where=str(path), hint="name a rows.jsonl file")
+            raise UnreadableInput(
+                "not a rows.jsonl file", where=str(path), hint="name a rows.jsonl file"
+            )
         number = 1
         with path.open("rb") as stream:
             while block := stream.read(_BLOCK) + stream.readline(_MAX_LINE + 1):
@@ -124,7 +133,11 @@ def _blocks(path: Path) -> Iterator[tuple[int, int, bytes]]:
                 yield number, ends, block
                 number += ends
     except OSError as error:
-        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
+        what = (
+            "no such file"
+            if isinstance(error, FileNotFoundError)
+            else error.strerror or "cannot be read"
+        )
         raise UnreadableInput(what, where=str(path), hint="check the path") from None
 
 
@@ -143,7 +156,9 @@ def _parse(line: bytes, where: str) -> dict[str, Any]:
         raise UnreadableInput("not a JSON object", where=where, hint=hint)
     for name, value in record.items():
         if not name.isprintable() or len(name) > _MAX_NAME:
-            raise UnreadableInput(f"a column with the name {ascii(name)[:40]}", where=where, hint=hint)
+            raise UnreadableInput(
+                f"a column with the name {ascii(name)[:40]}", where=where, hint=hint
+            )
         if not _is_cell(value):
             raise UnreadableInput(f"column '{name}' is {ascii(value)[:40]}", where=where, hint=hint)
     return record
@@ -166,8 +181,12 @@ def parse_row(record: Mapping[str, Any], where: str) -> Row:
     types = field_types()
     for name in record:
         if name not in types:
-            raise UnreadableInput(f"unknown column '{name}'", where=where, hint="was it written by another version?")
-    words: dict[str, Any] = {name: "" for name, (kind, nullable) in types.items() if kind is str and not nullable}
+            raise UnreadableInput(
+                f"unknown column '{name}'", where=where, hint="was it written by another version?"
+            )
+    words: dict[str, Any] = {
+        name: "" for name, (kind, nullable) in types.items() if kind is str and not nullable
+    }
     values = words | dict(record)
     return Row(**{name: _checked(values.get(name), name, *types[name], where) for name in types})
 
@@ -179,15 +198,18 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
         return float(value)
     if isinstance(value, kind) and isinstance(value, bool) == (kind is bool):
         return value
-    what = f"column '{name}' is missing or null" if value is None else f"column '{name}' is {value!r}"
+    what = (
+        f"column '{name}' is missing or null" if value is None else f"column '{name}' is {value!r}"
+    )
     raise UnreadableInput(what, where=where, hint=f"it must be {kind.__name__}")
 
 
 def read_rows(path: str | Path) -> list[Row]:
-    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending order.
+    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending
+    order.
 
-    Whole blocks of lines are decoded and checked at once. A block in which anything differs from what a run writes is
-    read cell by cell, which accepts it or names line and column.
+    Whole blocks of lines are decoded and checked at once. A block in which anything differs from
+    what a run writes is read cell by cell, which accepts it or names line and column.
     """
     rows: list[Row] = []
     for first, ends, block in _blocks(Path(path)):
@@ -201,7 +223,10 @@ def read_rows(path: str | Path) -> list[Row]:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Pause the collector, which would visit all rows again and again while they are read. They have no cycles."""
+    """Pause the collector, which would visit all rows again and again while they are read.
+
+    They have no cycles.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -216,12 +241,16 @@ def _add_cell_by_cell(rows: list[Row], block: bytes, path: str | Path, first: in
         row = parse_row(record, where)
         if rows and row.seq <= rows[-1].seq:
             what = f"scan {row.seq} after scan {rows[-1].seq}"
-            raise UnreadableInput(what, where=where, hint="the file is not as a run wrote it: run again")
+            raise UnreadableInput(
+                what, where=where, hint="the file is not as a run wrote it: run again"
+            )
         rows.append(row)
 
 
 def _checked_at_once(block: bytes, lines: int) -> list[Row] | None:
-    """The rows of some lines, None where a line is not one object with the columns, types and ranges of a row."""
+    """The rows of some lines, None where a line is not one object with the columns, types and
+    ranges of a row.
+    """
     decode = _decoder()
     found = decode(block) if decode else None
     if found is None or len(found) != lines:
@@ -235,9 +264,11 @@ def _checked_at_once(block: bytes, lines: int) -> list[Row] | None:
 
 @cache
 def _decoder() -> Callable[[bytes], list[Row] | None] | None:
-    """Decodes JSON lines into rows and checks names, types and ranges, without a call for each cell.
+    """Decodes JSON lines into rows and checks names, types and ranges, without a call for each
+    cell.
 
-    The function returns None where a line does not pass. Where msgspec is not installed, None takes its place.
+    The function returns None where a line does not pass. Where msgspec is not installed, None takes
+    its place.
     """
     try:
         import msgspec
@@ -254,7 +285,9 @@ def _decoder() -> Callable[[bytes], list[Row] | None] | None:
         (name, kinds[kind] | None, None) if nullable else (name, kinds[kind])
         for name, (kind, nullable) in field_types().items()
     ]
-    checked = msgspec.defstruct("CheckedRow", fields, kw_only=True, forbid_unknown_fields=True, gc=False)
+    checked = msgspec.defstruct(
+        "CheckedRow", fields, kw_only=True, forbid_unknown_fields=True, gc=False
+    )
     lines = msgspec.json.Decoder(checked)
 
     def decode(block: bytes) -> list[Row] | None:
@@ -267,7 +300,8 @@ def _decoder() -> Callable[[bytes], list[Row] | None] | None:
 
 
 def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
-    """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid Unicode only.
+    """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid
+    Unicode only.
 
     Raises UnreadableInput otherwise.
     """

@@ -1,4 +1,7 @@
-"""The worst moments of a run, with their cause: intervals without a used scan, scans whose error or NIS stands out."""
+"""The worst moments of a run, with their cause.
+
+Intervals without a used scan, scans whose error or NIS stands out.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,8 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.report import NIS_LIMIT
 from avsreplay.report.charts import values
+from avsreplay.report.summary import NIS_LIMIT
 from avsreplay.report.summary_parts import length_text
 from avsreplay.rows import Row
 
@@ -23,8 +26,10 @@ class Moment:
     """An interval with a large error or without a used scan.
 
     Attributes:
-        row: index of its worst row.  start_s, end_s: since the first scan.
-        what: what happened, with its size and what is usual.  cause: its cause by the rows.
+        row: index of its worst row.
+        start_s, end_s: since the first scan.
+        what: what happened, with its size and what is usual.
+        cause: its cause by the rows.
     """
 
     row: int
@@ -35,7 +40,10 @@ class Moment:
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
-    """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
+    """The five worst intervals: without a used scan, or with an error or NIS that stands out.
+
+    No two overlap.
+    """
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
         if len(kept) == MOMENTS:
@@ -46,7 +54,10 @@ def worst_moments(rows: Sequence[Row]) -> list[Moment]:
 
 
 def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
-    """Candidates with a weight: flagged intervals and single scans whose error or NIS stands out."""
+    """Candidates with a weight.
+
+    Flagged intervals and single scans whose error or NIS stands out.
+    """
     for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
         places = list(group)
         if flagged:
@@ -62,7 +73,10 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
     for value, k in _largest(values(rows, "nis"), used):
         if value > NIS_LIMIT:
             text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
-            yield 3.0 * value / NIS_LIMIT, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
+            yield (
+                3.0 * value / NIS_LIMIT,
+                Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k)),
+            )
 
 
 def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]:
@@ -77,17 +91,23 @@ def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, 
     error = "" if largest is None else f", position error up to {length_text(largest)}"
     count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
     span = rows[places[0]].t_s, rows[places[-1]].t_s
-    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1]))
+    return 3.0 * len(places), Moment(
+        worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1])
+    )
 
 
 def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
-    """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or at k."""
+    """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or
+    at k.
+    """
     row, end = rows[k], rows[k if last is None else last]
     before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
     if row.fault:
         return f"injected: {plain(row.fault)}"
     moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
-    manoeuvre = "manoeuvre of the target" + ("" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s")
+    manoeuvre = "manoeuvre of the target" + (
+        "" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s"
+    )
     if row.gamma == 0:
         return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
     if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
@@ -108,4 +128,8 @@ def plain(name: str) -> str:
 
 def median_of(figures: Array) -> float | None:
     """Median of the finite figures, None if there is none."""
-    return float(known[len(known) // 2]) if len(known := np.sort(figures[np.isfinite(figures)])) else None
+    return (
+        float(known[len(known) // 2])
+        if len(known := np.sort(figures[np.isfinite(figures)]))
+        else None
+    )

@@ -1,7 +1,8 @@
-"""One builder for every HTML page: of a run, a comparison, a campaign, a flight. Self-contained, no network, no server.
+"""One builder for every HTML page: of a run, a comparison, a campaign, a flight. Self-contained, no
+network, no server.
 
-Text reaches a page through Jinja templates with autoescape. Charts are drawn by uPlot (50 kB, MIT, bundled) and the
-3D view by plain WebGL, so that a page is its data plus 0.1 MB.
+Text reaches a page through Jinja templates with autoescape. Charts are drawn by uPlot (50 kB, MIT,
+bundled) and the 3D view by plain WebGL, so that a page is its data plus 0.1 MB.
 """
 
 from __future__ import annotations
@@ -19,12 +20,19 @@ from markupsafe import Markup
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
-from avsreplay.report import Summary, charts
+from avsreplay.report import charts
 from avsreplay.report.approach import approach_picture
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome, gate_table
-from avsreplay.report.summary_tables import fact_lines, in_one_line, moments_table, summary_tables, verdict_table
+from avsreplay.report.summary import Summary
+from avsreplay.report.summary_tables import (
+    fact_lines,
+    in_one_line,
+    moments_table,
+    summary_tables,
+    verdict_table,
+)
 from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of
 from avsreplay.report.view import View, cone_lines, scene, thin_surface
@@ -84,7 +92,8 @@ def build_html(
     Args:
         title: of the page and its first heading.
         lines: under the title, the verdict first.
-        parts: tables, headings, figures and folded text, in order; a table without rows is left out.
+        parts: tables, headings, figures and folded text, in order; a table without rows is left
+            out.
         data: charts and 3D view for the scripts; without it the page has no script.
         lead: parts above the charts.
 
@@ -97,7 +106,14 @@ def build_html(
     embedded = Markup(charts.embed(data)) if data else ""
     return str(
         render(
-            "page.html", title=title, lines=lines, lead=first, parts=listed, style=style, script=script, data=embedded
+            "page.html",
+            title=title,
+            lines=lines,
+            lead=first,
+            parts=listed,
+            style=style,
+            script=script,
+            data=embedded,
         )
     )
 
@@ -144,7 +160,13 @@ def build_page(
     columns = charts.derived(rows)
     t1 = summary.convergence.t1_s
     data = {
-        "runs": [{"name": title, "t": charts.pack(charts.values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
+        "runs": [
+            {
+                "name": title,
+                "t": charts.pack(charts.values(rows, "t_s"), "f8"),
+                "columns": _packed(columns),
+            }
+        ],
         "charts": charts.charts(columns, truth, (header or {}).get("limits")),
         "spans": charts.spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
@@ -154,7 +176,9 @@ def build_page(
     }
     errors, faults, manoeuvres, *others = summary_tables(summary, rows)
     picture = approach_picture(rows, view, header or {})
-    parts: list[Part] = [] if picture is None else [Section("Approach"), render("approach.svg", **picture)]
+    parts: list[Part] = (
+        [] if picture is None else [Section("Approach"), render("approach.svg", **picture)]
+    )
     parts += [errors, *others, facts_table("Run", fact_lines(summary))]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
@@ -163,7 +187,10 @@ def build_page(
     lines = [verdict.line, in_one_line(summary)]
     if len(rows) < len(all_rows):
         count = f"{len(rows)} of {len(all_rows)} scans"
-        lines.append(f"The charts show {count}: of every interval the first scan and those with the largest errors.")
+        lines.append(
+            f"The charts show {count}: of every interval the first scan and those with the largest"
+            " errors."
+        )
     return build_html(title, lines, parts, data, lead)
 
 
@@ -172,7 +199,9 @@ def _packed(columns: charts.Columns) -> dict[str, Any]:
 
 
 def build_comparison(
-    runs: Sequence[ComparedRun], conclusions: Sequence[Conclusion], outcomes: Sequence[RuleOutcome] = ()
+    runs: Sequence[ComparedRun],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[RuleOutcome] = (),
 ) -> str:
     """The page of several runs: conclusions, metrics in tables, charts over each other.
 
@@ -187,7 +216,11 @@ def build_comparison(
     columns = [charts.derived(run.rows) for run in runs]
     data = {
         "runs": [
-            {"name": run.name, "t": charts.pack(charts.values(run.rows, "t_s"), "f8"), "columns": _packed(own)}
+            {
+                "name": run.name,
+                "t": charts.pack(charts.values(run.rows, "t_s"), "f8"),
+                "columns": _packed(own),
+            }
             for run, own in zip(runs, columns, strict=True)
         ],
         "charts": _overlaid(runs, columns),
@@ -201,7 +234,11 @@ def build_comparison(
     parts = [changes_table(runs[0].name, c, show_all=True) for c in conclusions]
     names = ", ".join(run.name for run in runs)
     return build_html(
-        "Comparison", [*lines, f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"], parts, data, lead
+        "Comparison",
+        [*lines, f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"],
+        parts,
+        data,
+        lead,
     )
 
 
@@ -209,12 +246,18 @@ def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
     if not outcomes:
         return ""
     broken = sum(not o.ok for o in outcomes)
-    return f" {broken} of {len(outcomes)} rules broken." if broken else f" All {len(outcomes)} rules hold."
+    return (
+        f" {broken} of {len(outcomes)} rules broken."
+        if broken
+        else f" All {len(outcomes)} rules hold."
+    )
 
 
 def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) -> list[charts.Chart]:
     """One chart for each line of the single-run charts, with a line per run."""
-    everything: charts.Columns = {name: column for own in reversed(columns) for name, column in own.items()}
+    everything: charts.Columns = {
+        name: column for own in reversed(columns) for name, column in own.items()
+    }
     out = []
     for chart in charts.charts(everything):
         for line in chart["series"]:
@@ -226,7 +269,16 @@ def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) ->
             alone = len(chart["series"]) == 1
             title = chart["title"] if alone else f"{chart['title']}: {line['label']}"
             levels = chart["levels"] if alone else []
-            out.append(chart | {"key": line["column"], "title": title, "series": series, "bands": [], "levels": levels})
+            out.append(
+                chart
+                | {
+                    "key": line["column"],
+                    "title": title,
+                    "series": series,
+                    "bands": [],
+                    "levels": levels,
+                }
+            )
     return out
 
 
@@ -253,7 +305,9 @@ class Flight:
     surface: Surface | None = None
 
 
-def build_flight_page(title: str, lines: Sequence[str], flight: Flight, facts: Iterable[tuple[str, str]]) -> str:
+def build_flight_page(
+    title: str, lines: Sequence[str], flight: Flight, facts: Iterable[tuple[str, str]]
+) -> str:
     """Return the page of a flight as text; the same arguments give the same bytes.
 
     Args:
@@ -262,7 +316,9 @@ def build_flight_page(title: str, lines: Sequence[str], flight: Flight, facts: I
         flight: The flight.
         facts: Figures of the plan, as names and texts.
     """
-    columns = {name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()}
+    columns = {
+        name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()
+    }
     data = {
         "runs": [{"name": title, "t": charts.pack(flight.t_s, "f8"), "columns": _packed(columns)}],
         "charts": charts.flight_charts(columns),
@@ -272,13 +328,17 @@ def build_flight_page(title: str, lines: Sequence[str], flight: Flight, facts: I
         "scene": _scene(flight),
     }
     note = (
-        "3D view: frame of the fixture {C}, in which the target is at rest. Time counts from the instant of planning."
+        "3D view: frame of the fixture {C}, in which the target is at rest. Time counts from the"
+        " instant of planning."
     )
     return build_html(title, [*lines, note], [facts_table("Plan", facts)], data)
 
 
 def _scene(flight: Flight) -> dict[str, Any]:
-    """Data for ``scene.js``: the model at rest, the path in {C}, the gripper at every instant, the cones."""
+    """Data for ``scene.js``.
+
+    The model at rest, the path in {C}, the gripper at every instant, the cones.
+    """
     view = None if flight.surface is None else View(*thin_surface(flight.surface))
     still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(flight.t_s), 1))
     cones = [cone_lines(flight.axis_c, *cone, flight.mouth_m) for cone in flight.cones]

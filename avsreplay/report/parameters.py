@@ -1,4 +1,7 @@
-"""Estimated parameters of the body: those of the paper, and those that do not depend on the order of the axes."""
+"""Estimated parameters of the body.
+
+Those of the paper, and those that do not depend on the order of the axes.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ class Parameter:
     """An estimated constant at the last scan.
 
     Attributes:
-        estimate, truth: its components, in ``unit``.  error: length of their difference (rotation angle for mu).
+        estimate, truth: its components, in ``unit``.
+        error: length of their difference (rotation angle for mu).
         one_sigma: root of the trace of its covariance.
         note: whether the value depends on the order of the principal axes.
     """
@@ -43,12 +47,21 @@ class Parameter:
 
 
 def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is given."""
+    """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is
+    given.
+    """
     sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
     found = [
         _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s, ONE_ORDER),
         _vector("sigma2", "", (row.sigma2,), sigma[1], row.sigma2_1s, ONE_ORDER),
-        _vector("c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), _of(truth, "c_b"), row.c_1s_m, ONE_ORDER),
+        _vector(
+            "c (varrho)",
+            "m",
+            (row.cx_m, row.cy_m, row.cz_m),
+            _of(truth, "c_b"),
+            row.c_1s_m,
+            ONE_ORDER,
+        ),
         _attitude(row, truth),
         *_in_fixture_frame(row, truth),
     ]
@@ -56,7 +69,10 @@ def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
 
 
 def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
-    """Parameters that do not depend on the order of the axes: moments, and inertia, mass centre and rate in {C}."""
+    """Parameters that do not depend on the order of the axes.
+
+    Moments, and inertia, mass centre and rate in {C}.
+    """
     moments = tensor = centre = rate = None
     if truth is not None:
         R_cb, found = geometry.matrix(truth.q_bc).T, _moments(truth)
@@ -69,15 +85,24 @@ def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
     return [
         _vector("moments / sum, ascending: 1 2 3", "", small, moments, row.moments_1s),
         _vector("inertia / trace in {C}: xx yy zz xy xz yz", "", entries, tensor, row.inertia_1s),
-        _vector("mass centre in {C}", "m", (row.com_x_m, row.com_y_m, row.com_z_m), centre, row.com_1s_m),
         _vector(
-            "rate in {C}", "rad/s", (row.rate_cx_radps, row.rate_cy_radps, row.rate_cz_radps), rate, row.rate_c_1s_radps
+            "mass centre in {C}", "m", (row.com_x_m, row.com_y_m, row.com_z_m), centre, row.com_1s_m
+        ),
+        _vector(
+            "rate in {C}",
+            "rad/s",
+            (row.rate_cx_radps, row.rate_cy_radps, row.rate_cz_radps),
+            rate,
+            row.rate_c_1s_radps,
         ),
     ]
 
 
 def _moments(x: State) -> geometry.Array:
-    """Principal moments (3,) over their sum, from the inertia ratios: I / tr I is 1 over the diagonal of B(sigma)."""
+    """Principal moments (3,) over their sum, from the inertia ratios.
+
+    I / tr I is 1 over the diagonal of B(sigma).
+    """
     s1, s2 = float(x.sigma[0]), float(x.sigma[1])
     xx = 1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2)
     yy = 1.0 + (2.0 + s1 * s2 - s2) / (1.0 + s1)

@@ -1,6 +1,7 @@
 """Reads a result directory: rows, run facts, truth, summary, 3D view.
 
-``rows.jsonl`` is required; ``run.json`` (with ``facts``), ``truth.tum`` and ``view.npz`` are optional.
+``rows.jsonl`` is required; ``run.json`` (with ``facts``), ``truth.tum`` and ``view.npz`` are
+optional.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
-from avsreplay.report import Summary
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
+from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
 from avsreplay.settings import dump
@@ -38,9 +39,12 @@ class Result:
     """The result of a run as read from its directory.
 
     Attributes:
-        name: of its folder.  header: content of ``run.json``, empty if the file does not exist.
-        truth: the true state at the last scan, its axes named as the estimate's.  poses: true poses of {C} in {A}.
-        unverified: why the files could not be compared with run.json; empty if they are as the run wrote them.
+        name: of its folder.
+        header: content of ``run.json``, empty if the file does not exist.
+        truth: the true state at the last scan, its axes named as the estimate's.
+        poses: true poses of {C} in {A}.
+        unverified: why the files could not be compared with run.json; empty if they are as the run
+            wrote them.
         whole: whether it is a result directory, not a single file of rows.
     """
 
@@ -75,30 +79,47 @@ class Result:
         if stated is not None:
             return float(stated)
         if self.view is None or not len(self.view.vertices):
-            raise UsageError("the target's size is not known", where=str(path), hint="give it with --extent METRES")
+            raise UsageError(
+                "the target's size is not known",
+                where=str(path),
+                hint="give it with --extent METRES",
+            )
         return bounding_diagonal(self.view.vertices)
 
     @property
     def losses(self) -> int:
         """Return the number of damaged places in the log of the run."""
         found = self.header.get("losses")
-        return int(found["count"]) if isinstance(found, dict) and isinstance(found.get("count"), int) else 0
+        return (
+            int(found["count"])
+            if isinstance(found, dict) and isinstance(found.get("count"), int)
+            else 0
+        )
 
     @property
     def warnings(self) -> list[str]:
         """Return the known defects of this result, one sentence each."""
         out = [f"{self.name}: not verified, {self.unverified}"] if self.unverified else []
         out += [f"{self.name}: its log was damaged at {self.losses} places"] if self.losses else []
-        return out + ([f"{self.name}: the run was interrupted"] if "interrupted_after" in self.header else [])
+        return out + (
+            [f"{self.name}: the run was interrupted"] if "interrupted_after" in self.header else []
+        )
 
 
 def facts_record(
-    *, labels: Sequence[Label] | None = None, truth: State | None = None, counts: Mapping[str, int] | None = None
+    *,
+    labels: Sequence[Label] | None = None,
+    truth: State | None = None,
+    counts: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """What ``Summary.fold`` received beside the rows, as JSON values for the key ``facts`` of ``run.json``."""
+    """What ``Summary.fold`` received beside the rows, as JSON values for the key ``facts`` of
+    ``run.json``.
+    """
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
-        "truth": None if truth is None else {name: getattr(truth, name).tolist() for name in _STATE},
+        "truth": None
+        if truth is None
+        else {name: getattr(truth, name).tolist() for name in _STATE},
         "counts": dict(counts or {}),
     }
 
@@ -109,8 +130,14 @@ def _label_record(label: Label) -> dict[str, Any]:
 
 
 def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
-    """Write ``run.json``: ``record``, the number of rows, and size and SHA-256 of every file in the folder."""
-    files = {path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)} for path in sorted(folder.iterdir())}
+    """Write ``run.json``.
+
+    ``record``, the number of rows, and size and SHA-256 of every file in the folder.
+    """
+    files = {
+        path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)}
+        for path in sorted(folder.iterdir())
+    }
     text = json.dumps(dump({**record, "rows": rows, "files": files}), indent=1, allow_nan=False)
     (folder / "run.json").write_text(text + "\n", encoding="utf-8")
 
@@ -125,24 +152,33 @@ def sha256(path: Path) -> str:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a result directory, or a single ``rows.jsonl``, and verify its files against ``run.json``.
+    """Read a result directory, or a single ``rows.jsonl``, and verify its files against
+    ``run.json``.
 
     Args:
         path: the directory or the rows.
 
     Returns:
-        The result. ``unverified`` states why it could not be verified; it is empty if all files are as the run wrote
-        them.
+        The result. ``unverified`` states why it could not be verified; it is empty if all files are
+        as the run wrote them.
 
     Raises:
-        UnreadableInput: a file is missing, damaged, or differs from the size, SHA-256 or number of rows in run.json.
+        UnreadableInput: a file is missing, damaged, or differs from the size, SHA-256 or number of
+            rows in run.json.
     """
     path = Path(path)
     folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
     if folder and not rows_path.is_file():
-        raise UnreadableInput("holds no rows.jsonl", where=str(path), hint="name a directory written by run -o")
-    whole = folder or (path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None)
-    header, unverified = _header(whole / "run.json") if whole else {}, "it is a single file of rows without run.json"
+        raise UnreadableInput(
+            "holds no rows.jsonl", where=str(path), hint="name a directory written by run -o"
+        )
+    whole = folder or (
+        path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None
+    )
+    header, unverified = (
+        _header(whole / "run.json") if whole else {},
+        "it is a single file of rows without run.json",
+    )
     if whole:
         unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
     with without_garbage_collection():
@@ -167,14 +203,19 @@ def _header(path: Path) -> dict[str, Any]:
     for key in _TABLES:
         if not isinstance(header.get(key, {}), dict):
             raise UnreadableInput(f"'{key}' is not a JSON object", where=str(path), hint=_RUN_AGAIN)
-    drawn = [header.get("limits", {}).get(name) for name in ("rms_max_m", "alpha_max_m", "length_m")]
+    drawn = [
+        header.get("limits", {}).get(name) for name in ("rms_max_m", "alpha_max_m", "length_m")
+    ]
     if not all(v is None or (type(v) in (int, float) and _LEAST <= v < _LARGEST) for v in drawn):
         raise UnreadableInput("'limits' are not positive numbers", where=str(path), hint=_RUN_AGAIN)
     return header
 
 
 def _verify(folder: Path, header: Mapping[str, Any], names: Sequence[str] | None) -> str:
-    """Compare files with size and SHA-256 in run.json; return why this is not possible, or an empty string."""
+    """Compare files with size and SHA-256 in run.json.
+
+    Return why this is not possible, or an empty string.
+    """
     files = header.get("files")
     if not isinstance(files, dict) or "rows.jsonl" not in files:
         return "run.json lists no files" if header else "there is no run.json"
@@ -187,9 +228,13 @@ def _verify(folder: Path, header: Mapping[str, Any], names: Sequence[str] | None
         try:
             same = path.stat().st_size == entry.get("bytes") and sha256(path) == entry.get("sha256")
         except OSError as error:
-            raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint=_RUN_AGAIN) from None
+            raise UnreadableInput(
+                error.strerror or "cannot be read", where=str(path), hint=_RUN_AGAIN
+            ) from None
         if not same:
-            raise UnreadableInput("differs from its SHA-256 in run.json", where=str(path), hint=_RUN_AGAIN)
+            raise UnreadableInput(
+                "differs from its SHA-256 in run.json", where=str(path), hint=_RUN_AGAIN
+            )
     return ""
 
 
@@ -200,13 +245,18 @@ def _facts(record: Any, where: str) -> tuple[list[Label] | None, State | None, d
         known = None if labels is None else [_label(label) for label in labels]
         return known, None if truth is None else _state(truth), counts
     except (TypeError, ValueError, AttributeError, KeyError):
-        raise UnreadableInput("'facts' in run.json are not as written by a run", where=where, hint=_RUN_AGAIN) from None
+        raise UnreadableInput(
+            "'facts' in run.json are not as written by a run", where=where, hint=_RUN_AGAIN
+        ) from None
 
 
 def _label(values: Mapping[str, Any]) -> Label:
     label = Label(**values)
     times = (label.start_ns, label.end_ns)
-    if not all(type(t) is int and -(2**63) <= t < 2**63 for t in times) or type(label.harmful) is not bool:
+    if (
+        not all(type(t) is int and -(2**63) <= t < 2**63 for t in times)
+        or type(label.harmful) is not bool
+    ):
         raise ValueError("a label of the wrong type")
     if not isinstance(label.kind, str) or not label.kind.isprintable():
         raise ValueError("a label without a name")
@@ -228,7 +278,10 @@ def _state(values: Mapping[str, Any]) -> State:
 
 
 def read_tum(path: str | Path) -> list[StampedPose]:
-    """Read a TUM file: (t_ns, pose) with times exact to the nanosecond. Raises UnreadableInput with the line."""
+    """Read a TUM file: (t_ns, pose) with times exact to the nanosecond.
+
+    Raises UnreadableInput with the line.
+    """
     hint = "name a TUM trajectory"
     text = read_limited(Path(path), _MAX_TUM, hint).decode("utf-8", "backslashreplace")
     out: list[StampedPose] = []
@@ -239,7 +292,8 @@ def read_tum(path: str | Path) -> list[StampedPose]:
 
 
 def motion_samples(poses: Sequence[StampedPose], since_ns: int) -> tuple[Array, list[Pose]]:
-    """Return the times [s] after ``since_ns`` and the poses, ascending, without those within 10 us of an earlier one.
+    """Return the times [s] after ``since_ns`` and the poses, ascending, without those within 10 us
+    of an earlier one.
 
     Args:
         poses: times and poses in any order.
@@ -258,11 +312,17 @@ def _stamped(line: str, where: str) -> StampedPose:
         stamp, *words = line.split()
         x, y, z, *q = values = [float(v) for v in words]
         seconds = Decimal(stamp)
-        if not abs(seconds) < _LONGEST_S or len(q) != 4 or not all(abs(v) < _LARGEST for v in values):
+        if (
+            not abs(seconds) < _LONGEST_S
+            or len(q) != 4
+            or not all(abs(v) < _LARGEST for v in values)
+        ):
             raise ValueError("a pose out of range")
         t_ns = int((seconds * 1_000_000_000).to_integral_value(ROUND_DOWN))
         if not abs(math.hypot(*q) - 1.0) <= _UNIT:
             raise ValueError("not a unit quaternion")
         return t_ns, Pose(q, [x, y, z])  # type: ignore[arg-type]
     except (ValueError, ArithmeticError):
-        raise UnreadableInput("not 'stamp x y z qx qy qz qw'", where=where, hint="name a TUM trajectory") from None
+        raise UnreadableInput(
+            "not 'stamp x y z qx qy qz qw'", where=where, hint="name a TUM trajectory"
+        ) from None

@@ -37,7 +37,8 @@ def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
 
 @value_class(eq=True)
 class VelocityChange:
-    """A manoeuvre of the target as last reported: instant since the first scan and size, with 1 sigma.
+    """A manoeuvre of the target as last reported: instant since the first scan and size, with 1
+    sigma.
 
     Attributes:
         reported_s: instant of the first scan that reports it, since the first scan.
@@ -58,25 +59,34 @@ class VelocityChange:
 
     @classmethod
     def of(cls, taken: Mapping[str, Sequence[Any]]) -> tuple[VelocityChange, ...]:
-        """Return the manoeuvres that the rows of a run report: each row counts them and describes the last one.
+        """Return the manoeuvres that the rows of a run report: each row counts them and describes
+        the last one.
 
         Args:
             taken: the values of ``COLUMNS`` in all rows.
         """
         found: list[tuple[int, int]] = []  # the first and the last row that describe each manoeuvre
-        for k, (count, instant) in enumerate(zip(taken["manoeuvres"], taken["manoeuvre_s"], strict=True)):
+        for k, (count, instant) in enumerate(
+            zip(taken["manoeuvres"], taken["manoeuvre_s"], strict=True)
+        ):
             if count and instant is not None:
                 found[count - 1 :] = [(found[count - 1][0] if len(found) >= count else k, k)]
             else:
                 del found[count or 0 :]
         columns = [taken[name] for name in cls.COLUMNS[2:]]
-        return tuple(cls(taken["t_s"][first], *(column[last] or 0.0 for column in columns)) for first, last in found)
+        return tuple(
+            cls(taken["t_s"][first], *(column[last] or 0.0 for column in columns))
+            for first, last in found
+        )
 
     @property
     def significance(self) -> float:
         """Return the larger of the two changes in standard deviations."""
         sizes = ((self.velocity_mps, self.velocity_1s_mps), (self.rate_radps, self.rate_1s_radps))
-        return max(value / sigma if sigma > 0.0 else math.inf * value if value else 0.0 for value, sigma in sizes)
+        return max(
+            value / sigma if sigma > 0.0 else math.inf * value if value else 0.0
+            for value, sigma in sizes
+        )
 
     def __str__(self) -> str:
         sizes = (
@@ -89,7 +99,10 @@ class VelocityChange:
 
 @value_class(eq=True)
 class Drifting:
-    """A constant torque or force on the target: onset since the first scan and accelerations, with 1 sigma."""
+    """A constant torque or force on the target.
+
+    Onset since the first scan and accelerations, with 1 sigma.
+    """
 
     onset_s: float
     onset_1s_s: float
@@ -100,16 +113,26 @@ class Drifting:
 
     @classmethod
     def of(cls, row: Row) -> Drifting | None:
-        """Return the drift known at a row; None where there is none that exceeds 2 standard deviations.
+        """Return the drift known at a row; None where there is none that exceeds 2 standard
+        deviations.
 
         Args:
             row: the last row of a run.
         """
         if row.drift_s is None:
             return None
-        found = (row.drift_1s_s, row.drift_mps2, row.drift_1s_mps2, row.drift_radps2, row.drift_1s_radps2)
+        found = (
+            row.drift_1s_s,
+            row.drift_mps2,
+            row.drift_1s_mps2,
+            row.drift_radps2,
+            row.drift_1s_radps2,
+        )
         drift = cls(row.drift_s, *(value or 0.0 for value in found))
-        force, torque = drift.force_mps2 > 2.0 * drift.force_1s_mps2, drift.torque_radps2 > 2.0 * drift.torque_1s_radps2
+        force, torque = (
+            drift.force_mps2 > 2.0 * drift.force_1s_mps2,
+            drift.torque_radps2 > 2.0 * drift.torque_1s_radps2,
+        )
         return drift if force or torque else None
 
     def __str__(self) -> str:
@@ -134,7 +157,9 @@ def times(count: int) -> str:
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 
-def events(rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None) -> Iterator[str]:
+def events(
+    rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None
+) -> Iterator[str]:
     """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
 
     Args:
@@ -154,7 +179,9 @@ def events(rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Dri
 
 @value_class(eq=True)
 class Statistics:
-    """Root mean square, mean, median, standard deviation (over n), smallest and largest of ``count`` values."""
+    """Root mean square, mean, median, standard deviation (over n), smallest and largest of
+    ``count`` values.
+    """
 
     count: int
     rmse: float
@@ -172,7 +199,9 @@ class Statistics:
         if not n:
             return None
         mean = math.fsum(array.tolist()) / n
-        rmse, std = (math.sqrt(math.fsum((part * part).tolist()) / n) for part in (array, array - mean))
+        rmse, std = (
+            math.sqrt(math.fsum((part * part).tolist()) / n) for part in (array, array - mean)
+        )
         return cls(n, rmse, mean, median(array), std, float(array.min()), float(array.max()))
 
 
@@ -185,7 +214,9 @@ def median(values: ArrayLike) -> float:
 
 @value_class(eq=True)
 class CaptureMiss:
-    """Distance, relative speed and attitude error of the gripper to the true grasp point when it closed."""
+    """Distance, relative speed and attitude error of the gripper to the true grasp point when it
+    closed.
+    """
 
     position_m: float
     speed_mps: float | None
@@ -194,12 +225,15 @@ class CaptureMiss:
 
 @value_class(eq=True)
 class Capture:
-    """Planned instants of capture since the first scan; a replan is a row whose plan differs from the one before.
+    """Planned instants of capture since the first scan; a replan is a row whose plan differs from
+    the one before.
 
     Attributes:
-        last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
+        last_s, first_s: of the last and the first plan.
+        std_s, range_s: over all replans.
         status: of the last plan.
-        plan_miss_m: distance to the true grasp point at the end of each plan, flown without replanning.
+        plan_miss_m: distance to the true grasp point at the end of each plan, flown without
+            replanning.
         miss: when the gripper closed; None where it never closed or without truth.
         actions: scans under each of the supervisor's actions.
     """
@@ -239,7 +273,9 @@ class Capture:
             std_s=spread.std if spread else None,
             range_s=spread.max - spread.min if spread else None,
             status=plans[-1][0] if plans else None,
-            plan_miss_m=Statistics.of([miss_m for miss_m in taken["plan_miss_m"] if miss_m is not None]),
+            plan_miss_m=Statistics.of(
+                [miss_m for miss_m in taken["plan_miss_m"] if miss_m is not None]
+            ),
             miss=None if miss is None else CaptureMiss(*miss),
             actions=dict(sorted(Counter(filter(None, taken["action"])).items())),
         )

@@ -1,4 +1,6 @@
-"""The tables of one run, the same for terminal and page, and the single lines that are printed about it."""
+"""The tables of one run, the same for terminal and page, and the single lines that are printed
+about it.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,9 @@ from rich.console import Console
 
 from avsreplay.errors import counted
 from avsreplay.records import BLOCKS
-from avsreplay.report import Errors, Summary
 from avsreplay.report.episodes import Episode
 from avsreplay.report.parameters import Parameter
+from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Statistics, length_text, times
 from avsreplay.report.table import (
     Table,
@@ -77,7 +79,9 @@ def verdict_table(verdict: RunVerdict) -> Table:
     rows.append(("first pose from", verdict.first_pose))
     if verdict.robot:
         rows.append(("robot", verdict.robot))
-    rows += [("changed setting", text) for text in verdict.changed] or [("settings", "all at their defaults")]
+    rows += [("changed setting", text) for text in verdict.changed] or [
+        ("settings", "all at their defaults")
+    ]
     return Table("Verdict", ("what", "value"), tuple(rows), align="l")
 
 
@@ -91,7 +95,10 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
-    """Errors, injected faults, manoeuvres, parameters and consistency; a table without content has no rows."""
+    """Errors, injected faults, manoeuvres, parameters and consistency.
+
+    A table without content has no rows.
+    """
     events = fault_table(summary, rows), manoeuvre_table(summary, rows)
     return error_table(summary), *events, parameter_table(summary), consistency_table(summary)
 
@@ -109,18 +116,27 @@ def error_table(summary: Summary) -> Table:
         found += [(name, "m", errors.position_m), (name, "deg", errors.rotation_deg)]
     found.append(("fit error rms", "m", summary.fit_error_m))
     title = "Errors against the fitted motion" if summary.reference == "fit" else "Errors"
-    rows = tuple(_error_row(name, unit, spread) for name, unit, spread in found if spread is not None)
+    rows = tuple(
+        _error_row(name, unit, spread) for name, unit, spread in found if spread is not None
+    )
     return Table(title, ("of", "unit", "n", *_STATISTICS), rows, align="llr")
 
 
 def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
     unit, factor = ("mm", 1000.0) if unit == "m" and spread.rmse < 1.0 else (unit, 1.0)
     spec = f".{decimals([factor * spread.rmse], 2)}f"
-    return name, unit, str(spread.count), *(format(factor * getattr(spread, s), spec) for s in _STATISTICS)
+    return (
+        name,
+        unit,
+        str(spread.count),
+        *(format(factor * getattr(spread, s), spec) for s in _STATISTICS),
+    )
 
 
 def consistency_table(summary: Summary) -> Table:
-    """Normalised errors squared against their degrees of freedom and two-sided 95 % chi-square bands."""
+    """Normalised errors squared against their degrees of freedom and two-sided 95 % chi-square
+    bands.
+    """
     sizes = {f"NEES {name}": block.stop - block.start for name, block in BLOCKS.items()}
     blocks = [(f"NEES {name}", share) for name, share in summary.nees_blocks.items()]
     listed = [("NIS", 6, summary.nis, 1), ("NEES", 20, summary.nees, 1)]
@@ -143,7 +159,15 @@ def consistency_table(summary: Summary) -> Table:
 
 def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     """Injected faults; with ``rows`` the first cell leads to the fault's first scan."""
-    heads = ("kind", "from\n[s]", "to\n[s]", "scans\nflagged", "verdict", "delay\n[s]", "recovery\n[s]")
+    heads = (
+        "kind",
+        "from\n[s]",
+        "to\n[s]",
+        "scans\nflagged",
+        "verdict",
+        "delay\n[s]",
+        "recovery\n[s]",
+    )
     lines = tuple(
         (
             TableCell(e.kind, scan=_nearest_row(e.start_s, rows)),
@@ -161,7 +185,14 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
 
 def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     """Changes of the target's velocity; with ``rows`` the first cell leads to the nearest scan."""
-    heads = ("t\n[s]", "1 sigma\n[s]", "velocity\n[mm/s]", "1 sigma\n[mm/s]", "rate\n[deg/s]", "1 sigma\n[deg/s]")
+    heads = (
+        "t\n[s]",
+        "1 sigma\n[s]",
+        "velocity\n[mm/s]",
+        "1 sigma\n[mm/s]",
+        "rate\n[deg/s]",
+        "1 sigma\n[deg/s]",
+    )
     lines = tuple(
         (
             TableCell(f"{m.t_s:.2f}", scan=_nearest_row(m.t_s, rows)),
@@ -174,12 +205,18 @@ def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
         )
         for m in summary.velocity_changes
     )
-    return Table("Manoeuvres of the target: changes of its velocity", (*heads, "reported\n[s]"), lines)
+    return Table(
+        "Manoeuvres of the target: changes of its velocity", (*heads, "reported\n[s]"), lines
+    )
 
 
 def _nearest_row(t_s: float, rows: Sequence[Row]) -> int | None:
     after = bisect_left(rows, t_s, key=lambda row: row.t_s)
-    return min(range(max(after - 1, 0), min(after + 1, len(rows))), key=lambda k: abs(rows[k].t_s - t_s), default=None)
+    return min(
+        range(max(after - 1, 0), min(after + 1, len(rows))),
+        key=lambda k: abs(rows[k].t_s - t_s),
+        default=None,
+    )
 
 
 def _verdict(episode: Episode) -> TableCell:
@@ -195,9 +232,9 @@ def parameter_table(summary: Summary) -> Table:
     heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
     rows = tuple(row for p in summary.parameters for row in _parameter_rows(p))
     note = (
-        "error and 1 sigma of a vector are those of all its components together, given in its first row; sigma, c and"
-        " mu refer to one order of the principal axes, which is arbitrary (a permutation describes the same body), the"
-        " values below them do not depend on it"
+        "error and 1 sigma of a vector are those of all its components together, given in its first"
+        " row; sigma, c and mu refer to one order of the principal axes, which is arbitrary (a"
+        " permutation describes the same body), the values below them do not depend on it"
     )
     return Table("Parameters at the last scan", heads, rows, align="llr", note=note)
 
@@ -211,7 +248,9 @@ def _parameter_rows(p: Parameter) -> list[tuple[str, ...]]:
     for k, component in enumerate(components):
         last = (_small(p.error), sigma) if k == 0 else ("", "")
         label = f"{name} {component}".rstrip()
-        rows.append((label, p.unit, number(p.estimate[k], ".4f"), number(truth[k], ".4f", ""), *last))
+        rows.append(
+            (label, p.unit, number(p.estimate[k], ".4f"), number(truth[k], ".4f", ""), *last)
+        )
     return rows
 
 
@@ -222,12 +261,20 @@ def _small(value: float | None) -> str:
 
 def in_one_line(summary: Summary) -> str:
     """Scans used, faults, errors, t_1 and planned capture."""
-    parts = [f"{summary.healthy} of {summary.scans} scans used", *_fault_words(summary), *_error_words(summary)]
+    parts = [
+        f"{summary.healthy} of {summary.scans} scans used",
+        *_fault_words(summary),
+        *_error_words(summary),
+    ]
     t1, capture = summary.convergence.t1_s, summary.capture.last_s
     parts.append("not converged" if t1 is None else f"converged at {t1:.1f} s")
     parts.append("no capture planned" if capture is None else f"capture planned at {capture:.2f} s")
     miss = summary.capture.miss
-    parts += [] if miss is None else [f"gripper closed {length_text(miss.position_m)} from the true grasp point"]
+    parts += (
+        []
+        if miss is None
+        else [f"gripper closed {length_text(miss.position_m)} from the true grasp point"]
+    )
     return "; ".join(parts) + "."
 
 
@@ -245,17 +292,33 @@ def _fault_words(summary: Summary) -> list[str]:
 
 def _error_words(summary: Summary) -> list[str]:
     """Errors against the truth in healthy scans; without a healthy scan, while coasting."""
-    for errors, scans in ((summary.pose_healthy, "healthy scans"), (summary.pose_coasting, "coasting scans")):
+    for errors, scans in (
+        (summary.pose_healthy, "healthy scans"),
+        (summary.pose_coasting, "coasting scans"),
+    ):
         if errors.position_m is not None and errors.rotation_deg is not None:
-            rms = f"{length_text(errors.position_m.rmse)} and {errors.rotation_deg.rmse:.3g} deg rms in {scans}"
+            rms = (
+                f"{length_text(errors.position_m.rmse)} and {errors.rotation_deg.rmse:.3g} deg rms"
+                f" in {scans}"
+            )
             return [f"pose error {rms}"]
     return ["no truth to compare with"]
 
 
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
-    """(name, value) of everything that takes one line: scans, faults, filter, plan, counts, speed."""
-    facts = [*_scan_facts(summary), *_fault_facts(summary), *_filter_facts(summary), *_plan_facts(summary)]
-    facts += [(name.replace("_", " "), str(count)) for name, count in summary.counts.items() if count]
+    """(name, value) of everything that takes one line.
+
+    Scans, faults, filter, plan, counts, speed.
+    """
+    facts = [
+        *_scan_facts(summary),
+        *_fault_facts(summary),
+        *_filter_facts(summary),
+        *_plan_facts(summary),
+    ]
+    facts += [
+        (name.replace("_", " "), str(count)) for name, count in summary.counts.items() if count
+    ]
     if scans_per_s is not None:
         facts.append(("speed", f"{scans_per_s:.1f} scans/s"))
     return facts
@@ -264,14 +327,25 @@ def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tu
 def _scan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     interval = "" if summary.interval_s is None else f", one every {summary.interval_s:.3g} s"
     yield "scans", f"{summary.scans} in {summary.duration_s:.2f} s{interval}"
-    yield "used", f"{summary.healthy} healthy (gamma 1), {summary.coasting} coasting{_counted(summary.reasons)}"
+    yield (
+        "used",
+        (
+            f"{summary.healthy} healthy (gamma 1), {summary.coasting}"
+            f" coasting{_counted(summary.reasons)}"
+        ),
+    )
     if summary.gaps:
-        yield "gaps", f"{summary.gaps} interval{'s' * (summary.gaps != 1)} longer than 1.5 x the median"
+        yield (
+            "gaps",
+            f"{summary.gaps} interval{'s' * (summary.gaps != 1)} longer than 1.5 x the median",
+        )
     coast = summary.longest_coast
     if coast is not None:
         error = ""
         if coast.pos_err_m is not None and coast.rot_err_deg is not None:
-            error = f"; error at its end {length_text(coast.pos_err_m)}, {coast.rot_err_deg:.3f} deg"
+            error = (
+                f"; error at its end {length_text(coast.pos_err_m)}, {coast.rot_err_deg:.3f} deg"
+            )
         yield "longest coast", f"{coast.scans} scans, {coast.duration_s:.2f} s{error}"
 
 
@@ -282,27 +356,43 @@ def _counted(counts: Mapping[str, int]) -> str:
 def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     faults = summary.faults
     if not faults.known:
-        yield "flagged", f"{counted(faults.false_alarms, 'scan')}; the log does not state the injected faults"
+        yield (
+            "flagged",
+            f"{counted(faults.false_alarms, 'scan')}; the log does not state the injected faults",
+        )
         return
     events = f"{faults.injected} injected, {faults.detected} detected, {faults.missed} missed"
-    scans = f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans flagged"
+    scans = (
+        f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans"
+        " flagged"
+    )
     alarms = f"{faults.false_alarms} of {faults.unlabelled} scans without a fault"
     yield "harmful faults", f"{events}; {scans}"
     rate = f"{alarms} ({100.0 * faults.false_alarm_rate:.2f} %)"
     yield "false alarms", rate if faults.unlabelled else "unknown: every scan carries a fault"
     if faults.longest_recovery_s is not None:
-        yield "recovery", f"at most {faults.longest_recovery_s:.2f} s after the first scan past a fault"
+        yield (
+            "recovery",
+            f"at most {faults.longest_recovery_s:.2f} s after the first scan past a fault",
+        )
 
 
 def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if summary.sigma_hits is not None:
-        floors = f", eigenvalue floor of R active {times(summary.r_floors)}" if summary.r_floors is not None else ""
+        floors = (
+            f", eigenvalue floor of R active {times(summary.r_floors)}"
+            if summary.r_floors is not None
+            else ""
+        )
         yield "constraints", f"sigma bound active {times(summary.sigma_hits)}{floors}"
     if summary.reinitialised is not None:
         taken = f"{summary.weighed_down} healthy poses down-weighted (NIS above its 99.99 % point)"
         yield "outliers", f"{taken}; estimate reinitialised {times(summary.reinitialised)}"
     if summary.manoeuvres is not None:
-        yield "manoeuvres", f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed"
+        yield (
+            "manoeuvres",
+            f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed",
+        )
     if summary.acceleration is not None:
         yield "acceleration", summary.acceleration
     if summary.drift is not None:
@@ -311,7 +401,9 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
         raw, scaled = (number(value, ".1f") for value in (seen.log10_cond, seen.log10_cond_scaled))
-        condition = "" if seen.log10_cond is None else f"; log10 condition {raw} raw, {scaled} scaled"
+        condition = (
+            "" if seen.log10_cond is None else f"; log10 condition {raw} raw, {scaled} scaled"
+        )
         yield "Gramian", f"along the estimates: rank {seen.rank} of 20 ({full}){condition}"
 
 
@@ -333,11 +425,24 @@ def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
         found, n = capture.plan_miss_m, capture.plan_miss_m.count
         yield (
             "hindsight",
-            f"{n} plans miss by {length_text(found.median)} in the median, {length_text(found.max)} at most",
+            (
+                f"{n} plans miss by {length_text(found.median)} in the median,"
+                f" {length_text(found.max)} at most"
+            ),
         )
     if capture.miss is not None:
-        speed = "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"
+        speed = (
+            "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"
+        )
         turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
-        yield "gripper", f"closed {length_text(capture.miss.position_m)}{speed}{turn} from the true grasp point"
+        yield (
+            "gripper",
+            f"closed {length_text(capture.miss.position_m)}{speed}{turn} from the true grasp point",
+        )
     if capture.actions:
-        yield "actions", ", ".join(f"{action} {counted(count, 'scan')}" for action, count in capture.actions.items())
+        yield (
+            "actions",
+            ", ".join(
+                f"{action} {counted(count, 'scan')}" for action, count in capture.actions.items()
+            ),
+        )

@@ -1,7 +1,8 @@
-"""One table type for terminal, HTML page and Markdown, and the table of the scans, cut to the width of the console.
+"""One table type for terminal, HTML page and Markdown, and the table of the scans, cut to the width
+of the console.
 
-Cells are text and never interpreted as markup. States have a sign as well as a colour (Okabe and Ito's colours), so
-that a table can be read without colour.
+Cells are text and never interpreted as markup. States have a sign as well as a colour (Okabe and
+Ito's colours), so that a table can be read without colour.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from rich.text import Text
 from avsreplay.errors import value_class
 from avsreplay.rows import Column, Row, columns
 
-PLAIN_WIDTH, _WRAPPED = 80, 12  # the latter: least width of a column of wrapped text, with its margin
+PLAIN_WIDTH, _WRAPPED = (
+    80,
+    12,
+)  # the latter: least width of a column of wrapped text, with its margin
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
@@ -53,8 +57,8 @@ class Table:
         title: one line.
         heads: column headings; a line end in one is kept.
         rows: cells in the order of the headings.
-        align: a letter per column, "l" (text, may wrap), "n" (names, one line) or "r" (numbers); the last letter holds
-            for all further ones.
+        align: a letter per column, "l" (text, may wrap), "n" (names, one line) or "r" (numbers);
+            the last letter holds for all further ones.
         note: one line under the table.
         wide: whether a page gives it the whole width.
     """
@@ -80,18 +84,23 @@ def as_cell(cell: str | TableCell) -> TableCell:
     return cell if isinstance(cell, TableCell) else TableCell(cell)
 
 
-def make_console(stream: IO[str] | None = None, *, width: int | None = None, plain_width: int = PLAIN_WIDTH) -> Console:
+def make_console(
+    stream: IO[str] | None = None, *, width: int | None = None, plain_width: int = PLAIN_WIDTH
+) -> Console:
     """Return a console that interprets no markup.
 
     Args:
         stream: where to print; standard output by default.
         width: fixed width in columns; by default that of the terminal.
-        plain_width: width where ``stream`` is not a terminal; there is no colour there, nor under ``NO_COLOR``.
+        plain_width: width where ``stream`` is not a terminal; there is no colour there, nor under
+            ``NO_COLOR``.
     """
     stream = stream or sys.stdout
     if width is None and not stream.isatty():
         width = plain_width
-    return Console(file=stream, width=width, highlight=False, markup=False, emoji=False, soft_wrap=False)
+    return Console(
+        file=stream, width=width, highlight=False, markup=False, emoji=False, soft_wrap=False
+    )
 
 
 def ascii_only(console: Console) -> bool:
@@ -100,22 +109,34 @@ def ascii_only(console: Console) -> bool:
 
 
 def print_table(console: Console, table: Table, *, tight: bool = False) -> None:
-    """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank between columns.
+    """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank
+    between columns.
 
-    Lines are longer than the console is wide where numbers and names, which are never cut, require it.
+    Lines are longer than the console is wide where numbers and names, which are never cut, require
+    it.
     """
     if table.rows:
-        width, console.width = console.width, max(console.width, _least_width(table, 1 if tight else 2))
+        width, console.width = (
+            console.width,
+            max(console.width, _least_width(table, 1 if tight else 2)),
+        )
         console.print(_rich(console, table, tight))
         console.width = width
         console.print()
 
 
 def _least_width(table: Table, gap: int) -> int:
-    """Width at which no column of one line is cut; all columns have one where the gap between them is 1."""
-    columns_of_text = zip(table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True)
+    """Width at which no column of one line is cut.
+
+    All columns have one where the gap between them is 1.
+    """
+    columns_of_text = zip(
+        table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True
+    )
     return sum(
-        _WRAPPED if gap > 1 and table.letter(k) == "l" else gap + max(map(cell_len, "\n".join(texts).split("\n")))
+        _WRAPPED
+        if gap > 1 and table.letter(k) == "l"
+        else gap + max(map(cell_len, "\n".join(texts).split("\n")))
         for k, texts in enumerate(columns_of_text)
     )
 
@@ -141,7 +162,9 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
     for k, head in enumerate(table.heads):
         one_line = tight or table.letter(k) != "l"
         justify: Literal["left", "right"] = "right" if table.right(k) else "left"
-        drawn.add_column(Text(head), justify=justify, no_wrap=one_line, overflow="fold", vertical="top")
+        drawn.add_column(
+            Text(head), justify=justify, no_wrap=one_line, overflow="fold", vertical="top"
+        )
     for row in table.rows:
         drawn.add_row(*(_text(as_cell(cell), console) for cell in row))
     return drawn
@@ -181,7 +204,9 @@ def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
 
 
 def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
-    """Number of decimals, ``least`` to 8, that show ``figures`` significant figures of the middle value."""
+    """Number of decimals, ``least`` to 8, that show ``figures`` significant figures of the middle
+    value.
+    """
     sizes: Sequence[float] = sorted(abs(v) for v in values if v)
     wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2])) if sizes else least
     return min(max(least, wanted), 8)
@@ -203,16 +228,39 @@ _HEADS = {  # a line end stands where the heading may break
     "rot_err_deg": "attitude\nerror",
 }
 _ORDER = (  # which columns are kept first where the width is short
-    *("seq", "t_s", "reason", "fault", "pos_err_m", "rot_err_deg", "rms_m", "nis", "capture_time_s", "iterations"),
-    *("inlier_ratio", "action", "converged", "sigma1", "sigma2", "ogm_rank", "ogm_log10_cond", "status"),
+    *(
+        "seq",
+        "t_s",
+        "reason",
+        "fault",
+        "pos_err_m",
+        "rot_err_deg",
+        "rms_m",
+        "nis",
+        "capture_time_s",
+        "iterations",
+    ),
+    *(
+        "inlier_ratio",
+        "action",
+        "converged",
+        "sigma1",
+        "sigma2",
+        "ogm_rank",
+        "ogm_log10_cond",
+        "status",
+    ),
 )
 _TEXT_COLUMNS = ("reason", "fault", "action", "status")
 
 
-def choose_rows(rows: Sequence[Row], *, every: int | None = None, show_all: bool = False) -> tuple[list[Row], str]:
+def choose_rows(
+    rows: Sequence[Row], *, every: int | None = None, show_all: bool = False
+) -> tuple[list[Row], str]:
     """Return the rows to show and a description of the choice.
 
-    With neither flag: every k-th row so that about 24 are left, the last one, and those at which gamma changes.
+    With neither flag: every k-th row so that about 24 are left, the last one, and those at which
+        gamma changes.
     """
     if show_all or (every is None and len(rows) <= FEW):
         return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
@@ -222,7 +270,9 @@ def choose_rows(rows: Sequence[Row], *, every: int | None = None, show_all: bool
     turns = {k for k in range(1, len(rows)) if rows[k].gamma != rows[k - 1].gamma}
     turns = turns if len(turns) <= FEW else set()
     kept = sorted(set(range(0, len(rows), step)) | {len(rows) - 1} | turns)
-    words = f"every {_ordinal(step)} of {len(rows)} scans" + (" and where gamma changes" if turns else "")
+    words = f"every {_ordinal(step)} of {len(rows)} scans" + (
+        " and where gamma changes" if turns else ""
+    )
     return [rows[k] for k in kept], words
 
 
@@ -231,15 +281,26 @@ def _ordinal(n: int) -> str:
     return f"{n}{ending}"
 
 
-def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = None, show_all: bool = False) -> Table:
-    """The table of the chosen rows; columns that do not fit the console are left out and named in the note."""
+def scan_table(
+    console: Console, rows: Sequence[Row], *, every: int | None = None, show_all: bool = False
+) -> Table:
+    """The table of the chosen rows.
+
+    Columns that do not fit the console are left out and named in the note.
+    """
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
     plain = ascii_only(console)
     shown = {c.name: c for c in _shown(chosen)}
     cells = {name: _cells(c, chosen) for name, c in shown.items()}
     heads = {name: _head(c, chosen) for name, c in shown.items()}
     widths = {
-        name: max([*(len(c.signed(ascii_only=plain)) for c in cells[name]), *map(len, heads[name].split("\n"))]) + 1
+        name: max(
+            [
+                *(len(c.signed(ascii_only=plain)) for c in cells[name]),
+                *map(len, heads[name].split("\n")),
+            ]
+        )
+        + 1
         for name in cells
     }
     fitting = _fit(widths, console.width)
@@ -254,7 +315,10 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
 
 
 def head(column: Column, shown: str = "") -> str:
-    """A heading of whole words with the unit on the last line; ``shown`` is the unit of the printed numbers."""
+    """A heading of whole words with the unit on the last line.
+
+    ``shown`` is the unit of the printed numbers.
+    """
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
     name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
     name = _HEADS.get(column.name, name.replace("_", " "))
@@ -323,10 +387,15 @@ _LABEL = 32
 
 
 def spark(values: Sequence[float | None], width: int) -> str:
-    """At most ``width`` blocks from 0 to the largest value, each the largest of its part; a blank for none."""
+    """At most ``width`` blocks from 0 to the largest value, each the largest of its part.
+
+    A blank for none.
+    """
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)
-    return "".join(_BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " " for p in parts)
+    return "".join(
+        _BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " " for p in parts
+    )
 
 
 def _parts(count: int, width: int) -> list[tuple[int, int]]:
@@ -339,12 +408,18 @@ def print_sparks(console: Console, rows: Sequence[Row]) -> None:
     if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
         return
     width = console.width - _LABEL
-    shown = (("position error", "mm", "pos_err_m", 1000.0), ("attitude error", "deg", "rot_err_deg", 1.0))
+    shown = (
+        ("position error", "mm", "pos_err_m", 1000.0),
+        ("attitude error", "deg", "rot_err_deg", 1.0),
+    )
     for name, unit, column, scale in shown:
         values = [None if (v := getattr(row, column)) is None else scale * v for row in rows]
         if known := [v for v in values if v is not None]:
             label = f"{name} to {max(known):.3g} {unit}"
             console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
-    flags = "".join("✗" if any(row.gamma == 0 for row in rows[a:b]) else "·" for a, b in _parts(len(rows), width))
+    flags = "".join(
+        "✗" if any(row.gamma == 0 for row in rows[a:b]) else "·"
+        for a, b in _parts(len(rows), width)
+    )
     console.print(Text(f"{'flagged':{_LABEL}}").append(flags, style="#D55E00"))
     console.print()

@@ -1,7 +1,8 @@
-"""The verdict on a run: PASS, CHECK or FAIL with its reasons, the origin of the first pose, and the worst moments.
+"""The verdict on a run: PASS, CHECK or FAIL with its reasons, the origin of the first pose, and the
+worst moments.
 
-FAIL: the result must not be used, for example because most scans were not used. CHECK: a person should look at the
-named part. The limits below are stated in docs/report.md.
+FAIL: the result must not be used, for example because most scans were not used. CHECK: a person
+should look at the named part. The limits below are stated in docs/report.md.
 """
 
 from __future__ import annotations
@@ -14,20 +15,30 @@ from typing import Any
 import numpy as np
 
 from avsreplay.errors import value_class
-from avsreplay.report import Summary
 from avsreplay.report.charts import values
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
+from avsreplay.report.summary import Summary
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
 
-USED_FAIL, USED_CHECK = 0.5, 0.9  # share of the scans without an injected harmful fault that updated the filter
+USED_FAIL, USED_CHECK = (
+    0.5,
+    0.9,
+)  # share of the scans without an injected harmful fault that updated the filter
 INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
 FALSE_ALARMS = 0.05  # share of the scans without a fault
 ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
-GROWTH, GROWTH_SCANS = 3.0, 30  # ratio of the median errors of the last and the first third of the used scans; scans
-GROWN_LEAST, TURNED_LEAST = 0.001, 0.25  # smallest median of the last third, over the extent, and [deg]
-SAME_ERROR = 0.2  # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
+GROWTH, GROWTH_SCANS = (
+    3.0,
+    30,
+)  # ratio of the median errors of the last and the first third of the used scans; scans
+GROWN_LEAST, TURNED_LEAST = (
+    0.001,
+    0.25,
+)  # smallest median of the last third, over the extent, and [deg]
+# spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
+SAME_ERROR = 0.2
 SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
@@ -88,12 +99,15 @@ class RunVerdict:
             "robot": self.robot,
             "changed_settings": list(self.changed),
             "worst_moments": [
-                {"t_s": m.start_s, "end_s": m.end_s, "what": m.what, "cause": m.cause} for m in self.moments
+                {"t_s": m.start_s, "end_s": m.end_s, "what": m.what, "cause": m.cause}
+                for m in self.moments
             ],
         }
 
 
-def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> RunVerdict:
+def verdict_of(
+    rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
+) -> RunVerdict:
     """Return the verdict on a run.
 
     Args:
@@ -107,12 +121,16 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     header = header or {}
     extent_m = (header.get("model") or {}).get("extent_m")
     stopped, checks = header.get("interrupted_after"), header.get("preflight") or ()
-    outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
+    outside = (
+        [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")]
+        if stopped
+        else []
+    )
     found = (
         _use(rows, summary),
-        (*_errors(rows, extent_m), *_growth(rows, extent_m))
-        if summary.healthy
-        else (),  # without a used scan there is no estimate to judge
+        (
+            (*_errors(rows, extent_m), *_growth(rows, extent_m)) if summary.healthy else ()
+        ),  # without a used scan there is no estimate to judge
         _faults(summary, extent_m),
         _filter(rows, summary),
         _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
@@ -137,8 +155,14 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Scans that updated the filter; those with a harmful fault are not expected to."""
     common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
     if not summary.healthy:
-        none = "the only scan was not" if summary.scans == 1 else f"none of the {summary.scans} scans was"
-        yield Concern(Grade.FAIL, f"{none} used ({'' if summary.scans == 1 else 'mostly '}{plain(common)})")
+        none = (
+            "the only scan was not"
+            if summary.scans == 1
+            else f"none of the {summary.scans} scans was"
+        )
+        yield Concern(
+            Grade.FAIL, f"{none} used ({'' if summary.scans == 1 else 'mostly '}{plain(common)})"
+        )
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
@@ -148,7 +172,10 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(grade, text)
     last = next((k for k in range(len(rows) - 1, -1, -1) if rows[k].gamma == 1), 0)
     if rows[-1].t_s - rows[last].t_s > 0.1 * (rows[-1].t_s - rows[0].t_s) and len(rows) - last > 3:
-        yield Concern(Grade.FAIL, f"no scan after {rows[last].t_s:.1f} s was used, the estimate is only a prediction")
+        yield Concern(
+            Grade.FAIL,
+            f"no scan after {rows[last].t_s:.1f} s was used, the estimate is only a prediction",
+        )
 
 
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
@@ -157,38 +184,59 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     share = position / extent_m if position is not None and extent_m else 0.0
     if share > ERROR_CHECK or (turn or 0.0) > TURN_CHECK:
         yield from _frame(
-            rows, extent_m, Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK
+            rows,
+            extent_m,
+            Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK,
         )
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
-        yield Concern(grade, f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the model")
+        yield Concern(
+            grade,
+            f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the"
+            " model",
+        )
     if turn is not None and turn > TURN_CHECK:
         grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
         yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
     fit = median_of(values([row for row in rows if row.gamma == 1], "rms_m"))
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
-        text = f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its extent"
+        text = (
+            f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its"
+            " extent"
+        )
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
 
 
 def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterator[Concern]:
-    """Large errors that all used scans share: a constant displacement or rotation between two frames of the body.
+    """Large errors that all used scans share: a constant displacement or rotation between two
+    frames of the body.
 
-    With T_true = T X and a constant X the distance |R t_X| and the angle of X are the same at every attitude. An
-    equivalent pose of a symmetric body has such an X, too. Either of the two may be small.
+    With T_true = T X and a constant X the distance |R t_X| and the angle of X are the same at every
+    attitude. An equivalent pose of a symmetric body has such an X, too. Either of the two may be
+    small.
     """
-    used = [row for row in rows if row.gamma == 1 and row.pos_err_m is not None and row.rot_err_deg is not None]
+    used = [
+        row
+        for row in rows
+        if row.gamma == 1 and row.pos_err_m is not None and row.rot_err_deg is not None
+    ]
     if len(used) < GROWTH_SCANS:
         return
     same, small = list[bool](), list[bool]()
-    for column, limit in (("pos_err_m", ERROR_CHECK * (extent_m or 0.0)), ("rot_err_deg", TURN_CHECK)):
+    for column, limit in (
+        ("pos_err_m", ERROR_CHECK * (extent_m or 0.0)),
+        ("rot_err_deg", TURN_CHECK),
+    ):
         low, middle, high = np.quantile(values(used, column), (0.05, 0.5, 0.95))
         same.append(bool(middle > limit and high - low < SAME_ERROR * middle))
         small.append(bool(middle <= limit))
     if any(same) and all(a or b for a, b in zip(same, small, strict=True)):
-        text = "the errors are the same in all used scans: the model has another frame than the true poses"
+        text = (
+            "the errors are the same in all used scans: the model has another frame than the true"
+            " poses"
+        )
         yield Concern(grade, f"{text}, or the target is symmetric; move the model into that frame")
 
 
@@ -206,7 +254,10 @@ def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
         if first is None or last is None or not least or last < max(GROWTH * first, least):
             continue
         sizes = [length_text(v) if column == "pos_err_m" else f"{v:.3g} deg" for v in (first, last)]
-        text = f"the {name} error grows: median {sizes[0]} in the first third of the used scans, {sizes[1]} in the last"
+        text = (
+            f"the {name} error grows: median {sizes[0]} in the first third of the used scans,"
+            f" {sizes[1]} in the last"
+        )
         yield Concern(Grade.CHECK, text)
 
 
@@ -215,68 +266,127 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
     used = max((e.peak_used.pos_err_m or 0.0 for e in faults.episodes if e.harmful), default=0.0)
     if extent_m and used > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if used > ERROR_FAIL * extent_m else Grade.CHECK
-        text = f"{faults.missed_scans} of {faults.harmful_scans} scans with a harmful fault were used"
+        text = (
+            f"{faults.missed_scans} of {faults.harmful_scans} scans with a harmful fault were used"
+        )
         yield Concern(grade, f"{text}, with a position error up to {length_text(used)}")
     missed = [e for e in faults.episodes if e.harmful and not e.detected]
     if missed:
         first = f"{plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
-        text = f"{len(missed)} of {faults.injected} harmful faults were not detected, the first: {first}"
+        text = (
+            f"{len(missed)} of {faults.injected} harmful faults were not detected, the first:"
+            f" {first}"
+        )
         yield Concern(Grade.FAIL, text)
     lost = next((e for e in faults.episodes if e.lost), None)
     if lost is not None:
-        yield Concern(Grade.FAIL, f"the estimate did not recover from {plain(lost.kind)} at {lost.start_s:.1f} s")
+        yield Concern(
+            Grade.FAIL,
+            f"the estimate did not recover from {plain(lost.kind)} at {lost.start_s:.1f} s",
+        )
     if faults.known and faults.false_alarm_rate > FALSE_ALARMS:
         share = 100 * faults.false_alarm_rate
-        yield Concern(Grade.CHECK, f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)")
+        yield Concern(
+            Grade.CHECK,
+            f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)",
+        )
 
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Consistency, reinitialisation and convergence."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
-            low = "too small (overconfident)" if share.median > share.high else "too large (conservative)"
-            where = f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
-            shares = f"{100 * share.inside:.0f} % of {name} inside the 95 % band, {100 * share.above:.0f} % above it"
+            low = (
+                "too small (overconfident)"
+                if share.median > share.high
+                else "too large (conservative)"
+            )
+            where = (
+                f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
+            )
+            shares = (
+                f"{100 * share.inside:.0f} % of {name} inside the 95 % band,"
+                f" {100 * share.above:.0f} % above it"
+            )
             yield Concern(Grade.CHECK, f"{where}only {shares}")
     if len(inconsistent := [row.t_s for row in rows if row.consistent is False]) > 0.1 * len(rows):
         begin = inconsistent[0]
-        text = f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first at {begin:.1f} s"
+        text = (
+            f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first"
+            f" at {begin:.1f} s"
+        )
         yield Concern(Grade.CHECK, text)
     if summary.reinitialised:
         when = next(row.t_s for row in rows if row.reinitialised)
-        text = f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
+        text = (
+            f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
+        )
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
-    yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift))
+    yield from (
+        Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift)
+    )
     if summary.violations:
         when = next(row.t_s for row in rows if row.violations)
-        text = f"the estimate failed {summary.violations} consistency checks, the first at {when:.1f} s"
+        text = (
+            f"the estimate failed {summary.violations} consistency checks, the first at"
+            f" {when:.1f} s"
+        )
         yield Concern(Grade.CHECK, text)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
-        text = f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
+        text = (
+            f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
+        )
         yield Concern(Grade.CHECK, text)
     if (used := [row.free_directions for row in rows if row.gamma == 1]) and all(used):
-        yield Concern(Grade.CHECK, f"no scan determines all directions of the pose (last scan: the model {used[-1]})")
+        yield Concern(
+            Grade.CHECK,
+            f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
+        )
     t1 = summary.convergence
     if rows and t1.t1_s is None:
-        blocks = f" (not converged: {rows[-1].unconverged_blocks})" if rows[-1].unconverged_blocks else ""
-        yield Concern(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
-    elif rows and rows[-1].t_s - (held := max(row.t_s for row in rows if row.converged)) > SHORT_LAPSE_S:
-        yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold after {held:.1f} s")
+        blocks = (
+            f" (not converged: {rows[-1].unconverged_blocks})"
+            if rows[-1].unconverged_blocks
+            else ""
+        )
+        yield Concern(
+            Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}"
+        )
+    elif (
+        rows
+        and rows[-1].t_s - (held := max(row.t_s for row in rows if row.converged)) > SHORT_LAPSE_S
+    ):
+        yield Concern(
+            Grade.CHECK,
+            f"convergence, reached at {t1.t1_s:.1f} s, does not hold after {held:.1f} s",
+        )
 
 
 def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterator[Concern]:
-    """Damaged scans, errors of the back end, losses, and clock problems that the checks before the run did not name."""
+    """Damaged scans, errors of the back end, losses, and clock problems that the checks before the
+    run did not name.
+    """
     damaged = [row for row in rows if row.status == "damaged"]
     if damaged:
-        text = f"{len(damaged)} of {len(rows)} scans cannot be used, the first at {damaged[0].t_s:.1f} s"
+        text = (
+            f"{len(damaged)} of {len(rows)} scans cannot be used, the first at"
+            f" {damaged[0].t_s:.1f} s"
+        )
         yield Concern(Grade.CHECK, f"{text}: {damaged[0].message}" if damaged[0].message else text)
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK
-        yield Concern(grade, f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}")
-    counted = {"losses": "damaged places of the log were left out", "stamps_unset": "scans have no time stamp",
-               "stamps_back": "time stamps go backwards", "stamps_jumped": "time stamps jump"}  # fmt: skip
+        yield Concern(
+            grade,
+            f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}",
+        )
+    counted = {
+        "losses": "damaged places of the log were left out",
+        "stamps_unset": "scans have no time stamp",
+        "stamps_back": "time stamps go backwards",
+        "stamps_jumped": "time stamps jump",
+    }
     for name, text in counted.items():
         if summary.counts.get(name) and not (clock_known and name.startswith("stamps")):
             yield Concern(Grade.CHECK, f"{summary.counts[name]} {text}")
@@ -306,5 +416,11 @@ def _robot(header: Mapping[str, Any]) -> str:
     if header.get("robot"):
         return str(header["robot"])
     figures = (("a_max", "a_max_mps2", "m/s2"), ("latency", "latency_s", "s"))
-    known = [(name, plan[key], unit) for name, key, unit in figures if isinstance(plan.get(key), (int, float))]
-    return ", ".join(["default robot", *(f"{name} {value:g} {unit}" for name, value, unit in known)])
+    known = [
+        (name, plan[key], unit)
+        for name, key, unit in figures
+        if isinstance(plan.get(key), (int, float))
+    ]
+    return ", ".join(
+        ["default robot", *(f"{name} {value:g} {unit}" for name, value, unit in known)]
+    )

@@ -1,6 +1,8 @@
-"""Data of a page's 3D view: a decimated model, decimated clouds and planned paths, kept in ``view.npz``.
+"""Data of a page's 3D view: a decimated model, decimated clouds and planned paths, kept in
+``view.npz``.
 
-Decimation is deterministic: clouds by an even stride, the model by clustering its vertices on a grid.
+Decimation is deterministic: clouds by an even stride, the model by clustering its vertices on a
+grid.
 """
 
 from __future__ import annotations
@@ -39,7 +41,10 @@ Faces = NDArray[np.int32]
 
 @value_class
 class CloudView:
-    """Some points of scan ``seq``: (n, 3) in {A} [m], distances to the model (n,) [m] and intensities (n,) or None."""
+    """Some points of scan ``seq``.
+
+    (n, 3) in {A} [m], distances to the model (n,) [m] and intensities (n,) or None.
+    """
 
     seq: int
     points: Floats
@@ -49,7 +54,10 @@ class CloudView:
 
 @value_class
 class PathView:
-    """A planned path: time of planning, (n, 3) positions in {A} [m], distance to the true grasp point [m]."""
+    """A planned path.
+
+    Time of planning, (n, 3) positions in {A} [m], distance to the true grasp point [m].
+    """
 
     t_ns: int
     points: Floats
@@ -74,7 +82,9 @@ def thin_cloud(
     *,
     most: int = CLOUD_POINTS,
 ) -> CloudView:
-    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m], intensity (n,)."""
+    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m],
+    intensity (n,).
+    """
     points = np.asarray(points)
     count = min(most, len(points))
     chosen = np.arange(count) * (len(points) - 1) // max(count - 1, 1)
@@ -86,7 +96,10 @@ def thin_cloud(
 
 
 def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
-    """At most ``most`` faces (vertices, for a bare cloud): vertices are merged on an ever coarser grid."""
+    """At most ``most`` faces (vertices, for a bare cloud).
+
+    Vertices are merged on an ever coarser grid.
+    """
     vertices, faces = surface.vertices, surface.faces
     size = surface.extent / 256.0 or 1.0
     while max(len(faces), 0 if len(faces) else len(vertices)) > most:
@@ -96,20 +109,32 @@ def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, F
 
 
 def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces]:
-    """Replace the vertices of each grid cell by their mean; collapsed and duplicate faces are removed."""
+    """Replace the vertices of each grid cell by their mean.
+
+    Collapsed and duplicate faces are removed.
+    """
     cells = np.floor((vertices - vertices.min(axis=0)) / size).astype(np.int64)
     member = np.unique(_numbers(cells), return_inverse=True)[1]
     counts = np.bincount(member)
-    merged = np.stack([np.bincount(member, weights=vertices[:, k]) / counts for k in range(3)], axis=1)
+    merged = np.stack(
+        [np.bincount(member, weights=vertices[:, k]) / counts for k in range(3)], axis=1
+    )
     mapped = member[faces]
-    whole = (mapped[:, 0] != mapped[:, 1]) & (mapped[:, 1] != mapped[:, 2]) & (mapped[:, 2] != mapped[:, 0])
+    whole = (
+        (mapped[:, 0] != mapped[:, 1])
+        & (mapped[:, 1] != mapped[:, 2])
+        & (mapped[:, 2] != mapped[:, 0])
+    )
     mapped = mapped[whole]
     first = np.unique(_numbers(np.sort(mapped, axis=1)), return_index=True)[1]
     return merged, mapped[np.sort(first)].astype(np.int32)
 
 
 def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers (n,) in the order of triples (n, 3) of integers from 0; equal triples have the same number."""
+    """Numbers (n,) in the order of triples (n, 3) of integers from 0.
+
+    Equal triples have the same number.
+    """
     first, second, third = triples.T
     pairs = np.unique(first * (second.max(initial=0) + 1) + second, return_inverse=True)[1]
     return np.asarray(pairs * (third.max(initial=0) + 1) + third)
@@ -128,7 +153,9 @@ def write_view(path: str | Path, view: View) -> None:
         "path_t_ns": np.array([p.t_ns for p in view.paths], dtype=np.int64),
         "path_size": np.array([len(p.points) for p in view.paths], dtype=np.int64),
         "path_points": _joined([p.points for p in view.paths]),
-        "path_miss": np.array([np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64),
+        "path_miss": np.array(
+            [np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64
+        ),
     }
     with output_path(path) as part, part.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -140,7 +167,10 @@ def _joined(parts: Sequence[Floats]) -> Floats:
 
 def _each_point(parts: Sequence[tuple[CloudView, Floats | None]]) -> Floats:
     """A value of each point of all clouds, NaN where a cloud has none."""
-    filled = [np.full(len(cloud.points), np.nan, np.float32) if known is None else known for cloud, known in parts]
+    filled = [
+        np.full(len(cloud.points), np.nan, np.float32) if known is None else known
+        for cloud, known in parts
+    ]
     return np.concatenate([np.zeros(0, np.float32), *filled]).astype(np.float32, copy=False)
 
 
@@ -153,17 +183,28 @@ def read_view(path: str | Path) -> View:
     path, hint = Path(path), "run again with -o"
     arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint, optional=("cloud_intensity",))
     try:
-        return _view({name: a.astype(np.float32) if name in _SINGLE else a for name, a in arrays.items()})
+        return _view(
+            {name: a.astype(np.float32) if name in _SINGLE else a for name, a in arrays.items()}
+        )
     except ValueError as error:
         raise UnreadableInput(f"not a view file: {error}", where=str(path), hint=hint) from None
 
 
 def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
     points = _split(arrays["cloud_points"], arrays["cloud_size"])
-    arrays.setdefault("cloud_intensity", np.full(len(arrays["cloud_residual"]), np.nan, np.float32))  # earlier versions
-    residuals, seen = (_split(arrays[f"cloud_{name}"], arrays["cloud_size"]) for name in ("residual", "intensity"))
+    arrays.setdefault(
+        "cloud_intensity", np.full(len(arrays["cloud_residual"]), np.nan, np.float32)
+    )  # earlier versions
+    residuals, seen = (
+        _split(arrays[f"cloud_{name}"], arrays["cloud_size"]) for name in ("residual", "intensity")
+    )
     clouds = tuple(
-        CloudView(int(seq), p, None if np.isnan(r).any() or not len(r) else r, None if np.isnan(i).all() else i)
+        CloudView(
+            int(seq),
+            p,
+            None if np.isnan(r).any() or not len(r) else r,
+            None if np.isnan(i).all() else i,
+        )
         for seq, p, r, i in zip(arrays["cloud_seq"], points, residuals, seen, strict=True)
     )
     lines = _split(arrays["path_points"], arrays["path_size"])
@@ -172,7 +213,10 @@ def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
         for t, p, miss in zip(arrays["path_t_ns"], lines, arrays["path_miss"], strict=True)
     )
     vertices, faces = arrays["vertices"], arrays["faces"]
-    if not all((np.abs(arrays[name]) < _LARGEST).all() for name in ("vertices", "cloud_points", "path_points")):
+    if not all(
+        (np.abs(arrays[name]) < _LARGEST).all()
+        for name in ("vertices", "cloud_points", "path_points")
+    ):
         raise ValueError("points that are not finite or too far away")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError("faces refer to vertices that do not exist")
@@ -196,15 +240,22 @@ RING = 48  # lines of a cone
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
-    """Plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit steps about a centre [m]."""
+    """Plain data for ``scene.js``.
+
+    Poses as columns x y z qx qy qz qw, points as 16-bit steps about a centre [m].
+    """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-    estimate = np.stack([values(rows, n) for n in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=1)
+    estimate = np.stack(
+        [values(rows, n) for n in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=1
+    )
     return {
         "vertices": pack(view.vertices, "f4"),
         "faces": pack(view.faces, "u4"),
         "estimate": pack(estimate, "f4"),
         "truth": pack(_true_poses(rows, truth), "f4"),
-        "clouds": _clouds(_at_most(view.clouds, MOST_CLOUDS), {row.seq: k for k, row in enumerate(rows)}),
+        "clouds": _clouds(
+            _at_most(view.clouds, MOST_CLOUDS), {row.seq: k for k, row in enumerate(rows)}
+        ),
         "paths": _paths(_at_most(view.paths, MOST_PATHS), rows[0].t_ns if rows else 0),
     }
 
@@ -238,7 +289,9 @@ def _clouds(clouds: Sequence[CloudView], place: dict[int, int]) -> dict[str, Any
         "step": pack([p[2] for p in parts], "f4"),
         "points": pack(np.concatenate([np.zeros((0, 3), np.int16), *(p[0] for p in parts)]), "i2"),
         "residual": _levels([(c, c.residual_m) for c in thinned], cap),
-        "intensity": None if brightest is None else _levels([(c, c.intensity) for c in thinned], brightest),
+        "intensity": None
+        if brightest is None
+        else _levels([(c, c.intensity) for c in thinned], brightest),
         "cap_m": cap,
         "brightest": brightest,
     }
@@ -253,7 +306,10 @@ def _quantised(points: NDArray[np.float32]) -> tuple[NDArray[np.int16], NDArray[
 
 
 def _cap(residuals: Sequence[NDArray[np.float32]]) -> float | None:
-    """Residual at the top of the colour scale [m]: twice the median over the scans of their 90 % points."""
+    """Residual at the top of the colour scale [m].
+
+    Twice the median over the scans of their 90 % points.
+    """
     if not residuals:
         return None
     return 2.0 * float(np.median([np.quantile(r, 0.9) for r in residuals])) or 1e-9
@@ -274,11 +330,15 @@ def _levels(parts: Sequence[tuple[CloudView, Floats | None]], top: float | None)
 
 
 def _paths(paths: Sequence[PathView], start_ns: int) -> list[dict[str, Any]]:
-    return [{"t_s": (p.t_ns - start_ns) * 1e-9, "points": pack(p.points, "f4"), "miss_m": p.miss_m} for p in paths]
+    return [
+        {"t_s": (p.t_ns - start_ns) * 1e-9, "points": pack(p.points, "f4"), "miss_m": p.miss_m}
+        for p in paths
+    ]
 
 
 def cone_lines(axis: Array, degrees: float, length: float, mouth: float) -> Array:
-    """Return line segments (2 n, 3) of a cone about an axis: its rim, the rim of its mouth, and lines between them.
+    """Return line segments (2 n, 3) of a cone about an axis: its rim, the rim of its mouth, and
+    lines between them.
 
     The rim lies where the cone meets the ball of radius ``length`` about the grasp point.
 

@@ -1,21 +1,23 @@
-"""Faults injected into a simulated log, each over a window of the log clock and labelled in the log.
+"""Faults injected into a simulated log, each over a window of the log clock and labelled in the
+log.
 
-=================  ===========================================  =======  ========================================
-kind               strength (default)                           harmful  what happens
-=================  ===========================================  =======  ========================================
-occlusion          part of the view covered (1.0)               yes      a plate in front hides it; few plate points
-partial_occlusion  part of the target's returns hidden (0.5)    no       the same, from one side
-dropped            none                                         yes      no message is written
-empty              none                                         yes      a message without a point
-clutter            added points over returns (0.5)              no       points anywhere about the target
-range_bias         added to every range [m] (0.3)               yes      the target seems farther away
-noise_burst        factor on the range noise (5.0)              no       more range noise
-frozen             none                                         yes      the last scan before the window again
-stamp_jump         added to the stamps [s] (30.0)               yes      log time stays true
-=================  ===========================================  =======  ========================================
+=================  ===========================================  =======
+======================================== kind               strength (default)
+harmful  what happens =================  ===========================================  =======
+======================================== occlusion          part of the view covered (1.0)
+yes      a plate in front hides it; few plate points partial_occlusion  part of the target's returns
+hidden (0.5)    no       the same, from one side dropped            none
+yes      no message is written empty              none                                         yes
+a message without a point clutter            added points over returns (0.5)              no
+points anywhere about the target range_bias         added to every range [m] (0.3)               yes
+the target seems farther away noise_burst        factor on the range noise (5.0)              no
+more range noise frozen             none                                         yes      the last
+scan before the window again stamp_jump         added to the stamps [s] (30.0)               yes
+log time stays true =================  ===========================================  =======
+========================================
 
-``harmful`` is part of the label: the scan cannot give a correct pose at its stamp. The estimate should survive a fault
-that is not harmful. A scenario may set it for each fault.
+``harmful`` is part of the label: the scan cannot give a correct pose at its stamp. The estimate
+should survive a fault that is not harmful. A scenario may set it for each fault.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ LONGEST_S = 1e8  # longest log or window: its stamps fit the 31 bits of seconds 
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))
-CLUTTER_RADIUS_RATIO = 1.2  # radius of the ball of clutter over that of the target's bounding sphere
+CLUTTER_RADIUS_RATIO = (
+    1.2  # radius of the ball of clutter over that of the target's bounding sphere
+)
 
 
 class Kind(Enum):
@@ -73,14 +77,19 @@ class InjectedFault(Settings):
 
     kind: Kind = setting(doc="Kind of the fault.")
     start_s: float = setting(
-        doc="Begin of the fault, after the time of the first scan.", unit="s", low=0.0, high=LONGEST_S
+        doc="Begin of the fault, after the time of the first scan.",
+        unit="s",
+        low=0.0,
+        high=LONGEST_S,
     )
     duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0, high=LONGEST_S)
     strength: float | None = setting(
         None, "Strength; its meaning and range depend on the kind.", unset="the default of the kind"
     )
     harmful: bool | None = setting(
-        None, "Whether the label states that such a scan gives no good pose.", unset="as usual for the kind"
+        None,
+        "Whether the label states that such a scan gives no good pose.",
+        unset="as usual for the kind",
     )
 
     def check(self) -> None:
@@ -102,11 +111,15 @@ def fits(kind: Kind, value: float) -> bool:
         return 0.0 < value <= 1.0
     if kind is Kind.CLUTTER:
         return 0.0 < value <= MOST_CLUTTER
-    return abs(value) <= MOST_STRENGTH and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
+    return abs(value) <= MOST_STRENGTH and (
+        value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP)
+    )
 
 
 def strength(fault: InjectedFault) -> float:
-    """The strength of a fault, the default of its kind where none is given (0 for a kind without strength)."""
+    """The strength of a fault, the default of its kind where none is given (0 for a kind without
+    strength).
+    """
     return fault.strength if fault.strength is not None else DEFAULTS[fault.kind][0] or 0.0
 
 
@@ -122,8 +135,12 @@ def label(fault: InjectedFault, epoch_ns: int) -> Label:
     )
 
 
-def active(faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int) -> dict[Kind, InjectedFault]:
-    """The faults whose window contains ``log_ns``, the first of each kind, in the order of the scenario."""
+def active(
+    faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int
+) -> dict[Kind, InjectedFault]:
+    """The faults whose window contains ``log_ns``, the first of each kind, in the order of the
+    scenario.
+    """
     found: dict[Kind, InjectedFault] = {}
     for fault in faults:
         window = label(fault, epoch_ns)
@@ -138,7 +155,8 @@ def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Ge
     Args:
         returns: The returns of the scan.
         covered: Share that is hidden.
-        side_rad: Direction in the image from which the plate enters: 0 from the left, pi / 2 from the top.
+        side_rad: Direction in the image from which the plate enters: 0 from the left, pi / 2 from
+            the top.
         rng: For the returns of the plate.
     """
     draw = rng.random(len(returns.ranges))
@@ -157,7 +175,9 @@ def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Ge
     return replace(returns, ranges=np.where(hidden, on_plate, returns.ranges)).keep(~hidden | back)
 
 
-def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator) -> Returns:
+def clutter(
+    returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator
+) -> Returns:
     """Add ``ratio`` times as many points, uniform over a ball about the target.
 
     Args:
@@ -169,11 +189,18 @@ def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float
     """
     n = round(ratio * len(returns.ranges))
     towards = rng.standard_normal((n, 3))
-    radii = CLUTTER_RADIUS_RATIO * radius_m * np.cbrt(rng.random(n)) / np.sqrt(np.sum(towards * towards, axis=1))
+    radii = (
+        CLUTTER_RADIUS_RATIO
+        * radius_m
+        * np.cbrt(rng.random(n))
+        / np.sqrt(np.sum(towards * towards, axis=1))
+    )
     points = np.asarray(centre_a, dtype=np.float64) + towards * radii[:, None]
     times = rng.choice(returns.times_s, n) if n else np.empty(0)
     ranges = np.sqrt(np.sum(points * points, axis=1))
     ahead = points[:, 2] > 0.0
     one, zero = np.ones(int(ahead.sum())), np.zeros(int(ahead.sum()))
-    added = Returns(points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead], one, zero, zero)
+    added = Returns(
+        points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead], one, zero, zero
+    )
     return returns.joined(added)

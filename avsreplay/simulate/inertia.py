@@ -1,7 +1,8 @@
 """Mass properties of a triangle model, and its principal axes {B}.
 
-Density is uniform over the volume of a closed mesh, or over the area of an open one (a thin shell). Moments are per
-unit mass [m2], since only their ratios affect the motion. Sums are exact (fsum): the order of faces does not matter.
+Density is uniform over the volume of a closed mesh, or over the area of an open one (a thin shell).
+Moments are per unit mass [m2], since only their ratios affect the motion. Sums are exact (fsum):
+the order of faces does not matter.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ class Body:
 
     @property
     def c_b(self) -> Array:
-        """(3,) varrho, the fixture in {B} [m]: p_b = A(mu) p_c + varrho is zero at the mass centre."""
+        """(3,) varrho, the fixture in {B} [m].
+
+        P_b = A(mu) p_c + varrho is zero at the mass centre.
+        """
         return -geometry.rotate(geometry.matrix(self.q_bc), self.centre_c)
 
     @property
@@ -58,37 +62,55 @@ def body_of(surface: Surface) -> Body:
         raise UsageError("a cloud has no mass", where=surface.name, hint=hint)
     mass, first, second = _moments(surface)
     if not mass > 0.0:
-        raise UsageError("the model encloses no volume", where=surface.name, hint="name a mesh that is not flat")
+        raise UsageError(
+            "the model encloses no volume", where=surface.name, hint="name a mesh that is not flat"
+        )
     centre = first / mass
     central = second / mass - np.outer(centre, centre)
     return principal(np.eye(3) * np.trace(central) - central, centre)
 
 
 def principal(inertia_c: ArrayLike, centre_c: ArrayLike) -> Body:
-    """The body with inertia ``inertia_c`` (3, 3) [m2] about its mass centre ``centre_c`` (3,) [m] in {C}.
+    """The body with inertia ``inertia_c`` (3, 3) [m2] about its mass centre ``centre_c`` (3,) [m]
+    in {C}.
 
-    Of the 24 right-handed orders and signs of its principal axes, {B} has those with the smallest rotation from {C}.
+    Of the 24 right-handed orders and signs of its principal axes, {B} has those with the smallest
+    rotation from {C}.
     """
     inertia = np.asarray(inertia_c, dtype=np.float64)
     moments, axes = _jacobi(inertia)
-    best = max(_axis_permutations(axes), key=lambda option: (round(float(np.trace(option[0])), 12), option[1]))
+    best = max(
+        _axis_permutations(axes),
+        key=lambda option: (round(float(np.trace(option[0])), 12), option[1]),
+    )
     R_cb, order = best
     q_bc = geometry.conjugate(geometry.quaternion(R_cb))
-    return Body(frozen(inertia), frozen(centre_c), frozen(moments[list(order)]), frozen(geometry.normalise(q_bc)))
+    return Body(
+        frozen(inertia),
+        frozen(centre_c),
+        frozen(moments[list(order)]),
+        frozen(geometry.normalise(q_bc)),
+    )
 
 
 def with_axes(moments: ArrayLike, q_bc: ArrayLike, centre_c: ArrayLike) -> Body:
     """The body of given principal moments (3,), axes mu (4,) and mass centre (3,) in {C}."""
     R_bc = geometry.matrix(geometry.normalise(q_bc))
     inertia = R_bc.T @ np.diag(np.asarray(moments, dtype=np.float64)) @ R_bc
-    return Body(frozen(inertia), frozen(centre_c), frozen(moments), frozen(geometry.normalise(q_bc)))
+    return Body(
+        frozen(inertia), frozen(centre_c), frozen(moments), frozen(geometry.normalise(q_bc))
+    )
 
 
 def _moments(surface: Surface) -> tuple[float, Array, Array]:
     """Mass, first and second moments about {C}'s origin for unit density."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     if is_closed(surface.vertices, surface.faces):
-        weight, over, under = np.sum(a * np.cross(b, c), axis=1) / 6.0, 4.0, 20.0  # tetrahedra from the origin
+        weight, over, under = (
+            np.sum(a * np.cross(b, c), axis=1) / 6.0,
+            4.0,
+            20.0,
+        )  # tetrahedra from the origin
     else:
         weight, over, under = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1), 3.0, 12.0
     s = a + b + c
@@ -111,8 +133,13 @@ def _axis_permutations(axes: Array) -> list[tuple[Array, tuple[int, ...]]]:
 
 
 def _jacobi(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues (3,) and vectors (columns) of a symmetric matrix by Jacobi rotations, with reproducible bits."""
-    a, v = [[float(x) for x in row] for row in matrix], [[float(i == j) for j in range(3)] for i in range(3)]
+    """Eigenvalues (3,) and vectors (columns) of a symmetric matrix by Jacobi rotations, with
+    reproducible bits.
+    """
+    a, v = (
+        [[float(x) for x in row] for row in matrix],
+        [[float(i == j) for j in range(3)] for i in range(3)],
+    )
     for _sweep in range(12):
         for p, q in ((0, 1), (0, 2), (1, 2)):
             _rotate(a, v, p, q)

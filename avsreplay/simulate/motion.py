@@ -1,12 +1,13 @@
-"""The true motion of a rigid body, integrated with its full inertia tensor in the axes of {C} (not with sigma).
+"""The true motion of a rigid body, integrated with its full inertia tensor in the axes of {C} (not
+with sigma).
 
     I dw/dt = -w x (I w) + torque,   dq/dt = 1/2 q o [w; 0]   (Hamilton product, w in body axes)
     d2r/dt2 = force + gravity gradient of the camera's orbit, where there is one
 
-The right-hand sides are quadratic, or linear with known coefficients, so the Taylor coefficients of the solution follow
-by recurrence. A step covers at most 0.25 rad with 22 terms (truncation error below 1e-13); the polynomial is also the
-dense output. The arithmetic uses Python floats only: the same bits on any machine, except for the sine
-and cosine of the orbit.
+The right-hand sides are quadratic, or linear with known coefficients, so the Taylor coefficients of
+the solution follow by recurrence. A step covers at most 0.25 rad with 22 terms (truncation error
+below 1e-13); the polynomial is also the dense output. The arithmetic uses Python floats only: the
+same bits on any machine, except for the sine and cosine of the orbit.
 """
 
 from __future__ import annotations
@@ -50,16 +51,19 @@ class MotionParams(Settings):
     )
     orbit_rate_radps: float = setting(
         0.0,
-        "Mean motion of the camera's circular orbit, whose gravity gradient acts on the relative motion"
-        " (Clohessy-Wiltshire); 0 means no orbit.",
+        "Mean motion of the camera's circular orbit, whose gravity gradient acts on the relative"
+        " motion (Clohessy-Wiltshire); 0 means no orbit.",
         unit="rad/s",
         low=0.0,
         high=0.1,
     )
     radial_a: tuple[float, float, float] = setting(
-        (1.0, 0.0, 0.0), "Unit vector from the centre of the Earth to the camera in {A}, at the start."
+        (1.0, 0.0, 0.0),
+        "Unit vector from the centre of the Earth to the camera in {A}, at the start.",
     )
-    orbit_normal_a: tuple[float, float, float] = setting((0.0, 1.0, 0.0), "Unit normal of the orbit in {A}.")
+    orbit_normal_a: tuple[float, float, float] = setting(
+        (0.0, 1.0, 0.0), "Unit normal of the orbit in {A}."
+    )
     torque_std_radps2: float = setting(
         0.0,
         "1 sigma of the disturbance torque over the trace of the inertia, each axis of {C}.",
@@ -67,22 +71,31 @@ class MotionParams(Settings):
         low=0.0,
     )
     force_std_mps2: float = setting(
-        0.0, "1 sigma of the disturbance force per unit mass, each axis of {A}.", unit="m/s^2", low=0.0
+        0.0,
+        "1 sigma of the disturbance force per unit mass, each axis of {A}.",
+        unit="m/s^2",
+        low=0.0,
     )
-    disturbance_step_s: float = setting(1.0, "Time for which a disturbance is constant.", unit="s", above=0.0)
+    disturbance_step_s: float = setting(
+        1.0, "Time for which a disturbance is constant.", unit="s", above=0.0
+    )
 
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion."""
         if not is_unit(self.attitude_xyzw):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
         if not are_orthonormal(self.radial_a, self.orbit_normal_a):
-            raise ValueError("radial_a and orbit_normal_a must be unit vectors at right angles to each other")
+            raise ValueError(
+                "radial_a and orbit_normal_a must be unit vectors at right angles to each other"
+            )
 
 
 class Motion:
     """The motion of a body over [0, span_s]."""
 
-    def __init__(self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator
+    ) -> None:
         """Integrate the motion.
 
         Args:
@@ -101,10 +114,13 @@ class Motion:
             times_s: (n,) [s after the begin].
 
         Returns:
-            q_ac (n, 4), rate in {C} (n, 3) [rad/s], mass centre (n, 3) [m] and its velocity (n, 3) [m/s] in {A}.
+            q_ac (n, 4), rate in {C} (n, 3) [rad/s], mass centre (n, 3) [m] and its velocity (n, 3)
+            [m/s] in {A}.
         """
         times = np.asarray(times_s, dtype=np.float64)
-        step = np.clip(np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1)
+        step = np.clip(
+            np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1
+        )
         tau = (times - self._starts[step])[:, None]
         value = np.zeros((len(times), 13))
         for term in range(ORDER, -1, -1):
@@ -161,7 +177,9 @@ class _Instant:
     v: Vector
 
 
-def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def _integrate(
+    body: Body, params: MotionParams, span_s: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
     """Step starts (k,) and Taylor coefficients (k, ORDER + 1, 13) of [q_ac, w_c, r_a, v_a].
 
     Raises:
@@ -169,13 +187,17 @@ def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.G
     """
     inertia = [[float(x) for x in row] for row in body.inertia_c]
     least = min(float(m) for m in body.moments)
-    now = _Instant(_unit(params.attitude_xyzw), params.rate_radps, params.position_m, params.velocity_mps)
+    now = _Instant(
+        _unit(params.attitude_xyzw), params.rate_radps, params.position_m, params.velocity_mps
+    )
     fastest = max(math.hypot(*_times(inertia, now.w)) / least, params.orbit_rate_radps)
     if span_s * fastest > MOST_STEPS * STEP_RAD:
         raise _too_long(span_s)
     starts: list[float] = []
     table: list[Array] = []
-    for begin, until, torque, force in _windows(params, sum(inertia[i][i] for i in range(3)), span_s, rng):
+    for begin, until, torque, force in _windows(
+        params, sum(inertia[i][i] for i in range(3)), span_s, rng
+    ):
         t = begin
         while t < until:
             momentum = math.sqrt(sum(x * x for x in _times(inertia, now.w)))
@@ -217,11 +239,14 @@ def _terms(
     return [(*q, *w, *r, *v) for (q, w), r, v in zip(turning, *translation, strict=True)]
 
 
-def _translation(now: _Instant, params: MotionParams, t: float, force: Vector) -> tuple[list[Vector], list[Vector]]:
+def _translation(
+    now: _Instant, params: MotionParams, t: float, force: Vector
+) -> tuple[list[Vector], list[Vector]]:
     """Taylor coefficients of mass centre and velocity about the time t [s].
 
-    The axes of {A} are inertial. With the mean motion n and the radial unit vector o(t) the relative acceleration is
-    that of Clohessy and Wiltshire, n^2 (3 o o' - 1) r, to first order in the distance.
+    The axes of {A} are inertial. With the mean motion n and the radial unit vector o(t) the
+    relative acceleration is that of Clohessy and Wiltshire, n^2 (3 o o' - 1) r, to first order in
+    the distance.
     """
     zero = (0.0, 0.0, 0.0)
     if params.orbit_rate_radps == 0.0:
@@ -241,8 +266,9 @@ def _translation(now: _Instant, params: MotionParams, t: float, force: Vector) -
 def _gravity_gradient(params: MotionParams, t: float) -> list[Rows]:
     """Taylor coefficients of n^2 (3 o o' - 1) about the time t [s].
 
-    With the radial vector e and the along-track vector f at the time 0, o = e cos(n t) + f sin(n t), so that
-    o o' = (e e' + f f') / 2 + cos(2 n t) (e e' - f f') / 2 + sin(2 n t) (e f' + f e') / 2.
+    With the radial vector e and the along-track vector f at the time 0, o = e cos(n t) + f sin(n
+    t), so that o o' = (e e' + f f') / 2 + cos(2 n t) (e e' - f f') / 2 + sin(2 n t) (e f' + f e') /
+    2.
     """
     n, e, m = params.orbit_rate_radps, params.radial_a, params.orbit_normal_a
     f = (m[1] * e[2] - m[2] * e[1], m[2] * e[0] - m[0] * e[2], m[0] * e[1] - m[1] * e[0])
@@ -262,8 +288,13 @@ def _gravity_gradient(params: MotionParams, t: float) -> list[Rows]:
     return found
 
 
-def _turning(now: _Instant, inertia: Rows, inverse: Rows, torque: Vector) -> list[tuple[Vector, Vector]]:
-    """Taylor coefficients of attitude and rate; a product of series is a sum over i of terms i and k - i."""
+def _turning(
+    now: _Instant, inertia: Rows, inverse: Rows, torque: Vector
+) -> list[tuple[Vector, Vector]]:
+    """Taylor coefficients of attitude and rate.
+
+    A product of series is a sum over i of terms i and k - i.
+    """
     qs, ws, hs = [now.q], [now.w], [_times(inertia, now.w)]
     for k in range(ORDER):
         load = [torque[i] if k == 0 else 0.0 for i in range(3)]

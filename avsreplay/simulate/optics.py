@@ -1,13 +1,14 @@
 """Optics of a scanner: reflectance of materials, intensity of returns, and beams of finite width.
 
-The intensity is that of the return over the return of a white diffuse surface, perpendicular to the beam, at the
-reference range r0 of the scanner:
+The intensity is that of the return over the return of a white diffuse surface, perpendicular to the
+beam, at the reference range r0 of the scanner:
 
     I = (rho_d cos(theta) + rho_s exp(-(theta / w)^2)) (r0 / r)^2
 
-with the angle of incidence theta, the diffuse reflectance rho_d (Lambert's law), and a specular lobe of strength rho_s
-and width w about the normal, since emitter and receiver are at one place. A beam of finite width is sampled by rays; on
-an edge they meet surfaces at different ranges, whose returns merge into one range between them (a mixed pixel).
+with the angle of incidence theta, the diffuse reflectance rho_d (Lambert's law), and a specular
+lobe of strength rho_s and width w about the normal, since emitter and receiver are at one place. A
+beam of finite width is sampled by rays; on an edge they meet surfaces at different ranges, whose
+returns merge into one range between them (a mixed pixel).
 """
 
 from __future__ import annotations
@@ -36,23 +37,33 @@ class Material(Settings):
     name: str = setting(doc="Name of the material.")
     box_m: Corners | None = setting(
         None,
-        "The faces whose centre is within (xmin, ymin, zmin, xmax, ymax, zmax) in {C} have this material; of several"
-        " materials the last applies.",
+        "The faces whose centre is within (xmin, ymin, zmin, xmax, ymax, zmax) in {C} have this"
+        " material; of several materials the last applies.",
         unit="m",
         infinite=True,
         unset="all faces",
     )
     group: str = setting(
-        "", "The faces of this group (g), object (o) or material (usemtl) of an OBJ model; empty: of any."
+        "",
+        "The faces of this group (g), object (o) or material (usemtl) of an OBJ model; empty: of"
+        " any.",
     )
     reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
-    specular: float = setting(0.0, "Strength of the specular lobe in units of a white diffuse surface.", low=0.0)
+    specular: float = setting(
+        0.0, "Strength of the specular lobe in units of a white diffuse surface.", low=0.0
+    )
     specular_width_deg: float = setting(
-        3.0, "Angle of incidence at which the specular lobe has fallen to 1/e.", unit="deg", above=0.0, below=90.0
+        3.0,
+        "Angle of incidence at which the specular lobe has fallen to 1/e.",
+        unit="deg",
+        above=0.0,
+        below=90.0,
     )
     dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
     retroreflectance: float = setting(
-        0.0, "Intensity of a retro-reflector, at any incidence, in units of a white diffuse surface.", low=0.0
+        0.0,
+        "Intensity of a retro-reflector, at any incidence, in units of a white diffuse surface.",
+        low=0.0,
     )
 
 
@@ -61,7 +72,9 @@ class FaceOptics:
     """Optical properties of the faces of a surface, each (m,).
 
     Attributes:
-        diffuse, specular, retro: reflectances.  width_rad: of the specular lobe.  dropouts: share of the returns.
+        diffuse, specular, retro: reflectances.
+        width_rad: of the specular lobe.
+        dropouts: share of the returns.
         normals: (m, 3) unit normals.
     """
 
@@ -76,8 +89,12 @@ class FaceOptics:
         """The properties of some of the faces."""
         return FaceOptics(*(getattr(self, field.name)[faces] for field in fields(self)))
 
-    def intensity(self, faces: NDArray[np.int64], cosines: Array, ranges: Array, reference_m: float) -> Array:
-        """Intensity (n,) of returns from these faces (n,), by cosine of incidence (n,) and range (n,) [m]."""
+    def intensity(
+        self, faces: NDArray[np.int64], cosines: Array, ranges: Array, reference_m: float
+    ) -> Array:
+        """Intensity (n,) of returns from these faces (n,), by cosine of incidence (n,) and range
+        (n,) [m].
+        """
         angle = np.arccos(np.minimum(cosines, 1.0))
         lobe = self.specular[faces] * np.exp(-np.square(angle / self.width_rad[faces]))
         reflected = self.diffuse[faces] * cosines + lobe + self.retro[faces]
@@ -94,12 +111,15 @@ class FaceOptics:
         n = self.normals[faces]
         mirrored = directions - 2.0 * np.einsum("ni,ni->n", directions, n)[:, None] * n
         cosine = np.einsum("ni,ni->n", mirrored, sun)
-        angle = 0.5 * np.arccos(np.clip(cosine, -1.0, 1.0))  # cosine of the angle between the normal and the bisector
+        angle = 0.5 * np.arccos(
+            np.clip(cosine, -1.0, 1.0)
+        )  # cosine of the angle between the normal and the bisector
         return np.asarray((self.specular[faces] > 0.0) & (angle < self.width_rad[faces]))
 
 
 def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
-    """The optical properties of a surface's faces; those without a material have a diffuse reflectance of 0.5.
+    """The optical properties of a surface's faces; those without a material have a diffuse
+    reflectance of 0.5.
 
     Args:
         surface: vertices and faces.
@@ -114,20 +134,31 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     optics = FaceOptics(
-        np.full(count, REFLECTANCE), zero.copy(), np.full(count, 0.1), zero.copy(), zero.copy(), normals
+        np.full(count, REFLECTANCE),
+        zero.copy(),
+        np.full(count, 0.1),
+        zero.copy(),
+        zero.copy(),
+        normals,
     )
     groups = face_groups(surface) if any(material.group for material in materials) else []
     centres = surface.vertices[surface.faces].mean(axis=1)
     for material in materials:
         inside = np.ones(count, dtype=bool)
         if material.box_m is not None:
-            inside = np.all((centres >= material.box_m[:3]) & (centres <= material.box_m[3:]), axis=1)
+            inside = np.all(
+                (centres >= material.box_m[:3]) & (centres <= material.box_m[3:]), axis=1
+            )
         if material.group:
             named = np.array([material.group in names for names in groups], dtype=bool)
             if not named.any():
-                there = ", ".join(sorted({name for names in groups for name in names})[:20]) or "none"
+                there = (
+                    ", ".join(sorted({name for names in groups for name in names})[:20]) or "none"
+                )
                 hint = f"groups of the model: {there}"
-                raise UsageError(f"no group '{material.group}' in the model", where="material.group", hint=hint)
+                raise UsageError(
+                    f"no group '{material.group}' in the model", where="material.group", hint=hint
+                )
             inside &= named
         optics.diffuse[inside] = material.reflectance
         optics.retro[inside] = material.retroreflectance
@@ -138,11 +169,12 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
 
 
 def face_groups(surface: Surface) -> list[frozenset[str]]:
-    """The names of group, object and material of every face of an OBJ model; empty sets for any other format.
+    """The names of group, object and material of every face of an OBJ model; empty sets for any
+    other format.
 
     Args:
-        surface: the model with the bytes of its file. Its faces are found by their centres, because a reader merges
-            vertices and drops faces without area.
+        surface: the model with the bytes of its file. Its faces are found by their centres, because
+            a reader merges vertices and drops faces without area.
     """
     vertices: list[list[float]] = []
     centres: list[Array] = []
@@ -196,7 +228,9 @@ class TracedRays:
         """Ray by ray the nearer surface; it blocks the other one also where it gives no return."""
         other_first = other.ranges < self.ranges
         names = [field.name for field in fields(self)]
-        return TracedRays(*(np.where(other_first, getattr(other, name), getattr(self, name)) for name in names))
+        return TracedRays(
+            *(np.where(other_first, getattr(other, name), getattr(self, name)) for name in names)
+        )
 
     def chosen(self, index: NDArray[np.intp]) -> TracedRays:
         """Some of the rays."""
@@ -204,15 +238,19 @@ class TracedRays:
 
 
 def beam(directions: Array, divergence_rad: float) -> Array:
-    """Rays (k, n, 3) that sample the beams about unit ``directions`` (n, 3); k is 1 without divergence.
+    """Rays (k, n, 3) that sample the beams about unit ``directions`` (n, 3); k is 1 without
+    divergence.
 
-    One ray in the centre and six on a ring, of equal weight; they have the second moments of a uniform cone of full
-    angle ``divergence_rad``, whose radius is half of it: 6/7 ring^2 / 2 = radius^2 / 4.
+    One ray in the centre and six on a ring, of equal weight; they have the second moments of a
+    uniform cone of full angle ``divergence_rad``, whose radius is half of it: 6/7 ring^2 / 2 =
+    radius^2 / 4.
     """
     if divergence_rad == 0.0:
         return directions[None]
     ring = 0.5 * divergence_rad * math.sqrt(7.0 / 12.0)
-    side = np.cross(directions, np.where(np.abs(directions[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    side = np.cross(
+        directions, np.where(np.abs(directions[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    )
     side /= np.linalg.norm(side, axis=1)[:, None]
     other = np.cross(directions, side)
     rays = [directions]
@@ -232,8 +270,8 @@ def merged(ranges: Array, intensities: Array, merge_m: float) -> tuple[Array, Ar
         merge_m: Returns within this distance of the strongest one merge with it.
 
     Returns:
-        Range (n,) [m], the mean weighted by intensity; intensity (n,), averaged over the rays; weights (k, n) of the
-        rays, which sum to 1, or to 0 where nothing returns.
+        Range (n,) [m], the mean weighted by intensity; intensity (n,), averaged over the rays;
+        weights (k, n) of the rays, which sum to 1, or to 0 where nothing returns.
     """
     strongest = np.argmax(intensities, axis=0)
     anchor = np.take_along_axis(ranges, strongest[None], axis=0)
@@ -246,8 +284,11 @@ def merged(ranges: Array, intensities: Array, merge_m: float) -> tuple[Array, Ar
     return np.where(total > 0.0, mean, np.inf), total / len(ranges), weights
 
 
-def kept_returns(ranges: Array, intensities: Array, merge_m: float, returns: int) -> list[tuple[Array, Array, Array]]:
-    """The strongest returns of each beam, as of ``merged``; each ray takes part in one return at most.
+def kept_returns(
+    ranges: Array, intensities: Array, merge_m: float, returns: int
+) -> list[tuple[Array, Array, Array]]:
+    """The strongest returns of each beam, as of ``merged``; each ray takes part in one return at
+    most.
 
     Args:
         ranges: (k, n) range of each ray [m], inf without a return.
@@ -267,8 +308,8 @@ def kept_returns(ranges: Array, intensities: Array, merge_m: float, returns: int
 def crosstalk(ranges: Array, intensities: Array, ratio: float) -> Array:
     """Ranges (n,) with stray light: a share of the strongest return is added to every return.
 
-    The sum of two returns of a continuous-wave instrument has, to first order in their difference, the mean of their
-    ranges weighted by intensity.
+    The sum of two returns of a continuous-wave instrument has, to first order in their difference,
+    the mean of their ranges weighted by intensity.
     """
     if not len(ranges):
         return ranges
@@ -277,7 +318,9 @@ def crosstalk(ranges: Array, intensities: Array, ratio: float) -> Array:
     return np.asarray((intensities * ranges + stray * ranges[strongest]) / (intensities + stray))
 
 
-def bloomed(rays: Array, saturated: Array, angle_rad: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def bloomed(
+    rays: Array, saturated: Array, angle_rad: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rays within an angle of a saturated return.
 
     Args:
@@ -300,4 +343,8 @@ def bloomed(rays: Array, saturated: Array, angle_rad: float) -> tuple[NDArray[np
 
 def part_of(surface: Surface, faces: NDArray[np.intp]) -> Surface:
     """Some of the faces of a mesh."""
-    return surface if len(faces) == len(surface.faces) else replace(surface, faces=surface.faces[faces])
+    return (
+        surface
+        if len(faces) == len(surface.faces)
+        else replace(surface, faces=surface.faces[faces])
+    )

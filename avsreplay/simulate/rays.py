@@ -1,7 +1,8 @@
-"""The table [scanner] of a scenario, and the rays: directions and times in the order of measurement, and triangles hit.
+"""The table [scanner] of a scenario, and the rays: directions and times in the order of
+measurement, and triangles hit.
 
-The triangle is found by embreex where it is installed, by an exhaustive search elsewhere. Either engine only finds the
-triangle; the range is computed from the plane of that triangle in float64.
+The triangle is found by embreex where it is installed, by an exhaustive search elsewhere. Either
+engine only finds the triangle; the range is computed from the plane of that triangle in float64.
 """
 
 from __future__ import annotations
@@ -45,11 +46,13 @@ def ray_grid(
     lissajous: tuple[int, int],
     scan_s: float,
 ) -> tuple[Array, Array]:
-    """Unit directions (n, 3) in {A} in the order of measurement, and times (n,) [s] after the stamp.
+    """Unit directions (n, 3) in {A} in the order of measurement, and times (n,) [s] after the
+    stamp.
 
-    The rays of a flash are uniform on the image plane, those of a raster in the angle of its mirrors, row by row from
-    the top left. A Lissajous figure has as many rays as columns times rows. A spinning scanner measures column by
-    column from the left; its rays are uniform in azimuth and elevation.
+    The rays of a flash are uniform on the image plane, those of a raster in the angle of its
+    mirrors, row by row from the top left. A Lissajous figure has as many rays as columns times
+    rows. A spinning scanner measures column by column from the left; its rays are uniform in
+    azimuth and elevation.
     """
     (across, down), (columns, rows) = fov_deg, rays
     halves = [math.radians(0.5 * across), math.radians(0.5 * down)]
@@ -72,8 +75,13 @@ def ray_grid(
     return frozen(grid), frozen(times)
 
 
-def _direction(pattern: Pattern, halves: list[float], u: float, v: float) -> tuple[float, float, float]:
-    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half angles; not of unit length."""
+def _direction(
+    pattern: Pattern, halves: list[float], u: float, v: float
+) -> tuple[float, float, float]:
+    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half angles.
+
+    Not of unit length.
+    """
     if pattern is Pattern.FLASH:
         return math.tan(halves[0]) * u, math.tan(halves[1]) * v, 1.0
     if pattern is Pattern.SPINNING:
@@ -129,14 +137,19 @@ class RayCaster:
             directions: (n, 3) unit vectors.
 
         Returns:
-            Range (n,) [m] (inf: none), cosine (n,) of the angle of incidence, and face (n,) of the mesh (-1: none).
+            Range (n,) [m] (inf: none), cosine (n,) of the angle of incidence, and face (n,) of the
+            mesh (-1: none).
         """
         face = self._search(origins, directions)
         origins = np.broadcast_to(origins, directions.shape)
         hit = np.flatnonzero(face >= 0)
         normal = self._normals[face[hit]]
         cosine = dot(normal, directions[hit])
-        ranges, cosines, faces = np.full(len(face), np.inf), np.zeros(len(face)), np.full(len(face), -1)
+        ranges, cosines, faces = (
+            np.full(len(face), np.inf),
+            np.zeros(len(face)),
+            np.full(len(face), -1),
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = dot(normal, self._corners[face[hit], 0] - origins[hit]) / cosine
         good = np.isfinite(depth) & (depth > 0.0)
@@ -179,7 +192,11 @@ def _exact(corners: Array) -> Search:
         rows = max(1, CHUNK // max(1, len(a)))
         parts = [
             _nearest(
-                origins[k : k + rows, None] if len(origins) > 1 else origins[None], directions[k : k + rows], a, e1, e2
+                origins[k : k + rows, None] if len(origins) > 1 else origins[None],
+                directions[k : k + rows],
+                a,
+                e1,
+                e2,
             )
             for k in range(0, len(directions), rows)
         ]
@@ -191,8 +208,8 @@ def _exact(corners: Array) -> Search:
 def _nearest(origins: Array, directions: Array, a: Array, e1: Array, e2: Array) -> Hits:
     """Index of the nearest triangle (m, corner a, edges e1, e2) hit by each ray, -1 where none.
 
-    Moeller and Trumbore's test, its triple products permuted so that all but the direction is computed once
-    where the rays share an origin: origins (n or 1, 1, 3), directions (n, 3).
+    Moeller and Trumbore's test, its triple products permuted so that all but the direction is
+    computed once where the rays share an origin: origins (n or 1, 1, 3), directions (n, 3).
     """
     s = origins - a
     q, rays = np.cross(s, e1), directions[:, None]
@@ -223,27 +240,44 @@ class Preset(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ScannerParams(Settings):
-    """The table [scanner]: rays, field of view and noise. The camera looks along +z of {A}, x to the right."""
+    """The table [scanner]: rays, field of view and noise.
+
+    The camera looks along +z of {A}, x to the right.
+    """
 
     preset: Preset = setting(
-        Preset.NONE, "Class of instrument, which sets the defaults of this table (docs/scenario.md, Scanner)."
+        Preset.NONE,
+        "Class of instrument, which sets the defaults of this table (docs/scenario.md, Scanner).",
     )
     pattern: Pattern = setting(
         Pattern.FLASH,
-        "All rays at the stamp (flash), row by row (raster), along a Lissajous figure (lissajous), or column by column"
-        " with all rays of a column at once (spinning); the last three over scan_s.",
+        "All rays at the stamp (flash), row by row (raster), along a Lissajous figure (lissajous),"
+        " or column by column with all rays of a column at once (spinning); the last three over"
+        " scan_s.",
     )
     fov_deg: tuple[float, float] = setting(
-        (44.0, 44.0), "Full angles of the field of view, horizontal and vertical.", unit="deg", above=0.0, below=170.0
+        (44.0, 44.0),
+        "Full angles of the field of view, horizontal and vertical.",
+        unit="deg",
+        above=0.0,
+        below=170.0,
     )
     view: FieldOfView = setting(
-        FieldOfView.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it."
+        FieldOfView.RECTANGLE,
+        "Outline of the field of view: the rectangle, or the cone inscribed in it.",
     )
-    rays: tuple[int, int] = setting((128, 128), "Rays horizontally and vertically.", low=1, high=4096)
+    rays: tuple[int, int] = setting(
+        (128, 128), "Rays horizontally and vertically.", low=1, high=4096
+    )
     lissajous: tuple[int, int] = setting(
-        (73, 101), "Periods of the two mirrors in a Lissajous scan, horizontal and vertical.", low=1, high=4096
+        (73, 101),
+        "Periods of the two mirrors in a Lissajous scan, horizontal and vertical.",
+        low=1,
+        high=4096,
     )
-    scan_s: float = setting(0.0, "Duration of a scan that is not a flash; it begins at its stamp.", unit="s", low=0.0)
+    scan_s: float = setting(
+        0.0, "Duration of a scan that is not a flash; it begins at its stamp.", unit="s", low=0.0
+    )
     divergence_mrad: float = setting(
         0.0,
         "Full angle of the beam; on an edge the returns of one beam merge into a mixed pixel.",
@@ -253,29 +287,47 @@ class ScannerParams(Settings):
     )
     merge_m: float = setting(
         math.inf,
-        "Returns of a beam merge, weighted by intensity, if their ranges differ by less; else the strongest counts.",
+        "Returns of a beam merge, weighted by intensity, if their ranges differ by less; else the"
+        " strongest counts.",
         unit="m",
         low=0.0,
         infinite=True,
     )
     noise_m: float = setting(
-        0.008, "1 sigma of the range, along the ray, at the reference range and normal incidence.", unit="m", low=0.0
+        0.008,
+        "1 sigma of the range, along the ray, at the reference range and normal incidence.",
+        unit="m",
+        low=0.0,
     )
     noise_growth: float = setting(
-        0.0, "The 1 sigma of the range is proportional to the range to this power.", low=0.0, high=4.0
+        0.0,
+        "The 1 sigma of the range is proportional to the range to this power.",
+        low=0.0,
+        high=4.0,
     )
     noise_incidence: float = setting(
-        0.0, "The 1 sigma of the range is proportional to 1 / cos(incidence) to this power.", low=0.0, high=4.0
+        0.0,
+        "The 1 sigma of the range is proportional to 1 / cos(incidence) to this power.",
+        low=0.0,
+        high=4.0,
     )
-    reference_m: float = setting(1.0, "Reference range of noise and intensity.", unit="m", above=0.0)
-    quantisation_m: float = setting(0.0, "Ranges are rounded to multiples of this; 0: not rounded.", unit="m", low=0.0)
+    reference_m: float = setting(
+        1.0, "Reference range of noise and intensity.", unit="m", above=0.0
+    )
+    quantisation_m: float = setting(
+        0.0, "Ranges are rounded to multiples of this; 0: not rounded.", unit="m", low=0.0
+    )
     intensity_min: float = setting(
         0.0,
-        "Smallest intensity of a return, over that of a white diffuse surface at normal incidence and reference range.",
+        "Smallest intensity of a return, over that of a white diffuse surface at normal incidence"
+        " and reference range.",
         low=0.0,
     )
     outlier_ratio: float = setting(
-        0.02, "Share of the returns with a random range from range_min_m to range_max_m.", low=0.0, high=1.0
+        0.02,
+        "Share of the returns with a random range from range_min_m to range_max_m.",
+        low=0.0,
+        high=1.0,
     )
     dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
     max_incidence_deg: float = setting(
@@ -290,32 +342,53 @@ class ScannerParams(Settings):
     intensity: bool = setting(False, "Write the intensity of each return to the log.")
     returns: int = setting(
         1,
-        "Largest number of returns of a beam, strongest first; more than 1 needs divergence and merge_m.",
+        "Largest number of returns of a beam, strongest first; more than 1 needs divergence and"
+        " merge_m.",
         low=1,
         high=7,
     )
     range_walk_m: float = setting(
-        0.0, "Amount by which the range is too long for each factor of ten that the intensity is below 1.", unit="m"
+        0.0,
+        "Amount by which the range is too long for each factor of ten that the intensity is"
+        " below 1.",
+        unit="m",
     )
     crosstalk_ratio: float = setting(
-        0.0, "Share of the strongest return of a scan that is added to every return as stray light.", low=0.0, below=1.0
+        0.0,
+        "Share of the strongest return of a scan that is added to every return as stray light.",
+        low=0.0,
+        below=1.0,
     )
     saturation: float = setting(
-        math.inf, "Intensity from which a return saturates the detector and blooms.", above=0.0, infinite=True
+        math.inf,
+        "Intensity from which a return saturates the detector and blooms.",
+        above=0.0,
+        infinite=True,
     )
     bloom_deg: float = setting(
-        0.0, "Rays within this angle of a saturated return give the range of that return.", unit="deg", low=0.0
+        0.0,
+        "Rays within this angle of a saturated return give the range of that return.",
+        unit="deg",
+        low=0.0,
     )
     sun_a: tuple[float, float, float] | None = setting(
-        None, "Unit vector to the sun in {A}; specular faces that mirror it return nothing.", unset="no sun"
+        None,
+        "Unit vector to the sun in {A}; specular faces that mirror it return nothing.",
+        unset="no sun",
     )
-    engine: Engine = setting(Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto).")
+    engine: Engine = setting(
+        Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto)."
+    )
 
     def check(self) -> None:
         """Raise ValueError where the ranges, or pattern and duration, contradict each other."""
         if self.range_min_m >= self.range_max_m:
-            raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
+            raise ValueError(
+                f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}"
+            )
         if self.sun_a is not None and not is_unit(self.sun_a, 1e-6):
             raise ValueError(f"sun_a = {list(self.sun_a)} is not a unit vector")
         if (self.pattern is not Pattern.FLASH) != (self.scan_s > 0.0):
-            raise ValueError(f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern")
+            raise ValueError(
+                f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern"
+            )

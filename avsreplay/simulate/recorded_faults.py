@@ -1,15 +1,18 @@
-"""Faults injected into recorded scans: those of a scenario, and three that a scenario sets in its scanner.
+"""Faults injected into recorded scans: those of a scenario, and three that a scenario sets in its
+scanner.
 
-=================  ===========================================  =======  ========================================
-kind               strength (default)                           harmful  what happens
-=================  ===========================================  =======  ========================================
-outliers           share of the returns (0.2)                   no       a range 0.5 to 1.5 times the median range
-subsampled         share of the points that is removed (0.9)    no       fewer points, chosen at random
-frame_rate         n: every n-th scan is kept (2)               no       fewer scans
-=================  ===========================================  =======  ========================================
+=================  ===========================================  =======
+======================================== kind               strength (default)
+harmful  what happens =================  ===========================================  =======
+======================================== outliers           share of the returns (0.2)
+no       a range 0.5 to 1.5 times the median range subsampled         share of the points that is
+removed (0.9)    no       fewer points, chosen at random frame_rate         n: every n-th scan is
+kept (2)               no       fewer scans =================
+===========================================  =======  ========================================
 
-The other kinds are those of ``simulate/faults.py`` with the same strengths. Ranges are measured from the origin of the
-scans' frame. A noise burst multiplies the noise that ``range_noise`` estimates from the scan itself.
+The other kinds are those of ``simulate/faults.py`` with the same strengths. Ranges are measured
+from the origin of the scans' frame. A noise burst multiplies the noise that ``range_noise``
+estimates from the scan itself.
 """
 
 from __future__ import annotations
@@ -28,7 +31,8 @@ from avsreplay.simulate.scanner import Returns
 
 OUTLIER_RANGES = 0.5, 1.5  # limits of the range of an outlier, over the median range of the scan
 _NEIGHBOURS, _NOISE_SAMPLES = 9, 1000  # neighbours and samples for the estimate of the range noise
-_LEAST_AHEAD = 0.05  # cosine to the mean direction of the points, below which a point is not in front of the scanner
+# cosine to the mean direction of the points, below which a point is not in front of the scanner
+_LEAST_AHEAD = 0.05
 
 
 @value_class(eq=True)
@@ -65,7 +69,9 @@ class RecordedFault:
         except ValueError:
             numbers = []
         if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
-            raise ValueError(f"'{text}' is not kind:start:duration[:strength] with times in seconds")
+            raise ValueError(
+                f"'{text}' is not kind:start:duration[:strength] with times in seconds"
+            )
         if max(numbers[:2]) > MOST_STRENGTH:
             raise ValueError(f"'{text}': times of more than {MOST_STRENGTH:g} s")
         default = RECORDED_KINDS[kind][0]
@@ -79,7 +85,8 @@ class RecordedFault:
         return cls(kind, numbers[0], numbers[1], strength)
 
     def label(self, epoch_ns: int) -> Label:
-        """The label of the fault; its window begins ``start_s`` after ``epoch_ns`` on the log clock.
+        """The label of the fault; its window begins ``start_s`` after ``epoch_ns`` on the log
+        clock.
 
         Args:
             epoch_ns: time of the first scan on the log clock [ns].
@@ -128,7 +135,9 @@ class _Disturbance:
         kinds = {fault.kind for fault in now.values()}
         places = {k: self.seen.get(k, 0) for k in now}
         self.seen.update({k: place + 1 for k, place in places.items()})
-        thinned = any(f.kind == "frame_rate" and places[k] % round(f.strength) for k, f in now.items())
+        thinned = any(
+            f.kind == "frame_rate" and places[k] % round(f.strength) for k, f in now.items()
+        )
         if "dropped" in kinds or thinned:
             return None
         changed = self._points(scan, now)
@@ -148,7 +157,10 @@ class _Disturbance:
         return window.start_ns <= log_ns < window.end_ns
 
     def _points(self, scan: Scan, now: dict[int, RecordedFault]) -> Scan:
-        """The scan with its points changed; unchanged, bit for bit, where no fault changes points."""
+        """The scan with its points changed.
+
+        Unchanged, bit for bit, where no fault changes points.
+        """
         changing = [(k, fault) for k, fault in now.items() if fault.kind in _ON_POINTS]
         if not changing or not len(scan.points):
             return scan
@@ -171,11 +183,19 @@ class _Disturbance:
                 return _occlude_ahead(returns, strength, side, rng)
             case "noise_burst":
                 added = math.sqrt(max(strength * strength - 1.0, 0.0)) * range_noise(returns, rng)
-                return replace(returns, ranges=np.maximum(returns.ranges + added * rng.standard_normal(n), 0.0))
-            case "outliers":
-                wrong, median = rng.random(n) < strength, float(np.median(returns.ranges)) if n else 0.0
                 return replace(
-                    returns, ranges=np.where(wrong, median * rng.uniform(*OUTLIER_RANGES, n), returns.ranges)
+                    returns, ranges=np.maximum(returns.ranges + added * rng.standard_normal(n), 0.0)
+                )
+            case "outliers":
+                wrong, median = (
+                    rng.random(n) < strength,
+                    float(np.median(returns.ranges)) if n else 0.0,
+                )
+                return replace(
+                    returns,
+                    ranges=np.where(
+                        wrong, median * rng.uniform(*OUTLIER_RANGES, n), returns.ranges
+                    ),
                 )
             case "subsampled":
                 return returns.keep(rng.random(n) >= strength)
@@ -192,17 +212,31 @@ class _Disturbance:
 
 # In the order in which they act, as in a simulation.
 _ON_POINTS = (
-    *("occlusion", "partial_occlusion", "noise_burst", "outliers", "subsampled", "range_bias", "clutter", "empty"),
+    *(
+        "occlusion",
+        "partial_occlusion",
+        "noise_burst",
+        "outliers",
+        "subsampled",
+        "range_bias",
+        "clutter",
+        "empty",
+    ),
 )
 
 
 def disturbed(
-    scans: Iterable[Scan], faults: Sequence[RecordedFault], epoch_ns: int, seed: int, radius_m: float | None
+    scans: Iterable[Scan],
+    faults: Sequence[RecordedFault],
+    epoch_ns: int,
+    seed: int,
+    radius_m: float | None,
 ) -> Iterator[tuple[Scan, Scan | None]]:
     """Inject faults into scans.
 
-    Ranges are measured from the origin of the scans' frame, as a scanner at this origin measures them. Each fault and
-    scan has a random stream of its own, so that a further fault does not change others.
+    Ranges are measured from the origin of the scans' frame, as a scanner at this origin measures
+    them. Each fault and scan has a random stream of its own, so that a further fault does not
+    change others.
 
     Args:
         scans: Recorded scans.
@@ -223,14 +257,20 @@ def _returns(scan: Scan) -> Returns:
     points = np.asarray(scan.points, dtype=np.float64)
     ranges = np.sqrt(np.sum(points * points, axis=1))
     directions = points / np.where(ranges > 0.0, ranges, 1.0)[:, None]
-    times = np.zeros(len(points)) if scan.times_s is None else np.asarray(scan.times_s, dtype=np.float64)
+    times = (
+        np.zeros(len(points))
+        if scan.times_s is None
+        else np.asarray(scan.times_s, dtype=np.float64)
+    )
     one, zero = np.ones(len(points)), np.zeros(len(points))
     seen = one if scan.intensities is None else np.asarray(scan.intensities, dtype=np.float64)
     return Returns(directions, ranges, times, one, seen, zero)
 
 
 def _view(directions: Array) -> Array:
-    """Rotation (3, 3) from the frame of the scan to one whose +z axis is the mean direction of the points."""
+    """Rotation (3, 3) from the frame of the scan to one whose +z axis is the mean direction of the
+    points.
+    """
     mean = directions.mean(axis=0)
     z = mean / np.sqrt(mean @ mean) if mean @ mean > 0.0 else np.array([0.0, 0.0, 1.0])
     aside = np.eye(3)[int(np.argmin(np.abs(z)))]
@@ -239,7 +279,9 @@ def _view(directions: Array) -> Array:
     return np.stack([np.cross(y, z), y, z])
 
 
-def _occlude_ahead(returns: Returns, covered: float, side_rad: float, rng: np.random.Generator) -> Returns:
+def _occlude_ahead(
+    returns: Returns, covered: float, side_rad: float, rng: np.random.Generator
+) -> Returns:
     """``occlude`` for a scanner that looks along the mean direction of its points."""
     if not len(returns.ranges):
         return returns
@@ -250,8 +292,13 @@ def _occlude_ahead(returns: Returns, covered: float, side_rad: float, rng: np.ra
     return replace(hidden, directions=hidden.directions @ turn)
 
 
-def _clutter_around(returns: Returns, ratio: float, radius_m: float | None, rng: np.random.Generator) -> Returns:
-    """``clutter`` about the median point; without a radius it is the 90 % quantile of the distances from it."""
+def _clutter_around(
+    returns: Returns, ratio: float, radius_m: float | None, rng: np.random.Generator
+) -> Returns:
+    """``clutter`` about the median point.
+
+    Without a radius it is the 90 % quantile of the distances from it.
+    """
     if not len(returns.ranges):
         return returns
     points = returns.directions * returns.ranges[:, None]
@@ -259,22 +306,29 @@ def _clutter_around(returns: Returns, ratio: float, radius_m: float | None, rng:
     if radius_m is None:
         radius_m = float(np.quantile(np.sqrt(np.sum((points - centre) ** 2, axis=1)), 0.9))
     turn = _view(returns.directions)
-    added = clutter(replace(returns, directions=returns.directions @ turn.T), ratio, turn @ centre, radius_m, rng)
+    added = clutter(
+        replace(returns, directions=returns.directions @ turn.T),
+        ratio,
+        turn @ centre,
+        radius_m,
+        rng,
+    )
     return replace(added, directions=added.directions @ turn)
 
 
 def range_noise(returns: Returns, rng: np.random.Generator) -> float:
     """Estimate the noise of the ranges from returns with neighbouring directions.
 
-    The inverse range of a plane is linear in the direction, n . d = 1 / r. The deviations from the linear fit to
-    nine neighbours are noise where the surface is flat among them.
+    The inverse range of a plane is linear in the direction, n . d = 1 / r. The deviations from the
+    linear fit to nine neighbours are noise where the surface is flat among them.
 
     Args:
         returns: The returns of a scan.
         rng: Chooses the returns at which the noise is estimated.
 
     Returns:
-        Standard deviation of the range [m]: the median over up to 1000 returns; 0 for fewer than ten returns.
+        Standard deviation of the range [m]: the median over up to 1000 returns; 0 for fewer than
+        ten returns.
     """
     known = returns.keep(returns.ranges > 0.0)
     count = len(known.ranges)
@@ -286,5 +340,7 @@ def range_noise(returns: Returns, rng: np.random.Generator) -> float:
     _, near = cKDTree(known.directions).query(known.directions[chosen], _NEIGHBOURS)
     ranges, directions = known.ranges[near], known.directions[near]
     inverse = (1.0 / ranges)[:, :, None]
-    deviations = (inverse - directions @ (np.linalg.pinv(directions) @ inverse))[:, :, 0] * ranges * ranges
+    deviations = (
+        (inverse - directions @ (np.linalg.pinv(directions) @ inverse))[:, :, 0] * ranges * ranges
+    )
     return float(np.median(np.sqrt(np.sum(deviations * deviations, axis=1) / (_NEIGHBOURS - 3))))

@@ -1,7 +1,8 @@
 """The scanner: beams from the camera, cast on the moving target, with noise.
 
-A flash scanner measures all beams at once. Any other scanner measures them one after the other, or column by column,
-while the target moves: each beam is cast on the target at its pose at the time of that beam.
+A flash scanner measures all beams at once. Any other scanner measures them one after the other, or
+column by column, while the target moves: each beam is cast on the target at its pose at the time of
+that beam.
 """
 
 from __future__ import annotations
@@ -30,7 +31,14 @@ from avsreplay.simulate.optics import (
     part_of,
 )
 from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, dot, ray_grid
-from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
+from avsreplay.simulate.scene import (
+    Appendage,
+    Limb,
+    MovingCamera,
+    Plume,
+    SceneBody,
+    appendage_faces,
+)
 
 
 @value_class
@@ -42,7 +50,8 @@ class Returns:
         ranges: (n,) [m].
         times_s: (n,) after the stamp [s].
         cosines: (n,) cosine of the angle of incidence.
-        intensities: (n,) intensity, 1 for a white diffuse surface at normal incidence and reference range.
+        intensities: (n,) intensity, 1 for a white diffuse surface at normal incidence and reference
+            range.
         dropouts: (n,) probability that the return is lost.
     """
 
@@ -61,7 +70,9 @@ class Returns:
     def joined(self, other: Returns) -> Returns:
         """These returns, then the others."""
         names = [field.name for field in fields(self)]
-        return Returns(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+        return Returns(
+            *(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
+        )
 
     def in_order(self) -> Returns:
         """The returns by time; the order of equal times is kept."""
@@ -102,14 +113,19 @@ class Scanner:
             for k, each in enumerate(appendages)
             for faces in [np.flatnonzero(owner == k)]
         ]
-        directions, self._times = ray_grid(p.pattern, p.view, p.fov_deg, p.rays, p.lissajous, p.scan_s)
+        directions, self._times = ray_grid(
+            p.pattern, p.view, p.fov_deg, p.rays, p.lissajous, p.scan_s
+        )
         self._rays = beam(directions, 1e-3 * params.divergence_mrad)
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
         reach = [float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))]
         for each in appendages:  # for any angle of its hinge
             hinge = np.array(each.hinge_m)
-            reach.append(np.linalg.norm(hinge - self.centre_c) + np.linalg.norm(surface.vertices - hinge, axis=1).max())
+            reach.append(
+                np.linalg.norm(hinge - self.centre_c)
+                + np.linalg.norm(surface.vertices - hinge, axis=1).max()
+            )
         self.radius_m, self._reach_m = reach[0], float(np.max(reach))
 
     @property
@@ -145,16 +161,22 @@ class Scanner:
         for body in bodies:
             placed = self._seen(body.params.poses(times), times)
             for k, rays in enumerate(self._rays):
-                found[k] = found[k].nearer(self._traced(body.caster, body.optics, placed, rays, every))
+                found[k] = found[k].nearer(
+                    self._traced(body.caster, body.optics, placed, rays, every)
+                )
         for plume, rng in plumes:
             for k, rays in enumerate(self._rays):
                 found[k] = found[k].nearer(self._particles(plume, found[k], rays, rng))
         if bodies or plumes or self.params.bloom_deg > 0.0:
             near = every
         returns = self._beams([each.chosen(near) for each in found], near)
-        returns = returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
+        returns = returns.keep(
+            np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min)
+        )
         for limb, rng in limbs:
-            free = np.all([np.isinf(each.ranges) for each in found], axis=0) & self._behind(limb, times)
+            free = np.all([np.isinf(each.ranges) for each in found], axis=0) & self._behind(
+                limb, times
+            )
             returns = returns.joined(self._false(np.flatnonzero(free), limb.false_ratio, rng))
         return self._stray(returns)
 
@@ -164,7 +186,10 @@ class Scanner:
         The variance grows in proportion to the share of the beams that look at it.
         """
         times = np.array([t_s])
-        return math.sqrt(1.0 + sum((limb.glare**2 - 1.0) * float(self._behind(limb, times).mean()) for limb in limbs))
+        return math.sqrt(
+            1.0
+            + sum((limb.glare**2 - 1.0) * float(self._behind(limb, times).mean()) for limb in limbs)
+        )
 
     def _behind(self, limb: Limb, times: Array) -> NDArray[np.bool_]:
         """Whether each beam looks at the Earth."""
@@ -177,9 +202,13 @@ class Scanner:
         beams = beams[rng.random(len(beams)) < ratio]
         n = len(beams)
         ranges, least = rng.uniform(p.range_min_m, p.range_max_m, n), np.full(n, p.intensity_min)
-        return Returns(self._rays[0][beams], ranges, self._times[beams], np.ones(n), least, np.zeros(n))
+        return Returns(
+            self._rays[0][beams], ranges, self._times[beams], np.ones(n), least, np.zeros(n)
+        )
 
-    def _particles(self, plume: Plume, met: TracedRays, rays: Array, rng: np.random.Generator) -> TracedRays:
+    def _particles(
+        self, plume: Plume, met: TracedRays, rays: Array, rng: np.random.Generator
+    ) -> TracedRays:
         """Rays (n, 3) on the particles of a plume that lie in front of the surfaces."""
         p = self.params
         ranges = plume.particles(rays, np.minimum(met.ranges, p.range_max_m), rng)
@@ -194,7 +223,9 @@ class Scanner:
         """Returns with stray light of the strongest one, and with the bloom of saturated ones."""
         p = self.params
         if p.crosstalk_ratio > 0.0:
-            returns = replace(returns, ranges=crosstalk(returns.ranges, returns.intensities, p.crosstalk_ratio))
+            returns = replace(
+                returns, ranges=crosstalk(returns.ranges, returns.intensities, p.crosstalk_ratio)
+            )
         if p.bloom_deg > 0.0:
             strong = returns.keep(returns.intensities >= p.saturation)
             ray, source = bloomed(self._rays[0], strong.directions, math.radians(p.bloom_deg))
@@ -202,7 +233,9 @@ class Scanner:
                 from scipy.spatial import cKDTree  # takes 0.2 s to import
 
                 inside = np.asarray(cKDTree(self._rays[0][ray]).query(returns.directions)[0]) < 1e-9
-                bloom = replace(strong.keep(source), directions=self._rays[0][ray], times_s=self._times[ray])
+                bloom = replace(
+                    strong.keep(source), directions=self._rays[0][ray], times_s=self._times[ray]
+                )
                 returns = returns.keep(~inside).joined(bloom)
         return returns
 
@@ -216,7 +249,10 @@ class Scanner:
 
     def _beams(self, rays: list[TracedRays], near: NDArray[np.intp]) -> Returns:
         """The returns of beams from those of their rays."""
-        ranges, intensities = np.stack([r.returned for r in rays]), np.stack([r.intensities for r in rays])
+        ranges, intensities = (
+            np.stack([r.returned for r in rays]),
+            np.stack([r.intensities for r in rays]),
+        )
         if len(rays) == 1:
             groups = [(ranges[0], intensities[0], np.ones((1, len(near))))]
         else:
@@ -255,11 +291,15 @@ class Scanner:
             seen &= ~optics.glint(np.maximum(faces, 0), directions, sun)
         back = near[seen]
         traced.returned[back] = ranges[seen]
-        traced.intensities[back] = optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
+        traced.intensities[back] = optics.intensity(
+            faces[seen], cosines[seen], ranges[seen], p.reference_m
+        )
         traced.dropouts[back] = optics.dropouts[faces[seen]]
         return traced
 
-    def disturb(self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0) -> Returns:
+    def disturb(
+        self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0
+    ) -> Returns:
         """Add range noise and outliers, remove dropouts, and quantise the ranges."""
         p, n = self.params, len(returns.ranges)
         noise_m = noise_factor * p.noise_m * np.ones(n)
@@ -273,7 +313,9 @@ class Scanner:
         wrong = rng.random(n) < p.outlier_ratio
         ranges = np.where(wrong, rng.uniform(p.range_min_m, p.range_max_m, n), ranges)
         lost = np.where(
-            returns.dropouts > 0.0, 1.0 - (1.0 - p.dropout_ratio) * (1.0 - returns.dropouts), p.dropout_ratio
+            returns.dropouts > 0.0,
+            1.0 - (1.0 - p.dropout_ratio) * (1.0 - returns.dropouts),
+            p.dropout_ratio,
         )
         kept = rng.random(n) >= lost
         if p.quantisation_m > 0.0:

@@ -30,31 +30,51 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class StartParams(Settings):
-    """The table [start]: the initial belief, as a standard deviation per axis and, if wanted, the exact errors.
+    """The table [start]: the initial belief, as a standard deviation per axis and, if wanted, the
+    exact errors.
 
-    An offset (mean minus truth) that is not given is drawn from its standard deviation with the scenario's seed.
+    An offset (mean minus truth) that is not given is drawn from its standard deviation with the
+    scenario's seed.
     """
 
-    rate_std_radps: float = setting(0.005, "1 sigma of the angular rate in {B}.", unit="rad/s", above=0.0)
-    rate_offset_radps: Triple | None = setting(None, "Error of the angular rate.", unit="rad/s", unset=DRAWN)
+    rate_std_radps: float = setting(
+        0.005, "1 sigma of the angular rate in {B}.", unit="rad/s", above=0.0
+    )
+    rate_offset_radps: Triple | None = setting(
+        None, "Error of the angular rate.", unit="rad/s", unset=DRAWN
+    )
     sigma_std: float = setting(0.05, "1 sigma of sigma_1 and sigma_2.", above=0.0, high=1.0)
     sigma_offset: tuple[float, float] | None = setting(
-        None, "Error of sigma_1 and sigma_2; the initial estimate of both must be between -1 and 1.", unset=DRAWN
+        None,
+        "Error of sigma_1 and sigma_2; the initial estimate of both must be between -1 and 1.",
+        unset=DRAWN,
     )
-    varrho_std_m: float = setting(0.05, "1 sigma of the fixture's position in {B}.", unit="m", above=0.0)
-    varrho_offset_m: Triple | None = setting(None, "Error of the fixture's position.", unit="m", unset=DRAWN)
-    mu_std_deg: float = setting(1.0, "1 sigma of mu, as a rotation about the axes of {B}.", unit="deg", above=0.0)
+    varrho_std_m: float = setting(
+        0.05, "1 sigma of the fixture's position in {B}.", unit="m", above=0.0
+    )
+    varrho_offset_m: Triple | None = setting(
+        None, "Error of the fixture's position.", unit="m", unset=DRAWN
+    )
+    mu_std_deg: float = setting(
+        1.0, "1 sigma of mu, as a rotation about the axes of {B}.", unit="deg", above=0.0
+    )
     mu_offset_deg: Triple | None = setting(None, "Error of mu.", unit="deg", unset=DRAWN)
     position_std_m: float = setting(0.03, "1 sigma of the mass centre in {A}.", unit="m", above=0.0)
-    position_offset_m: Triple | None = setting(None, "Error of the mass centre.", unit="m", unset=DRAWN)
+    position_offset_m: Triple | None = setting(
+        None, "Error of the mass centre.", unit="m", unset=DRAWN
+    )
     velocity_std_mps: float = setting(
         0.003, "1 sigma of the velocity of the mass centre in {A}.", unit="m/s", above=0.0
     )
-    velocity_offset_mps: Triple | None = setting(None, "Error of that velocity.", unit="m/s", unset=DRAWN)
+    velocity_offset_mps: Triple | None = setting(
+        None, "Error of that velocity.", unit="m/s", unset=DRAWN
+    )
     attitude_std_deg: float = setting(
         1.0, "1 sigma of the attitude of {B}, as a rotation about its axes.", unit="deg", above=0.0
     )
-    attitude_offset_deg: Triple | None = setting(None, "Error of the attitude.", unit="deg", unset=DRAWN)
+    attitude_offset_deg: Triple | None = setting(
+        None, "Error of the attitude.", unit="deg", unset=DRAWN
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +88,14 @@ class ScenarioParams(Settings):
     target: TargetParams = setting(TargetParams, "The target.")
     motion: MotionParams = setting(MotionParams, "The target's motion.")
     scanner: ScannerParams = setting(ScannerParams, "The scanner.")
-    material: tuple[Material, ...] = setting((), "Optical properties of parts of the target, one table each.")
+    material: tuple[Material, ...] = setting(
+        (), "Optical properties of parts of the target, one table each."
+    )
     appendage: tuple[Appendage, ...] = setting((), "Flexible parts of the target, one table each.")
     camera: CameraParams | None = setting(
-        None, "Motion of the camera, whose pose the log then holds.", unset="at rest at the origin of {A}"
+        None,
+        "Motion of the camera, whose pose the log then holds.",
+        unset="at rest at the origin of {A}",
     )
     object: tuple[SceneObject, ...] = setting((), "Objects beside the target, one table each.")
     plume: tuple[Plume, ...] = setting((), "Particles from thrusters, one table each.")
@@ -83,11 +107,17 @@ class ScenarioParams(Settings):
     run: Any = setting(dict, "Settings of the replay for this log (docs/settings.md).")
 
     def check(self) -> None:
-        """Raise ValueError where there is no scan, too many, or a scan is longer than the time between scans."""
+        """Raise ValueError where there is no scan, too many, or a scan is longer than the time
+        between scans.
+        """
         if not 1.0 <= self.duration_s * self.rate_hz <= MAX_SCANS:
-            raise ValueError(f"{self.duration_s} s at {self.rate_hz} Hz is not between 1 and {MAX_SCANS} scans")
+            raise ValueError(
+                f"{self.duration_s} s at {self.rate_hz} Hz is not between 1 and {MAX_SCANS} scans"
+            )
         if self.scanner.scan_s * self.rate_hz > 1.0 + 1e-9:
-            raise ValueError(f"scanner.scan_s = {self.scanner.scan_s} is longer than the time between scans")
+            raise ValueError(
+                f"scanner.scan_s = {self.scanner.scan_s} is longer than the time between scans"
+            )
 
 
 @value_class(eq=True)
@@ -114,10 +144,16 @@ class Scenario:
     @property
     def meshes(self) -> dict[str, Path]:
         """The mesh files of its objects, by the names that it gives them."""
-        return {each.model: (self.folder or Path()) / each.model for each in self.params.object if each.model}
+        return {
+            each.model: (self.folder or Path()) / each.model
+            for each in self.params.object
+            if each.model
+        }
 
 
-def load_scenario(path: Path | None = None, seed: int | None = None, duration_s: float | None = None) -> Scenario:
+def load_scenario(
+    path: Path | None = None, seed: int | None = None, duration_s: float | None = None
+) -> Scenario:
     """Load a scenario.
 
     Args:
@@ -130,7 +166,11 @@ def load_scenario(path: Path | None = None, seed: int | None = None, duration_s:
         UsageError: A key or value is wrong; the message names file and line.
     """
     if path is None:
-        text = resources.files("avsreplay.simulate").joinpath("builtin.toml").read_text(encoding="utf-8")
+        text = (
+            resources.files("avsreplay.simulate")
+            .joinpath("builtin.toml")
+            .read_text(encoding="utf-8")
+        )
         document, folder = toml_document.parse(text, "built-in scenario"), None
     else:
         document, folder = toml_document.load(path), Path(path).parent
@@ -140,7 +180,9 @@ def load_scenario(path: Path | None = None, seed: int | None = None, duration_s:
     return replace(scenario_of(changed, seed, folder), text=tomli_w.dumps(changed.table))
 
 
-def scenario_of(document: toml_document.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
+def scenario_of(
+    document: toml_document.Document, seed: int | None = None, folder: Path | None = None
+) -> Scenario:
     """Return the scenario of a parsed document.
 
     Args:
@@ -153,7 +195,9 @@ def scenario_of(document: toml_document.Document, seed: int | None = None, folde
     """
     params = toml_document.build(ScenarioParams, _with_preset(document))
     if not isinstance(params.run, dict):
-        raise UsageError("'run' must be a table", where=document.where(("run",)), hint="write it as [run]")
+        raise UsageError(
+            "'run' must be a table", where=document.where(("run",)), hint="write it as [run]"
+        )
     if seed is not None:
         params = replace(params, seed=seed)
     return Scenario(params, document.text, folder)
@@ -165,13 +209,16 @@ def _with_preset(document: toml_document.Document) -> toml_document.Document:
     name = scanner.get("preset", "none") if isinstance(scanner, dict) else "none"
     if name not in [preset.value for preset in Preset if preset is not Preset.NONE]:
         return document  # none, or an error that ``build`` reports
-    text = resources.files("avsreplay.simulate").joinpath("presets.toml").read_text(encoding="utf-8")
+    text = (
+        resources.files("avsreplay.simulate").joinpath("presets.toml").read_text(encoding="utf-8")
+    )
     figures = toml_document.parse(text, "presets.toml").table[name]
     return replace(document, table={**document.table, "scanner": {**figures, **scanner}})
 
 
 def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator) -> Belief:
-    """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20 error states.
+    """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20
+    error states.
 
     Raises:
         UsageError: the given offset leads to inertia ratios that no body has.
@@ -179,8 +226,15 @@ def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator
     rate = _offset(start.rate_offset_radps, start.rate_std_radps, 3, rng)
     sigma = _offset(start.sigma_offset, start.sigma_std, 2, rng)
     if start.sigma_offset is not None and np.abs(truth.sigma + sigma).max() >= 1.0:
-        what = f"with it the estimated inertia ratios are {[round(float(s), 4) for s in truth.sigma + sigma]}"
-        raise UsageError(what, where="start.sigma_offset", hint="they must be between -1 and 1, as those of any body")
+        what = (
+            "with it the estimated inertia ratios are"
+            f" {[round(float(s), 4) for s in truth.sigma + sigma]}"
+        )
+        raise UsageError(
+            what,
+            where="start.sigma_offset",
+            hint="they must be between -1 and 1, as those of any body",
+        )
     varrho = _offset(start.varrho_offset_m, start.varrho_std_m, 3, rng)
     mu = np.radians(_offset(start.mu_offset_deg, start.mu_std_deg, 3, rng))
     position = _offset(start.position_offset_m, start.position_std_m, 3, rng)
@@ -213,6 +267,8 @@ def _deviations(start: StartParams) -> Array:
     return np.concatenate([np.full(size, value) for value, size in blocks])
 
 
-def _offset(given: tuple[float, ...] | None, std: float, size: int, rng: np.random.Generator) -> Array:
+def _offset(
+    given: tuple[float, ...] | None, std: float, size: int, rng: np.random.Generator
+) -> Array:
     drawn = std * rng.standard_normal(size)
     return drawn if given is None else np.array(given, dtype=np.float64)

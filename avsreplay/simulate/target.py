@@ -1,7 +1,8 @@
-"""Built-in targets, made of closed solids. {C} is on the face of the grapple fixture, +x outward: the approach axis.
+"""Built-in targets, made of closed solids. {C} is on the face of the grapple fixture, +x outward:
+the approach axis.
 
-Vertices are rounded to float32 as in the binary PLY file, so that this surface and the one in a log are identical.
-Faces are counter-clockwise seen from outside.
+Vertices are rounded to float32 as in the binary PLY file, so that this surface and the one in a log
+are identical. Faces are counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ class Shape(Enum):
 
     SATELLITE = "satellite"  # bus, two unequal panels, nozzle, fixture, small parts: no symmetry
     BRACKET = "bracket"  # an L-shaped bracket with a tapered pin
-    STAGE = "stage"  # a spent rocket stage: nearly a body of revolution, marked by a raceway and a box
+    STAGE = (  # a spent rocket stage: nearly a body of revolution, marked by a raceway and a box
+        "stage"
+    )
     CUBE = "cube"  # fully symmetric: 24 equivalent poses
 
 
@@ -42,21 +45,30 @@ class TargetParams(Settings):
 
     shape: Shape = setting(Shape.SATELLITE, "A built-in target; not used where a model is given.")
     model: str = setting(
-        "", "STL, OBJ or PLY file in metres in {C}, relative to the scenario file; empty for the built-in shape."
+        "",
+        "STL, OBJ or PLY file in metres in {C}, relative to the scenario file; empty for the"
+        " built-in shape.",
     )
     moments_m2: tuple[float, float, float] | None = setting(
-        None, "Principal moments of inertia of {B} per unit mass.", unit="m^2", above=0.0, unset=FROM_MESH
+        None,
+        "Principal moments of inertia of {B} per unit mass.",
+        unit="m^2",
+        above=0.0,
+        unset=FROM_MESH,
     )
     axes_xyzw: tuple[float, float, float, float] | None = setting(
         None, "mu = q_bc, the rotation from {C} to {B}.", unset=FROM_MESH
     )
-    mass_centre_m: tuple[float, float, float] | None = setting(None, "Mass centre in {C}.", unit="m", unset=FROM_MESH)
+    mass_centre_m: tuple[float, float, float] | None = setting(
+        None, "Mass centre in {C}.", unit="m", unset=FROM_MESH
+    )
 
     def check(self) -> None:
         """Raise ValueError where the mass properties are not those of a rigid body."""
         if self.moments_m2 is not None and not _triangle(self.moments_m2):
             raise ValueError(
-                f"moments_m2 = {list(self.moments_m2)} are not those of a body: each below the others' sum"
+                f"moments_m2 = {list(self.moments_m2)} are not those of a body: each below the"
+                " others' sum"
             )
         if self.axes_xyzw is not None and not is_unit(self.axes_xyzw):
             raise ValueError(f"axes_xyzw = {list(self.axes_xyzw)} is not a unit quaternion")
@@ -65,7 +77,8 @@ class TargetParams(Settings):
 
 
 def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
-    """Return the mesh of a built-in target in {C}, with its PLY bytes. Parts that touch keep their own faces.
+    """Return the mesh of a built-in target in {C}, with its PLY bytes. Parts that touch keep their
+    own faces.
 
     Args:
         shape: The built-in target.
@@ -79,19 +92,25 @@ def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
     solid = join(parts)
     vertices = solid.vertices.astype("<f4")
     data = ply_bytes(vertices, solid.faces)
-    return Surface(frozen(vertices), solid.faces, f"{shape.value}.ply", hashlib.sha256(data).hexdigest(), data)
+    return Surface(
+        frozen(vertices), solid.faces, f"{shape.value}.ply", hashlib.sha256(data).hexdigest(), data
+    )
 
 
 def body(params: TargetParams, surface: Surface) -> Body:
     """Mass properties of the target: those of the scenario where given, else those of the mesh.
 
     Raises:
-        UsageError: They are needed from a mesh that has none (see ``body_of``), or the body has no thickness.
+        UsageError: They are needed from a mesh that has none (see ``body_of``), or the body has no
+            thickness.
     """
     found = _stated_or_computed(params, surface)
     if np.abs(found.sigma).max() > 1.0 - LEAST_THICKNESS:
         moments = ", ".join(f"{m:.4g}" for m in found.moments)
-        what = f"the body has no thickness: of its principal moments {moments} m2 one is the sum of the others"
+        what = (
+            f"the body has no thickness: of its principal moments {moments} m2 one is the sum of"
+            " the others"
+        )
         hint = "give the model a thickness, or moments_m2 and axes_xyzw under [target]"
         raise UsageError(what, where=surface.name, hint=hint)
     return found
@@ -130,10 +149,17 @@ def _triangle(moments: tuple[float, float, float]) -> bool:
     return all(0.0 < m < total - m for m in moments)
 
 
-def _at(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Pose:
+def _at(
+    x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
+) -> Pose:
     """T_cs from a position [m] and rotations about x, then y, then z [deg]."""
-    turns = [geometry.exp(np.radians(angle) * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True)]
-    return Pose(geometry.multiply(turns[2], geometry.multiply(turns[1], turns[0])), np.array([x, y, z]))
+    turns = [
+        geometry.exp(np.radians(angle) * axis)
+        for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True)
+    ]
+    return Pose(
+        geometry.multiply(turns[2], geometry.multiply(turns[1], turns[0])), np.array([x, y, z])
+    )
 
 
 @value_class
@@ -141,7 +167,8 @@ class Solid:
     """A closed triangle surface.
 
     Attributes:
-        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, outward by the right hand.
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices, outward by the right hand.
     """
 
     vertices: Array
@@ -152,7 +179,9 @@ def join(solids: Iterable[Solid]) -> Solid:
     """Several solids as one list of triangles."""
     parts = list(solids)
     shifts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
-    faces = np.concatenate([p.faces + s for p, s in zip(parts, shifts, strict=True)]).astype(np.int32)
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, shifts, strict=True)]).astype(
+        np.int32
+    )
     return Solid(np.concatenate([p.vertices for p in parts]), faces)
 
 
@@ -162,17 +191,27 @@ def placed(solid: Solid, pose: Pose) -> Solid:
 
 
 def extrusion(outline: Sequence[tuple[float, float]], x0: float, x1: float) -> Solid:
-    """An outline in (y, z), counter-clockwise about +x, star-shaped from its mean point, from x0 to x1 [m]."""
+    """An outline in (y, z), counter-clockwise about +x, star-shaped from its mean point, from x0 to
+    x1 [m].
+    """
     centre = tuple(sum(c) / len(outline) for c in zip(*outline, strict=True))
-    return _tube([[(x0, *centre)], [(x0, *p) for p in outline], [(x1, *p) for p in outline], [(x1, *centre)]])
+    return _tube(
+        [[(x0, *centre)], [(x0, *p) for p in outline], [(x1, *p) for p in outline], [(x1, *centre)]]
+    )
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Solid:
     """The box between two corners (3,) [m], two triangles a side."""
-    (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    (x0, y0, z0), (x1, y1, z1) = (
+        np.asarray(low, dtype=np.float64),
+        np.asarray(high, dtype=np.float64),
+    )
     corners = [(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (z0, z1)]
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return Solid(np.array(corners), np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32))
+    return Solid(
+        np.array(corners),
+        np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32),
+    )
 
 
 def frustum(x0: float, r0: float, x1: float, r1: float, sides: int = 24) -> Solid:
@@ -180,15 +219,23 @@ def frustum(x0: float, r0: float, x1: float, r1: float, sides: int = 24) -> Soli
     return _tube([[(x0, 0.0, 0.0)], _ring(x0, r0, sides), _ring(x1, r1, sides), [(x1, 0.0, 0.0)]])
 
 
-def shell(x0: float, r0: float, x1: float, r1: float, wall: float, floor: float, sides: int = 24) -> Solid:
-    """An open cup about x: radius r0 at x0 and r1 at its opening x1, thickness ``wall``, bottom at x0 + floor [m]."""
+def shell(
+    x0: float, r0: float, x1: float, r1: float, wall: float, floor: float, sides: int = 24
+) -> Solid:
+    """An open cup about x.
+
+    Radius r0 at x0 and r1 at its opening x1, thickness ``wall``, bottom at x0 + floor [m].
+    """
     outer0, outer1 = _ring(x0, r0, sides), _ring(x1, r1, sides)
     inner1, inner0 = _ring(x1, r1 - wall, sides), _ring(x0 + floor, r0 - wall, sides)
     return _tube([[(x0, 0.0, 0.0)], outer0, outer1, inner1, inner0, [(x0 + floor, 0.0, 0.0)]])
 
 
 def adapter(r0: float, r1: float, half_height: float) -> Solid:
-    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m]; wall 5 % of the smaller one."""
+    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m].
+
+    Wall 5 % of the smaller one.
+    """
     wall, low, high = 0.05 * min(r0, r1), -half_height, half_height
     outer, inner = _ring(low, r0, 48), _ring(low, r0 - wall, 48)
     ring = _tube([outer, _ring(high, r1, 48), _ring(high, r1 - wall, 48), inner, outer])
@@ -218,7 +265,10 @@ def _tube(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Solid:
 
 
 def _fixture() -> list[Solid]:
-    """The grapple fixture: base, pin along +x and three unequal cams; the face of the base is x = 0."""
+    """The grapple fixture: base, pin along +x and three unequal cams.
+
+    The face of the base is x = 0.
+    """
     return [
         box((-0.06, -0.16, -0.16), (0.0, 0.16, 0.16)),
         frustum(0.0, 0.035, 0.14, 0.02, 16),
@@ -230,8 +280,12 @@ def _fixture() -> list[Solid]:
 
 def _satellite() -> list[Solid]:
     bus = box((-1.26, -0.55, -0.60), (-0.06, 0.35, 1.15))
-    long_wing = placed(box((-0.025, 0.0, -0.45), (0.025, 1.75, 0.45)), _at(-0.75, 0.65, 0.35, pitch=20.0))
-    short_wing = placed(box((-0.025, -1.05, -0.40), (0.025, 0.0, 0.40)), _at(-0.60, -0.80, 0.15, pitch=-35.0))
+    long_wing = placed(
+        box((-0.025, 0.0, -0.45), (0.025, 1.75, 0.45)), _at(-0.75, 0.65, 0.35, pitch=20.0)
+    )
+    short_wing = placed(
+        box((-0.025, -1.05, -0.40), (0.025, 0.0, 0.40)), _at(-0.60, -0.80, 0.15, pitch=-35.0)
+    )
     return [
         *_fixture(),
         bus,
@@ -250,7 +304,14 @@ def _satellite() -> list[Solid]:
 
 
 def _bracket() -> list[Solid]:
-    outline = [(-0.30, -0.20), (0.50, -0.20), (0.50, -0.05), (-0.10, 0.00), (-0.15, 0.60), (-0.30, 0.60)]
+    outline = [
+        (-0.30, -0.20),
+        (0.50, -0.20),
+        (0.50, -0.05),
+        (-0.10, 0.00),
+        (-0.15, 0.60),
+        (-0.30, 0.60),
+    ]
     return [
         extrusion(outline, -0.30, 0.0),
         frustum(0.0, 0.06, 0.15, 0.03, 16),

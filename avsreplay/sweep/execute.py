@@ -1,7 +1,8 @@
-"""Runs tasks in this process, on worker processes of this machine, or on a Dask cluster; writes the result files.
+"""Runs tasks in this process, on worker processes of this machine, or on a Dask cluster; writes the
+result files.
 
-A task records its scenario, replays the log as ``avsreplay run`` does, and summarises it. An error of the input is the
-result of the run; it does not end the campaign.
+A task records its scenario, replays the log as ``avsreplay run`` does, and summarises it. An error
+of the input is the result of the run; it does not end the campaign.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from avsreplay.plan.arm import with_arm
 from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Belief, Label, Scan
 from avsreplay.replan import Replanning
-from avsreplay.report import Summary
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
 from avsreplay.run import Job, Listener, ReplayedScan, Run
 from avsreplay.saved_result import of_run
-from avsreplay.simulate import scenario_of
-from avsreplay.sweep import SCORES, RunResult
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.sweep.campaign import SCORES, RunResult
 from avsreplay.sweep.expansion import Expansion, Point, Task
 from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
 from avsreplay.sweep.page import build_sweep_page
@@ -91,12 +92,17 @@ def _replayed(task: Task, log: Path) -> RunResult:
 
 
 def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, Any]:
-    """How whole flights from the first converged scan on end, by name; none where the estimate did not converge."""
+    """How whole flights from the first converged scan on end, by name.
+
+    None where the estimate did not converge.
+    """
     if not any(row.converged for row, _ in known):
         return {"flights.count": 0}
     saved = of_run(run, [row for row, _ in known], [belief for _, belief in known])
     robot, arm = with_arm(saved.robot)
-    planning = Replanning(replace(saved, robot=robot), saved.plan, saved.limits, saved.supervisor, arm)
+    planning = Replanning(
+        replace(saved, robot=robot), saved.plan, saved.limits, saved.supervisor, arm
+    )
     seed = 0 if task.log else toml_document.parse(task.scenario, "scenario").table["seed"]
     flights = planning.flights(saved.index_at(None), task.flights, seed)
     counts = settings.dump(flights)
@@ -105,7 +111,9 @@ def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, A
 
 
 def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> tuple[Any, ...]:
-    harmful = any(label.harmful and label.start_ns <= scan.log_ns < label.end_ns for label in labels)
+    harmful = any(
+        label.harmful and label.start_ns <= scan.log_ns < label.end_ns for label in labels
+    )
     alpha = None
     if row.innov_m is not None and row.innov_deg is not None:
         alpha = float(np.hypot(row.innov_m, length_m * np.radians(row.innov_deg)))
@@ -114,15 +122,28 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
 
 
 def flat_metrics(summary: Summary, last: Row | None) -> dict[str, Any]:
-    """A summary as flat values by dotted name: its single values, parameter errors, worst coasting, last row."""
+    """A summary as flat values by dotted name.
+
+    Its single values, parameter errors, worst coasting, last row.
+    """
     plain = settings.dump(summary)
     flat = dict(_flat({k: v for k, v in plain.items() if k not in ("parameters", "coasts")}))
     for parameter in plain["parameters"]:
         for what in ("error", "one_sigma"):
             flat[f"parameter.{_word(parameter['name'])}.{what}"] = parameter[what]
     for what in ("duration_s", "pos_err_m", "rot_err_deg"):
-        flat[f"worst_coast.{what}"] = max((c[what] for c in plain["coasts"] if c[what] is not None), default=None)
-    for what in ("nees", "pos_err_m", "rot_err_deg", "pos_1s_m", "rot_1s_deg", "converged", "estimator"):
+        flat[f"worst_coast.{what}"] = max(
+            (c[what] for c in plain["coasts"] if c[what] is not None), default=None
+        )
+    for what in (
+        "nees",
+        "pos_err_m",
+        "rot_err_deg",
+        "pos_1s_m",
+        "rot_1s_deg",
+        "converged",
+        "estimator",
+    ):
         flat[f"end.{what}"] = getattr(last, what) if last is not None else None
     return flat
 
@@ -145,13 +166,17 @@ LOOK_EVERY = 64  # completions between two queries for the number of workers
 
 
 def run_tasks(
-    tasks: Iterable[Task], workers: int = 0, scheduler: str | None = None, dashboard: str = "127.0.0.1:0"
+    tasks: Iterable[Task],
+    workers: int = 0,
+    scheduler: str | None = None,
+    dashboard: str = "127.0.0.1:0",
 ) -> Iterator[RunResult]:
     """Run tasks; yields one result per task, in order of completion.
 
     Args:
         tasks: What to run.
-        workers: Processes on this machine; 0 runs the tasks in this process, one after the other, without Dask.
+        workers: Processes on this machine; 0 runs the tasks in this process, one after the other,
+            without Dask.
         scheduler: Address of a Dask scheduler, whose workers must see the files that tasks name.
         dashboard: Address at which the Dask dashboard of ``workers`` listens.
 
@@ -172,7 +197,9 @@ def _distributed() -> Any:
         return importlib.import_module("distributed")
     except ImportError:
         hint = "pip install 'avsreplay[sweep]', or --workers 0 to run in this process"
-        raise MissingBackend("Dask (distributed) is not installed", where="sweep", hint=hint) from None
+        raise MissingBackend(
+            "Dask (distributed) is not installed", where="sweep", hint=hint
+        ) from None
 
 
 def _here(tasks: Iterable[Task]) -> Iterator[RunResult]:
@@ -194,10 +221,17 @@ def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any
             what = f"the scheduler does not answer: {str(error).splitlines()[0]}"
             raise UnreadableInput(what, where=scheduler, hint="check the address") from None
         return
-    options = {"threads_per_worker": 1, "processes": True, "memory_limit": None, "silence_logs": logging.CRITICAL}
+    options = {
+        "threads_per_worker": 1,
+        "processes": True,
+        "memory_limit": None,
+        "silence_logs": logging.CRITICAL,
+    }
     with ExitStack() as stack:
         with _no_interrupt():
-            cluster = dask.LocalCluster(n_workers=workers, host="127.0.0.1", dashboard_address=dashboard, **options)
+            cluster = dask.LocalCluster(
+                n_workers=workers, host="127.0.0.1", dashboard_address=dashboard, **options
+            )
             client = stack.enter_context(dask.Client(stack.enter_context(cluster)))
         yield client
 
@@ -206,7 +240,8 @@ def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any
 def _no_interrupt() -> Iterator[None]:
     """Delay SIGINT; threads and processes started meanwhile never receive it.
 
-    A terminal sends Ctrl-C to all processes of a command. Only this one handles it; it then ends its workers.
+    A terminal sends Ctrl-C to all processes of a command. Only this one handles it; it then ends
+    its workers.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -222,7 +257,9 @@ def _no_interrupt() -> Iterator[None]:
 
 
 def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
-    """Keep a bounded number of tasks at the scheduler, which repeats the tasks of a failed worker on another one."""
+    """Keep a bounded number of tasks at the scheduler, which repeats the tasks of a failed worker
+    on another one.
+    """
     running = _distributed().as_completed()
     held, count, limit = 0, 0, IN_FLIGHT
     while True:
@@ -246,7 +283,10 @@ def _collected(future: Any) -> RunResult:
 
 
 def _crashed(task_id: str, error: BaseException | None) -> RunResult:
-    """The result of a run that raised: kind and first line of the error, without addresses that differ between runs."""
+    """The result of a run that raised.
+
+    Kind and first line of the error, without addresses that differ between runs.
+    """
     if type(error).__name__ == "KilledWorker":
         return RunResult(task_id, "crashed", "the worker process died repeatedly")
     first = (str(error).splitlines() or [""])[0]
@@ -254,7 +294,8 @@ def _crashed(task_id: str, error: BaseException | None) -> RunResult:
 
 
 def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSummary:
-    """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and ``report.html``.
+    """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and
+    ``report.html``.
 
     Args:
         plan: The runs of the campaign.
@@ -279,22 +320,34 @@ def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSumma
     detector = None
     if plan.loaded.campaign.scans:
         detector = DetectorFold()
-        write_batches(folder / "scans.parquet", scan_schema(), _scan_batches(sorted(ids), journal, detector))
+        write_batches(
+            folder / "scans.parquet", scan_schema(), _scan_batches(sorted(ids), journal, detector)
+        )
     summary = fold.result(detector.result() if detector else None)
     text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
-    for name, content in (("summary.json", text + "\n"), ("report.html", build_sweep_page(summary))):
+    for name, content in (
+        ("summary.json", text + "\n"),
+        ("report.html", build_sweep_page(summary)),
+    ):
         with output_text(folder / name) as stream:
             stream.write(content)
     return summary
 
 
 def _finished(plan: Expansion, journal: Journal) -> Iterator[tuple[Point, RunResult]]:
-    return ((point, journal.result(point.task.id)) for point in plan.points() if point.task.id in journal)
+    return (
+        (point, journal.result(point.task.id))
+        for point in plan.points()
+        if point.task.id in journal
+    )
 
 
 def _values(point: Point, result: RunResult) -> dict[str, Any]:
     """The columns of a run that depend on the campaign: what was set, and its metrics."""
-    return {**{f"set:{key}": value for key, value in point.values.items()}, **(result.metrics or {})}
+    return {
+        **{f"set:{key}": value for key, value in point.values.items()},
+        **(result.metrics or {}),
+    }
 
 
 def _kind(value: Any) -> str:
@@ -302,11 +355,22 @@ def _kind(value: Any) -> str:
         return "none"
     if isinstance(value, bool):
         return "bool"
-    return "number" if isinstance(value, (int, float)) else "text" if isinstance(value, str) else "mixed"
+    return (
+        "number"
+        if isinstance(value, (int, float))
+        else "text"
+        if isinstance(value, str)
+        else "mixed"
+    )
 
 
-def _write_runs(plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path) -> None:
-    """One row per run; a column is of truth values, float64 or text, anything mixed or nested as JSON text."""
+def _write_runs(
+    plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path
+) -> None:
+    """One row per run.
+
+    A column is of truth values, float64 or text, anything mixed or nested as JSON text.
+    """
     pa, _ = arrow()
     types = {"bool": pa.bool_(), "number": pa.float64(), "text": pa.string()}
     columns = [*sorted(name for name in kinds if name.startswith("set:"))]
@@ -314,11 +378,21 @@ def _write_runs(plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]]
     only = {name: "".join(kinds[name] - {"none"}) for name in columns}
     integers = {"index", "cell", "repeat", "seed"}
     fixed = [(name, pa.int64() if name in integers else pa.string()) for name in _FIXED]
-    schema = pa.schema([*fixed, *((name, types.get(only[name] or "number", pa.string())) for name in columns)])
+    schema = pa.schema(
+        [*fixed, *((name, types.get(only[name] or "number", pa.string())) for name in columns)]
+    )
 
     def row(point: Point, result: RunResult) -> tuple[Any, ...]:
         found = _values(point, result)
-        place = (point.index, point.cell, point.repeat, point.seed, result.id, result.status, result.error)
+        place = (
+            point.index,
+            point.cell,
+            point.repeat,
+            point.seed,
+            result.id,
+            result.status,
+            result.error,
+        )
         return (*place, *(_plain(found.get(name), only[name]) for name in columns))
 
     runs = (row(*found) for found in _finished(plan, journal))
@@ -331,7 +405,9 @@ def _plain(value: Any, kind: str) -> Any:
     return float(value) if kind == "number" else json.dumps(value)
 
 
-def _scan_batches(ids: list[str], journal: Journal, detector: DetectorFold) -> Iterator[list[tuple[Any, ...]]]:
+def _scan_batches(
+    ids: list[str], journal: Journal, detector: DetectorFold
+) -> Iterator[list[tuple[Any, ...]]]:
     """The scans in the order of the runs' ids; each run counts once for the fault tests."""
     batch: list[tuple[Any, ...]] = []
     for run_id in ids:

@@ -1,8 +1,9 @@
 """The runs of a campaign. Each is a task that contains everything a worker needs.
 
-The id of a task is the hash of its scenario, settings and inputs: a finished run stays finished when the campaign is
-extended, and two equal runs are made once. The seed depends on the repeat only, so that all combinations of one repeat
-have the same noise and the same draws and differences between combinations are not due to chance.
+The id of a task is the hash of its scenario, settings and inputs: a finished run stays finished
+when the campaign is extended, and two equal runs are made once. The seed depends on the repeat
+only, so that all combinations of one repeat have the same noise and the same draws and differences
+between combinations are not due to chance.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ import avsreplay
 from avsreplay import geometry, toml_document
 from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.simulate import load_scenario, scenario_of
-from avsreplay.sweep import Campaign, Draw, DrawKind, LoadedCampaign
+from avsreplay.simulate.scenario import load_scenario, scenario_of
+from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
 FORMAT = 4  # format of a run's result; a result with another format is computed again
 _NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
@@ -58,7 +59,10 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One run: row number, number of the combination, repeat, seed (None for a log), values by key, and task."""
+    """One run.
+
+    Row number, number of the combination, repeat, seed (None for a log), values by key, and task.
+    """
 
     index: int
     cell: int
@@ -70,7 +74,10 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
-    """All runs of a campaign, made one by one. ``cells`` are the combinations by key, without what is drawn."""
+    """All runs of a campaign, made one by one.
+
+    ``cells`` are the combinations by key, without what is drawn.
+    """
 
     loaded: LoadedCampaign
     cells: tuple[Mapping[str, Any], ...]
@@ -82,7 +89,10 @@ class Expansion:
         return len(self.cells) * self.loaded.campaign.repeats
 
     def points(self) -> Iterator[Point]:
-        """The runs in the order of their rows: repeat by repeat, so that a stop leaves complete repeats."""
+        """The runs in the order of their rows.
+
+        Repeat by repeat, so that a stop leaves complete repeats.
+        """
         campaign = self.loaded.campaign
         for repeat in range(campaign.repeats):
             drawn = _draws(campaign, repeat)
@@ -99,7 +109,9 @@ class Expansion:
             repeat: Number of the repeat, from 0; the seed of the scenario is derived from it.
         """
         campaign, folder = self.loaded.campaign, self.loaded.folder
-        of_case: Mapping[str, Any] = next((case.set for case in campaign.case if case.name == values.get("case")), {})
+        of_case: Mapping[str, Any] = next(
+            (case.set for case in campaign.case if case.name == values.get("case")), {}
+        )
         every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in _NAMED}}
         name = values.get("scenario", campaign.scenario)
         home = (folder / name).parent
@@ -110,9 +122,19 @@ class Expansion:
         assignments = (*self._run, *run)
         named = _models_of(scenario, home)
         inputs = [self._inputs.get(path, "") for path in (log, model or named[0], *named[1:])]
-        content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans, campaign.flights]
+        content = [
+            FORMAT,
+            avsreplay.__version__,
+            scenario,
+            inputs,
+            assignments,
+            campaign.scans,
+            campaign.flights,
+        ]
         digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
-        return Task(digest, scenario, str(home), log, model, assignments, campaign.scans, campaign.flights)
+        return Task(
+            digest, scenario, str(home), log, model, assignments, campaign.scans, campaign.flights
+        )
 
     def _scenario(self, name: str, every: Mapping[str, Any], repeat: int) -> str:
         table = dict(self._bases[name])
@@ -124,7 +146,8 @@ class Expansion:
 
 
 def expand(loaded: LoadedCampaign) -> Expansion:
-    """Return the runs of a campaign; every value of every axis is checked before the first run starts.
+    """Return the runs of a campaign; every value of every axis is checked before the first run
+    starts.
 
     Args:
         loaded: the campaign and its folder.
@@ -134,7 +157,9 @@ def expand(loaded: LoadedCampaign) -> Expansion:
         UnreadableInput: A file cannot be read.
     """
     campaign = loaded.campaign
-    axes: list[list[tuple[str, Any]]] = [[(axis.key, value) for value in axis.values] for axis in campaign.grid]
+    axes: list[list[tuple[str, Any]]] = [
+        [(axis.key, value) for value in axis.values] for axis in campaign.grid
+    ]
     if campaign.case:
         axes.insert(0, [("case", case.name) for case in campaign.case])
     for name, files in (("scenario", campaign.scenarios), ("log", campaign.logs)):
@@ -171,14 +196,23 @@ def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> d
     campaign = loaded.campaign
     paths = {str(loaded.folder / name) for name in (*campaign.logs, campaign.model) if name}
     texts = {name: tomli_w.dumps(table) for name, table in bases.items()}
-    paths |= {path for name, text in texts.items() for path in _models_of(text, (loaded.folder / name).parent)}
+    paths |= {
+        path
+        for name, text in texts.items()
+        for path in _models_of(text, (loaded.folder / name).parent)
+    }
     return {path: _sha256(Path(path)) for path in sorted(paths - {""})}
 
 
 def _models_of(scenario: str, folder: Path) -> tuple[str, ...]:
-    """Paths of the target's model that a scenario names ("" for none) and of the meshes of its objects."""
+    """Paths of the target's model that a scenario names ("" for none) and of the meshes of its
+    objects.
+    """
     table = toml_document.parse(scenario, "scenario").table if scenario else {}
-    names = [table.get("target", {}).get("model"), *(each.get("model") for each in table.get("object", ()))]
+    names = [
+        table.get("target", {}).get("model"),
+        *(each.get("model") for each in table.get("object", ())),
+    ]
     return tuple(str(folder / name) if name else "" for name in names)
 
 
@@ -189,11 +223,15 @@ def _sha256(path: Path) -> str:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint="check the path") from None
+        raise UnreadableInput(
+            error.strerror or "cannot be read", where=str(path), hint="check the path"
+        ) from None
 
 
 def _try_all(plan: Expansion, axes: list[list[tuple[str, Any]]]) -> None:
-    """Build scenario and settings once for every value of every axis, the other axes at their first value."""
+    """Build scenario and settings once for every value of every axis, the other axes at their first
+    value.
+    """
     first = {axis[0][0]: axis[0][1] for axis in axes}
     drawn = _draws(plan.loaded.campaign, 0)
     for key, value in [(None, None), *(pair for axis in axes for pair in axis)]:
@@ -202,22 +240,30 @@ def _try_all(plan: Expansion, axes: list[list[tuple[str, Any]]]) -> None:
         try:
             if task.scenario:
                 scenario_of(toml_document.parse(task.scenario, plan.loaded.name))
-            toml_document.build(RunConfig, toml_document.override(toml_document.Document("", {}), task.assignments))
+            toml_document.build(
+                RunConfig, toml_document.override(toml_document.Document("", {}), task.assignments)
+            )
         except UsageError as error:
             at = f"{plan.loaded.name}, {key} = {value}" if key else plan.loaded.name
             raise UsageError(error.what, where=at, hint=error.hint) from None
 
 
 def _seed(campaign: Campaign, repeat: int) -> int:
-    state = np.random.SeedSequence(campaign.seed, spawn_key=(0, repeat)).generate_state(1, np.uint64)
+    state = np.random.SeedSequence(campaign.seed, spawn_key=(0, repeat)).generate_state(
+        1, np.uint64
+    )
     return int(state[0] >> np.uint64(1))
 
 
 def _draws(campaign: Campaign, repeat: int) -> dict[str, Any]:
-    """The values drawn for a repeat, each from its own random stream, so that adding a draw changes no other."""
+    """The values drawn for a repeat, each from its own random stream, so that adding a draw changes
+    no other.
+    """
     drawn = {}
     for draw in campaign.draw:
-        stream = np.random.SeedSequence(campaign.seed, spawn_key=(1, repeat, zlib.crc32(draw.key.encode())))
+        stream = np.random.SeedSequence(
+            campaign.seed, spawn_key=(1, repeat, zlib.crc32(draw.key.encode()))
+        )
         drawn[draw.key] = _drawn(draw, np.random.Generator(np.random.PCG64(stream)))
     return drawn
 
@@ -237,7 +283,10 @@ def _drawn(draw: Draw, rng: np.random.Generator) -> Any:
             return draw.values[int(rng.integers(len(draw.values)))]
         case DrawKind.DIRECTION:
             towards = rng.standard_normal(3)
-            return [float(x) for x in towards / np.linalg.norm(towards[None], axis=1) * rng.uniform(low, high)]
+            return [
+                float(x)
+                for x in towards / np.linalg.norm(towards[None], axis=1) * rng.uniform(low, high)
+            ]
         case DrawKind.ATTITUDE:
             return [float(x) for x in geometry.normalise(rng.standard_normal(4))]
 
@@ -247,7 +296,9 @@ def _placed(node: Any, path: list[str], value: Any, key: str, where: str) -> Any
     head, rest = path[0], path[1:]
     if isinstance(node, list):
         if not head.isdigit() or int(head) >= len(node):
-            raise UsageError(f"'{key}' names no setting", where=where, hint=f"the list has {len(node)} entries")
+            raise UsageError(
+                f"'{key}' names no setting", where=where, hint=f"the list has {len(node)} entries"
+            )
         changed = list(node)
         changed[int(head)] = _placed(node[int(head)], rest, value, key, where) if rest else value
         return changed

@@ -1,8 +1,10 @@
-"""The journal of a campaign: one line per finished run, appended as runs finish, and the scans of each run.
+"""The journal of a campaign: one line per finished run, appended as runs finish, and the scans of
+each run.
 
-A line is ``checksum id status values``; the scans of a run are a Parquet file of their own, written before its line. A
-line that is damaged (a changed byte, or the end cut off by a kill) is moved to ``journal.damaged`` and its run is made
-again; all other lines are kept. Lines are in the order of completion; results are sorted elsewhere.
+A line is ``checksum id status values``; the scans of a run are a Parquet file of their own, written
+before its line. A line that is damaged (a changed byte, or the end cut off by a kill) is moved to
+``journal.damaged`` and its run is made again; all other lines are kept. Lines are in the order of
+completion; results are sorted elsewhere.
 """
 
 from __future__ import annotations
@@ -20,11 +22,14 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import output_path
-from avsreplay.sweep import SCAN_COLUMNS, RunResult
+from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 
 
 def arrow() -> tuple[Any, Any]:
-    """The modules pyarrow and pyarrow.parquet. Raises MissingBackend where pyarrow is not installed."""
+    """The modules pyarrow and pyarrow.parquet.
+
+    Raises MissingBackend where pyarrow is not installed.
+    """
     try:
         return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     except ImportError:
@@ -36,7 +41,9 @@ def scan_schema() -> Any:
     """Columns of a file of scans: the run's id, then SCAN_COLUMNS."""
     pa, _ = arrow()
     types = {"seq": pa.int64(), "fault": pa.string(), "harmful": pa.bool_(), "gamma": pa.int64()}
-    return pa.schema([("id", pa.string()), *((name, types.get(name, pa.float64())) for name in SCAN_COLUMNS)])
+    return pa.schema(
+        [("id", pa.string()), *((name, types.get(name, pa.float64())) for name in SCAN_COLUMNS)]
+    )
 
 
 def write_scans(path: Path, rows: Sequence[tuple[Any, ...]]) -> None:
@@ -53,7 +60,9 @@ def write_scans(path: Path, rows: Sequence[tuple[Any, ...]]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be made", where=str(path.parent), hint="check it") from None
+        raise UnreadableInput(
+            error.strerror or "cannot be made", where=str(path.parent), hint="check it"
+        ) from None
     write_batches(path, schema, [rows])
 
 
@@ -66,7 +75,9 @@ def write_batches(path: Path, schema: Any, batches: Iterable[Sequence[tuple[Any,
     ):
         for rows in batches:
             columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
-            arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
+            arrays = [
+                pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)
+            ]
             writer.write_table(pa.table(arrays, schema))
 
 
@@ -78,28 +89,41 @@ def read_scans(path: Path) -> list[tuple[Any, ...]]:
         if table.schema != scan_schema().remove(0):
             raise ValueError("its columns are not those of a campaign's scans")
         return list(zip(*(column.to_pylist() for column in table.columns), strict=True))
-    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: also a name that is not UTF-8
+    except (
+        OSError,
+        ValueError,
+        pa.ArrowException,
+    ) as error:  # ValueError: also a name that is not UTF-8
         what = str(error).splitlines()[0]
         raise UnreadableInput(what, where=str(path), hint="run the campaign again") from None
 
 
 T = TypeVar("T")
-RESULTS = ("results.parquet", "scans.parquet", "summary.json", "report.html")  # written from a journal
+RESULTS = (
+    "results.parquet",
+    "scans.parquet",
+    "summary.json",
+    "report.html",
+)  # written from a journal
 
 
 class Journal:
-    """Journal of the finished runs of a campaign in one folder; a context manager while runs are added.
+    """Journal of the finished runs of a campaign in one folder; a context manager while runs are
+    added.
 
-    Entering the context locks the folder, so that two campaigns cannot write to it at the same time.
+    Entering the context locks the folder, so that two campaigns cannot write to it at the same
+    time.
 
     Attributes:
         folder: The folder.
         path: The file ``journal.txt`` in the folder.
         status: Status of every finished run, by its id.
-        damaged: Lines that were set aside, except a last line that is incomplete because the process was killed.
+        damaged: Lines that were set aside, except a last line that is incomplete because the
+            process was killed.
 
     Raises:
-        UsageError: On entering the context, another process uses the folder; the message names the folder.
+        UsageError: On entering the context, another process uses the folder; the message names the
+            folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -123,7 +147,9 @@ class Journal:
         foreign = [name for name in RESULTS if (folder / name).exists()]
         if foreign and not self.path.exists():
             hint = "name another directory; it is left alone"
-            raise UsageError(f"contains '{foreign[0]}', but no journal", where=str(folder), hint=hint)
+            raise UsageError(
+                f"contains '{foreign[0]}', but no journal", where=str(folder), hint=hint
+            )
 
     def __enter__(self) -> Journal:
         def begin() -> BinaryIO:
@@ -138,7 +164,10 @@ class Journal:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         for stream in (self._stream, self._lock):
             if stream is not None:
@@ -152,7 +181,8 @@ class Journal:
         """Append a result and flush it; a run that is already in the journal is ignored.
 
         Args:
-            result: The result of a finished run; its scans, if any, are written to a file of their own.
+            result: The result of a finished run; its scans, if any, are written to a file of their
+                own.
 
         Raises:
             RuntimeError: The journal is used outside its context.
@@ -206,7 +236,10 @@ class Journal:
         return read_scans(part) if part.exists() else []
 
     def check_scans(self) -> int:
-        """Forget every run whose scans are missing or damaged, so that it is made again; return their number."""
+        """Forget every run whose scans are missing or damaged, so that it is made again.
+
+        Return their number.
+        """
         bad = []
         for run_id in self.status:
             count = self.result(run_id).scan_count
@@ -265,7 +298,11 @@ class Journal:
         with self.path.open("rb") as stream:
             for line in stream:
                 parts = line[9:-1].split(b" ", 2)
-                if line[-1:] == b"\n" and line[:9] == b"%08x " % zlib.crc32(line[9:-1]) and len(parts) == 3:
+                if (
+                    line[-1:] == b"\n"
+                    and line[:9] == b"%08x " % zlib.crc32(line[9:-1])
+                    and len(parts) == 3
+                ):
                     self._end = place
                     self._note(parts[0].decode(), parts[1].decode(), len(line))
                 elif line[-1:] == b"\n":
@@ -295,11 +332,16 @@ class Journal:
             return act()
         except OSError as error:
             what = error.strerror or "cannot be used"
-            raise UnreadableInput(what, where=str(self.path), hint="check the folder, then run it again") from None
+            raise UnreadableInput(
+                what, where=str(self.path), hint="check the folder, then run it again"
+            ) from None
 
 
 def _locked(path: Path) -> BinaryIO:
-    """The open lock file of a folder; the system releases it when the process ends, however it ends."""
+    """The open lock file of a folder.
+
+    The system releases it when the process ends, however it ends.
+    """
     stream = path.open("a+b")
     try:
         _lock(stream)
@@ -308,7 +350,9 @@ def _locked(path: Path) -> BinaryIO:
         owner = stream.read(200).decode("utf-8", "replace").strip() or "another process"
         stream.close()
         hint = "wait for it, or give another directory with -o"
-        raise UsageError(f"the directory is in use by {owner}", where=str(path.parent), hint=hint) from None
+        raise UsageError(
+            f"the directory is in use by {owner}", where=str(path.parent), hint=hint
+        ) from None
     stream.seek(0)
     stream.truncate()
     stream.write(f"process {os.getpid()} on {socket.gethostname()}\n".encode())
@@ -342,6 +386,10 @@ def _line(result: RunResult) -> bytes:
 def _result(line: bytes) -> RunResult:
     run_id, status, body = line[9:-1].split(b" ", 2)
     values: dict[str, Any] = json.loads(body)
-    metrics = values["metrics"] and {sys.intern(name): value for name, value in values["metrics"].items()}
+    metrics = values["metrics"] and {
+        sys.intern(name): value for name, value in values["metrics"].items()
+    }
     episodes = tuple(map(tuple, values["episodes"]))
-    return RunResult(run_id.decode(), status.decode(), values["error"], metrics, (), episodes, values["scans"])
+    return RunResult(
+        run_id.decode(), status.decode(), values["error"], metrics, (), episodes, values["scans"]
+    )

@@ -15,16 +15,28 @@ from avsreplay.report.table import Table
 from avsreplay.sweep.statistics import NONE, FaultKind, Quantiles, Rate, Roc, Typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, WorstRun
 
-# Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its own
+# Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its
+# own
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
 _LEFT, _WIDTH, _ROW = 50, 460, 26  # fits a telephone without scrolling
 _FALSE_MIN = 1e-4  # left end of the ROC's logarithmic axis
 _X0, _Y0, _SIZE = 60, 20, 380
 _KIND_HEADS = (
-    *("fault", "no.", "strength,\nlength", "scans\nflagged", "windows\nfound", "delay,\nworst", "recovery,\nworst"),
+    *(
+        "fault",
+        "no.",
+        "strength,\nlength",
+        "scans\nflagged",
+        "windows\nfound",
+        "delay,\nworst",
+        "recovery,\nworst",
+    ),
     *("lost", "worst\nflagged", "worst\nused", "worst\nafter"),
 )
-KIND_PARTS = ((0, 1, 2, 3, 4, 5, 6, 7), (0, 1, 8, 9, 10))  # columns: what was found and when; errors
+KIND_PARTS = (
+    (0, 1, 2, 3, 4, 5, 6, 7),
+    (0, 1, 8, 9, 10),
+)  # columns: what was found and when; errors
 _KINDS_TEXT = """No.: the combination. None: the scans outside every window; what is flagged there is a false alarm.
 ~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap. Delay: from a window's first
 scan to its first flagged one [s], median and worst. Recovery: from the first scan after it to the first healthy one
@@ -39,11 +51,17 @@ avsreplay sweep CAMPAIGN.toml --run ID -o DIR --report"""
 def build_sweep_page(summary: SweepSummary) -> str:
     """The page of a campaign's summary; the same summary gives the same bytes."""
     cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
-    figures = [_spans(title, [(n, c.metrics.get(name)) for n, c in cells]) for name, title in HEADLINES.items()]
+    figures = [
+        _spans(title, [(n, c.metrics.get(name)) for n, c in cells])
+        for name, title in HEADLINES.items()
+    ]
     parts: list[Part] = [
         combination_table(cells),
         rate_table(cells),
-        Section("Metrics", "Dot: median over the runs; thick: its 95 % interval; thin: 5 % to 95 % of the runs."),
+        Section(
+            "Metrics",
+            "Dot: median over the runs; thick: its 95 % interval; thin: 5 % to 95 % of the runs.",
+        ),
         *(figure for figure in figures if figure is not None),
     ]
     if summary.detector is not None and summary.detector.harmful:
@@ -56,7 +74,9 @@ def build_sweep_page(summary: SweepSummary) -> str:
 
 
 def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
-    """A row per run that did not end well or has the largest errors, with ``digits`` of its id (all if None)."""
+    """A row per run that did not end well or has the largest errors, with ``digits`` of its id (all
+    if None).
+    """
     rows = tuple(
         (
             run.id[:digits],
@@ -68,12 +88,21 @@ def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
         )
         for run in worst
     )
-    return Table("Worst runs", ("run", "no.", "repeat", "seed", "status", "reason"), rows, "nrrrnl", wide=True)
+    return Table(
+        "Worst runs",
+        ("run", "no.", "repeat", "seed", "status", "reason"),
+        rows,
+        "nrrrnl",
+        wide=True,
+    )
 
 
 def words(values: Mapping[str, Any]) -> str:
     """A combination in words, without the prefixes of its keys."""
-    pairs = (f"{key.removeprefix('scenario.').removeprefix('run.')}={value}" for key, value in values.items())
+    pairs = (
+        f"{key.removeprefix('scenario.').removeprefix('run.')}={value}"
+        for key, value in values.items()
+    )
     return ", ".join(pairs) or "no change"
 
 
@@ -87,8 +116,12 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     rows = []
     for number, cell in cells:
         nees = cell.nees
-        text = "" if nees is None else f"{nees.mean_per_dof:.3f} ({nees.low:.3f} to {nees.high:.3f})"
-        rows.append((f"{number}: {words(cell.values)}", str(cell.runs), str(cell.status.get("ok", 0)), text))
+        text = (
+            "" if nees is None else f"{nees.mean_per_dof:.3f} ({nees.low:.3f} to {nees.high:.3f})"
+        )
+        rows.append(
+            (f"{number}: {words(cell.values)}", str(cell.runs), str(cell.status.get("ok", 0)), text)
+        )
     heads = ("combination", "runs", "ok", "NEES per state at the end\n(band where consistent)")
     return Table("Combinations", heads, tuple(rows), wide=True)
 
@@ -96,7 +129,9 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """A row per combination: share of the runs that meet each criterion, with its 95 % interval."""
     names = list(cells[0][1].rates) if cells else []
-    rows = tuple((str(number), *(_share(cell.rates[name]) for name in names)) for number, cell in cells)
+    rows = tuple(
+        (str(number), *(_share(cell.rates[name]) for name in names)) for number, cell in cells
+    )
     return Table("Success", ("combination", *names), rows, wide=True)
 
 
@@ -107,16 +142,30 @@ def cell_table(number: int, cell: Cell) -> Table:
         if found is not None:
             points = (f"{v:.3g}" for v in (found.q05, found.median, found.q95))
             rows.append(
-                (HEADLINES[name], str(found.count), *points, _interval(found.median_low, found.median_high, ".3g"))
+                (
+                    HEADLINES[name],
+                    str(found.count),
+                    *points,
+                    _interval(found.median_low, found.median_high, ".3g"),
+                )
             )
     for name, share in cell.rates.items():
         if share is not None:
             span = _interval(share.low, share.high, ".1%")
-            rows.append((name, f"{share.successes}/{share.count}", "", f"{share.share:.1%}", "", span))
+            rows.append(
+                (name, f"{share.successes}/{share.count}", "", f"{share.share:.1%}", "", span)
+            )
     if cell.nees is not None:
         nees, band = cell.nees, f"{cell.nees.low:.3f} to {cell.nees.high:.3f}"
         rows.append(
-            ("NEES per state at the end, 1 expected", str(nees.count), "", f"{nees.mean_per_dof:.3f}", "", band)
+            (
+                "NEES per state at the end, 1 expected",
+                str(nees.count),
+                "",
+                f"{nees.mean_per_dof:.3f}",
+                "",
+                band,
+            )
         )
     title = f"{number}: {words(cell.values)} ({cell.runs} runs)"
     return Table(title, ("metric", "runs", "5 %", "median", "95 %", "95 % interval"), tuple(rows))
@@ -130,10 +179,24 @@ def detector_table(detector: Detector) -> Table:
     for name, curve in detector.curves.items():
         if curve is not None:
             threshold, detected = curve.at_one_percent
-            rows.append((f"{name} alone", f"{detected:.2%}", "at most 1 %", f"{threshold:.4g}", f"{curve.area:.4f}"))
+            rows.append(
+                (
+                    f"{name} alone",
+                    f"{detected:.2%}",
+                    "at most 1 %",
+                    f"{threshold:.4g}",
+                    f"{curve.area:.4f}",
+                )
+            )
     return Table(
         f"Fault tests over {detector.harmful} harmful and {detector.other} other scans of all runs",
-        ("test", "harmful scans flagged", "other scans flagged", "threshold", "area under\nthe ROC curve"),
+        (
+            "test",
+            "harmful scans flagged",
+            "other scans flagged",
+            "threshold",
+            "area under\nthe ROC curve",
+        ),
         tuple(rows),
         wide=True,
     )
@@ -166,7 +229,10 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
     lines = [
         {
             "label": number,
-            "title": f"{number}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count} runs",
+            "title": (
+                f"{number}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count}"
+                " runs"
+            ),
             "y": _ROW * (k + 3),
             "x": {
                 **{name: x(getattr(q, name)) for name in ("q05", "q95", "median")},
@@ -190,7 +256,10 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
 
 
 def _roc(detector: Detector) -> Markup:
-    """Detected against false alarms; the axis of false alarms is logarithmic, since what matters is below 1 %."""
+    """Detected against false alarms.
+
+    The axis of false alarms is logarithmic, since what matters is below 1 %.
+    """
     curves = [
         {"name": name, "colour": colour, "dash": dash, "points": _points(curve)}
         for (colour, dash), (name, curve) in zip(_STYLES, detector.curves.items(), strict=False)
@@ -200,7 +269,9 @@ def _roc(detector: Detector) -> Markup:
     if detector.detected is not None and detector.false is not None:
         rule = [f"{v:.1f}" for v in _place(detector.false.share, detector.detected.share)]
     ticks = [(f"{_place(v, 0.0)[0]:.1f}", f"{100 * v:g} %") for v in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
-    return render("roc.svg", x0=_X0, y0=_Y0, size=_SIZE, width=_WIDTH, ticks=ticks, curves=curves, rule=rule)
+    return render(
+        "roc.svg", x0=_X0, y0=_Y0, size=_SIZE, width=_WIDTH, ticks=ticks, curves=curves, rule=rule
+    )
 
 
 def _points(curve: Roc) -> str:
@@ -216,10 +287,13 @@ def _place(false: float, detected: float) -> tuple[float, float]:
 def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """A row per kind of fault and combination; without rows where nothing was injected.
 
-    Times are in s; errors are position [mm] and rotation [deg] of the estimate. The rows of kind "none" come first:
-    flagged scans in these rows are false alarms.
+    Times are in s; errors are position [mm] and rotation [deg] of the estimate. The rows of kind
+    "none" come first: flagged scans in these rows are false alarms.
     """
-    title = "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
+    title = (
+        "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none:"
+        " outside every window"
+    )
     injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)
     return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else (), wide=True)
 
@@ -227,7 +301,12 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 def columns_of(table: Table, kept: Sequence[int]) -> Table:
     """Some columns of a table."""
     heads, align = tuple(table.heads[k] for k in kept), "".join(table.letter(k) for k in kept)
-    return replace(table, heads=heads, align=align, rows=tuple(tuple(row[k] for k in kept) for row in table.rows))
+    return replace(
+        table,
+        heads=heads,
+        align=align,
+        rows=tuple(tuple(row[k] for k in kept) for row in table.rows),
+    )
 
 
 def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:
@@ -243,7 +322,9 @@ def _kind_row(name: str, number: int, kind: FaultKind) -> tuple[str, ...]:
     return (
         f"{name} ~" if harmless else name,
         str(number),
-        ", ".join([*(f"{s:g}" for s in kind.strengths), *(f"{length:g} s" for length in kind.lengths_s)]),
+        ", ".join(
+            [*(f"{s:g}" for s in kind.strengths), *(f"{length:g} s" for length in kind.lengths_s)]
+        ),
         _percent(kind.flagged),
         _count(kind.detected),
         _typical(kind.delay_s),

@@ -1,8 +1,10 @@
-"""Statistics over many runs: quantiles, success rates, consistency, ROC curves of the fault tests, kinds of fault.
+"""Statistics over many runs: quantiles, success rates, consistency, ROC curves of the fault tests,
+kinds of fault.
 
-The figures by kind of fault (windows detected, delay, recovery, largest errors of the estimate) are computed from the
-fault accounts of the runs (report/episodes), without their scans. Two windows of one kind in a run count as two. Kind
-"none" stands for the scans outside every window; those flagged there are false alarms.
+The figures by kind of fault (windows detected, delay, recovery, largest errors of the estimate) are
+computed from the fault accounts of the runs (report/episodes), without their scans. Two windows of
+one kind in a run count as two. Kind "none" stands for the scans outside every window; those flagged
+there are false alarms.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ LEVEL = 0.95  # confidence level of every interval
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """5 %, 50 % and 95 % quantiles over the runs that have the metric, and a 95 % interval of the median.
+    """5 %, 50 % and 95 % quantiles over the runs that have the metric, and a 95 % interval of the
+    median.
 
     The interval is None where there are too few runs for one with this coverage (fewer than 6).
     """
@@ -38,7 +41,10 @@ class Quantiles:
 
 
 def quantiles(values: Sequence[float]) -> Quantiles | None:
-    """Quantiles by linear interpolation, the interval of the median by order statistics; None without a value."""
+    """Quantiles by linear interpolation, the interval of the median by order statistics.
+
+    None without a value.
+    """
     if not len(values):
         return None
     from scipy.stats import quantile_test
@@ -62,7 +68,9 @@ class Typical:
 
 def typical(values: Sequence[float]) -> Typical | None:
     """Median and largest value; None without a value."""
-    return Typical(len(values), float(np.median(values)), float(max(values))) if len(values) else None
+    return (
+        Typical(len(values), float(np.median(values)), float(max(values))) if len(values) else None
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +127,8 @@ class Roc:
         detected: Share of the harmful scans that are flagged at each threshold.
         false: Share of the other scans that are flagged at each threshold.
         area: Area under the curve.
-        at_one_percent: Threshold at which at most 1 % of the other scans are flagged, and the share it detects.
+        at_one_percent: Threshold at which at most 1 % of the other scans are flagged, and the share
+            it detects.
     """
 
     thresholds: tuple[float, ...]
@@ -130,10 +139,12 @@ class Roc:
 
 
 class ScoreHistogram:
-    """Histogram of the scores of harmful and of other scans; its size does not depend on the number of scans.
+    """Histogram of the scores of harmful and of other scans; its size does not depend on the number
+    of scans.
 
-    Bins are uniform in the logarithm of the score, 100 per decade from 1e-9 to 1e6, so that thresholds are known to
-    2.4 %. A scan without a score (nothing measured) counts as flagged at every threshold.
+    Bins are uniform in the logarithm of the score, 100 per decade from 1e-9 to 1e6, so that
+    thresholds are known to 2.4 %. A scan without a score (nothing measured) counts as flagged at
+    every threshold.
     """
 
     EDGES: NDArray[np.float64] = np.logspace(-9.0, 6.0, 1501)
@@ -144,7 +155,9 @@ class ScoreHistogram:
     def add(self, score: float | None, harmful: bool) -> None:
         """Count one scan; a larger score is worse."""
         place = (
-            len(self.EDGES) if score is None or math.isnan(score) else int(np.searchsorted(self.EDGES, score, "right"))
+            len(self.EDGES)
+            if score is None or math.isnan(score)
+            else int(np.searchsorted(self.EDGES, score, "right"))
         )
         self._counts[int(harmful), place] += 1
 
@@ -155,11 +168,16 @@ class ScoreHistogram:
         return int(other), int(harmful)
 
     def roc(self) -> Roc | None:
-        """The curve over the thresholds at which it changes; None without harmful or without other scans."""
+        """The curve over the thresholds at which it changes.
+
+        None without harmful or without other scans.
+        """
         other, harmful = self.totals
         if not other or not harmful:
             return None
-        above = np.cumsum(self._counts[:, ::-1], axis=1)[:, ::-1]  # at or above the lower edge of each bin
+        above = np.cumsum(self._counts[:, ::-1], axis=1)[
+            :, ::-1
+        ]  # at or above the lower edge of each bin
         used = np.flatnonzero(self._counts.sum(axis=0)[1:]) + 1
         places = np.unique(np.concatenate([[1], used, np.minimum(used + 1, len(self.EDGES))]))[::-1]
         false, detected = above[0, places] / other, above[1, places] / harmful
@@ -198,10 +216,12 @@ class FaultKind:
         detected: Share of the windows with a flagged scan or, without any scan, a gap.
         delay_s: From the first scan of a window to the first flagged one, where there was one [s].
         delay_scans: The same in scans.
-        recovery_s: From the first scan after a window to the first healthy one, where recovery was needed [s].
+        recovery_s: From the first scan after a window to the first healthy one, where recovery was
+            needed [s].
         recovery_scans: The same in scans.
         lost: Windows after which no scan was healthy.
-        peak_flagged: Largest errors of the estimate over its scans with gamma 0; None without truth.
+        peak_flagged: Largest errors of the estimate over its scans with gamma 0; None without
+            truth.
         peak_used: The same over its scans with gamma 1.
         peak_after: The same over the healthy scans after a window, up to the next one.
     """
@@ -264,8 +284,12 @@ class _Windows:
                 self.peaks[name] = max(value, self.peaks.get(name, value))
 
     def result(self) -> FaultKind:
-        delay_s, delay_scans, recovery_s, recovery_scans = (typical(self.times[name]) for name in _TIMES)
-        flagged, used, after = (Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERRORS)) for when in _PEAKS)
+        delay_s, delay_scans, recovery_s, recovery_scans = (
+            typical(self.times[name]) for name in _TIMES
+        )
+        flagged, used, after = (
+            Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERRORS)) for when in _PEAKS
+        )
         return FaultKind(
             harmful=self.harmful,
             strengths=tuple(sorted(self.strengths)),

@@ -1,4 +1,7 @@
-"""The summary of a campaign: one entry per combination, the fault tests over all scans, and the worst runs."""
+"""The summary of a campaign.
+
+One entry per combination, the fault tests over all scans, and the worst runs.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from avsreplay import settings
-from avsreplay.sweep import SCAN_COLUMNS, RunResult, SuccessCriterion, statistics
+from avsreplay.sweep import statistics
+from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult, SuccessCriterion
 from avsreplay.sweep.expansion import Expansion, Point
 
 HEADLINES = {
@@ -28,7 +32,12 @@ CRITERIA = (
     SuccessCriterion("no fault missed", "faults.missed", max=0),
     SuccessCriterion("no false alarm", "faults.false_alarms", max=0),
 )
-SCORES = {"rms_m": "rms_m", "alpha_m": "alpha_m", "outlier_ratio": "inlier_ratio", "nis": "nis"}  # score: its column
+SCORES = {
+    "rms_m": "rms_m",
+    "alpha_m": "alpha_m",
+    "outlier_ratio": "inlier_ratio",
+    "nis": "nis",
+}  # score: its column
 FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
 STATES = 20
 WORST = 5  # number of runs that are listed
@@ -45,7 +54,8 @@ class Cell:
         runs: Number of finished runs.
         status: Number of runs by status.
         metrics: Quantiles of HEADLINES.
-        rates: Share of the finished runs that meet each criterion, and of all their whole flights that end in each way.
+        rates: Share of the finished runs that meet each criterion, and of all their whole flights
+            that end in each way.
         nees: NEES at the last scan of each run.
         kinds: Fault detection by kind of fault; "none" for the scans outside every window.
     """
@@ -80,7 +90,10 @@ class Detector:
 
 @dataclass(frozen=True, slots=True)
 class WorstRun:
-    """A run to look at: its id, combination, repeat, seed, status, and the reason why it is listed."""
+    """A run to look at.
+
+    Its id, combination, repeat, seed, status, and the reason why it is listed.
+    """
 
     id: str
     cell: int
@@ -92,7 +105,10 @@ class WorstRun:
 
 @dataclass(frozen=True, slots=True)
 class SweepSummary:
-    """A campaign: planned and finished runs, number of runs by status, combinations, fault tests, worst runs."""
+    """A campaign.
+
+    Planned and finished runs, number of runs by status, combinations, fault tests, worst runs.
+    """
 
     name: str
     planned: int
@@ -135,9 +151,14 @@ class CampaignFold:
             planned=len(self._plan),
             done=status.total(),
             status=dict(sorted(status.items())),
-            cells=tuple(c.result(v, self._criteria) for c, v in zip(self._cells, self._plan.cells, strict=True)),
+            cells=tuple(
+                c.result(v, self._criteria)
+                for c, v in zip(self._cells, self._plan.cells, strict=True)
+            ),
             detector=detector,
-            worst=tuple(run for _, run in sorted(self._worst, reverse=True, key=lambda entry: entry[0])),
+            worst=tuple(
+                run for _, run in sorted(self._worst, reverse=True, key=lambda entry: entry[0])
+            ),
         )
 
 
@@ -157,12 +178,16 @@ class _CellFold:
             values += [float(value)] if value is not None and math.isfinite(value) else []
         self._met.update(c.name for c in criteria if _meets(c, metrics))
         self._kinds.add(result.episodes, metrics)
-        self._flights.update({name: metrics.get(f"flights.{name}") or 0 for name in ("count", *FLIGHT_ENDS)})
+        self._flights.update(
+            {name: metrics.get(f"flights.{name}") or 0 for name in ("count", *FLIGHT_ENDS)}
+        )
 
     def result(self, values: Mapping[str, Any], criteria: Sequence[SuccessCriterion]) -> Cell:
         runs, count = self.status.total(), self._flights["count"]
         rates = {c.name: statistics.rate(self._met[c.name], runs) for c in criteria}
-        flown = {f"flights {name}": statistics.rate(self._flights[name], count) for name in FLIGHT_ENDS}
+        flown = {
+            f"flights {name}": statistics.rate(self._flights[name], count) for name in FLIGHT_ENDS
+        }
         return Cell(
             values=values,
             runs=runs,
@@ -182,7 +207,9 @@ def _meets(criterion: SuccessCriterion, metrics: Mapping[str, Any]) -> bool:
 def _badness(result: RunResult) -> tuple[tuple[float, float], str]:
     """Sort key, larger for a worse run, and the reason in words."""
     metrics = result.metrics or {}
-    known = [(metrics[name], what) for name, what in _ERRORS.items() if metrics.get(name) is not None]
+    known = [
+        (metrics[name], what) for name, what in _ERRORS.items() if metrics.get(name) is not None
+    ]
     error, what = max(known, default=(0.0, ""))
     rank = len(_BAD) - _BAD.index(result.status) if result.status in _BAD else 0
     reason = result.error or (f"position error {error:.4g} m ({what})" if what else "")
@@ -208,7 +235,9 @@ class DetectorFold:
 
     def result(self) -> Detector:
         """Fault detection over the scans added."""
-        counts = {kind: self._flagged[kind, True] + self._flagged[kind, False] for kind in (True, False)}
+        counts = {
+            kind: self._flagged[kind, True] + self._flagged[kind, False] for kind in (True, False)
+        }
         return Detector(
             harmful=counts[True],
             other=counts[False],
@@ -219,7 +248,10 @@ class DetectorFold:
 
 
 def _score(name: str, value: float | None) -> float | None:
-    """The score of a test, larger for a worse scan: the share of inliers is replaced by that of outliers."""
+    """The score of a test, larger for a worse scan.
+
+    The share of inliers is replaced by that of outliers.
+    """
     return 1.0 - value if value is not None and name == "outlier_ratio" else value
 
 

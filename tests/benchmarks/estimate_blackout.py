@@ -1,10 +1,10 @@
 """Coasting through blackouts. ``python tests/benchmarks/estimate_blackout.py [--quick] [--early]``.
 
-Random bodies at 0.1 rad/s, seen at 5 Hz with 5 mm and 0.3 deg of white noise for 80 s from a cold start; then nothing.
-For each length: error of the predicted pose at the end, its predicted 1 sigma, share inside 3 sigma (position and
-attitude together, chi-square with 6 degrees of freedom at the 3 sigma level of 99.73 %). ``--early``: gaps long before
-convergence, 24 bodies with 2 mm and 0.1 deg at 2 Hz: NEES per degree of freedom of a propagation about the mean alone,
-and of the estimator.
+Random bodies at 0.1 rad/s, seen at 5 Hz with 5 mm and 0.3 deg of white noise for 80 s from a cold
+start; then nothing. For each length: error of the predicted pose at the end, its predicted 1 sigma,
+share inside 3 sigma (position and attitude together, chi-square with 6 degrees of freedom at the 3
+sigma level of 99.73 %). ``--early``: gaps long before convergence, 24 bodies with 2 mm and 0.1 deg
+at 2 Hz: NEES per degree of freedom of a propagation about the mean alone, and of the estimator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ EARLY = (10.0, 12.0), (15.0, 12.0), (20.0, 12.0), (20.0, 30.0)  # time with scan
 
 
 def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]]:
-    """Is it converged when the light goes out; per length: errors [m, deg], 1 sigma of both, chi-square of the pose."""
+    """Is it converged when the light goes out; per length.
+
+    Errors [m, deg], 1 sigma of both, chi-square of the pose.
+    """
     world = tumbling.draw(seed, seconds=SEEN_S + LENGTHS[-1], hz=5.0)
     seen = int(np.searchsorted(world.times, SEEN_S, side="right"))
     lit = tumbling.World(world.times[:seen], world.states[:seen], world.moments)
@@ -58,11 +61,17 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
 
 
 def early(seed: int, seen_s: float, gap_s: float) -> tuple[float, float]:
-    """NEES per degree of freedom at the end of a gap: of a propagation about the mean alone, and of the estimator."""
+    """NEES per degree of freedom at the end of a gap.
+
+    Of a propagation about the mean alone, and of the estimator.
+    """
     world = tumbling.draw(seed, seconds=seen_s + gap_s, hz=2.0, sigma_max=0.85)
     seen = int(np.searchsorted(world.times, seen_s, side="right"))
     lit = tumbling.World(world.times[:seen], world.states[:seen], world.moments)
-    rng, estimator = np.random.Generator(np.random.PCG64([seed, 12])), Estimator(EstimatorParams(), None, 4.0)
+    rng, estimator = (
+        np.random.Generator(np.random.PCG64([seed, 12])),
+        Estimator(EstimatorParams(), None, 4.0),
+    )
     tests = [Convergence(ConvergenceParams(), 4.0)]
     for _, _, track, _ in fold(lit, estimator, tests, rng, (0.002, np.radians(0.1))):  # noqa: B007
         pass
@@ -86,7 +95,8 @@ def main() -> None:
             found = np.array([early(seed, seen_s, gap_s) for seed in range(1000, 1024)])
             cells = [f"{column.mean():.2f} ({column.max():.1f})" for column in found.T]
             print(
-                f"{seen_s:.0f} s of scans, {gap_s:.0f} s without: about the mean {cells[0]}, used {cells[1]}",
+                f"{seen_s:.0f} s of scans, {gap_s:.0f} s without: about the mean {cells[0]}, used"
+                f" {cells[1]}",
                 flush=True,
             )
         return

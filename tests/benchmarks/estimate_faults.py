@@ -1,8 +1,9 @@
-"""The fault campaign as Markdown. ``avsreplay sweep docs/campaigns/faults.toml -o DIR``, then this with DIR.
+"""The fault campaign as Markdown. ``avsreplay sweep docs/campaigns/faults.toml -o DIR``, then this
+with DIR.
 
-``python tests/benchmarks/estimate_faults.py DIR``: one table a setting (policy of the fault rule), a line a kind of
-fault and strength, from DIR/summary.json. Any campaign over scenarios will do; a scenario's file name gives the
-strength its name.
+``python tests/benchmarks/estimate_faults.py DIR``: one table a setting (policy of the fault rule),
+a line a kind of fault and strength, from DIR/summary.json. Any campaign over scenarios will do; a
+scenario's file name gives the strength its name.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def tables(summary: dict[str, Any]) -> str:
     for cell in summary["cells"]:
         values = dict(cell["values"])
         strength = Path(values.pop("scenario", "")).stem.rpartition("-")[2]
-        setting = ", ".join(f"`{key.removeprefix('run.')} = {value}`" for key, value in values.items())
+        setting = ", ".join(
+            f"`{key.removeprefix('run.')} = {value}`" for key, value in values.items()
+        )
         by_setting.setdefault(setting, []).append((strength, cell))
     return "\n\n".join(
         f"{setting}, runs of each strength: {cells[0][1]['runs']}:\n\n{table(cells)}"
@@ -42,17 +45,27 @@ def tables(summary: dict[str, Any]) -> str:
 
 
 def table(cells: list[tuple[str, dict[str, Any]]]) -> str:
-    """One setting: its kinds of fault (false alarms first), each at the strengths in the campaign's order."""
+    """One setting.
+
+    Its kinds of fault (false alarms first), each at the strengths in the campaign's order.
+    """
     names = {name for _, cell in cells for name in cell["kinds"]}
     rows = [HEADS, ("---",) * len(HEADS)]
     for name in sorted(names, key=lambda name: (name != NONE, name)):
-        rows += [line(name, strength, cell["kinds"][name]) for strength, cell in cells if name in cell["kinds"]]
+        rows += [
+            line(name, strength, cell["kinds"][name])
+            for strength, cell in cells
+            if name in cell["kinds"]
+        ]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def line(name: str, strength: str, kind: dict[str, Any]) -> tuple[str, ...]:
     """One kind of fault at one strength."""
-    how = [*(f"{s:g}" for s in kind["strengths"]), *(f"{length:g} s" for length in kind["lengths_s"])]
+    how = [
+        *(f"{s:g}" for s in kind["strengths"]),
+        *(f"{length:g} s" for length in kind["lengths_s"]),
+    ]
     harmless = name != NONE and not kind["harmful"]
     peaks = (kind[f"peak_{when}"] for when in ("flagged", "used", "after"))
     return (
@@ -69,7 +82,11 @@ def line(name: str, strength: str, kind: dict[str, Any]) -> tuple[str, ...]:
 
 def share(rate: dict[str, Any] | None) -> str:
     """Scans flagged of scans."""
-    return "" if rate is None else f"{rate['successes']} of {rate['count']} ({100.0 * rate['share']:.3g} %)"
+    return (
+        ""
+        if rate is None
+        else f"{rate['successes']} of {rate['count']} ({100.0 * rate['share']:.3g} %)"
+    )
 
 
 def count(rate: dict[str, Any] | None) -> str:
@@ -88,7 +105,11 @@ def times(kind: dict[str, Any], what: str) -> str:
 def error(peak: dict[str, float | None]) -> str:
     """Position and rotation, each its own worst."""
     position, rotation = peak["pos_err_m"], peak["rot_err_deg"]
-    return "" if position is None or rotation is None else f"{short(1000.0 * position)} mm, {short(rotation)}°"
+    return (
+        ""
+        if position is None or rotation is None
+        else f"{short(1000.0 * position)} mm, {short(rotation)}°"
+    )
 
 
 def short(value: float) -> str:
@@ -98,7 +119,9 @@ def short(value: float) -> str:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="of the campaign's results")
     found = json.loads((parser.parse_args().folder / "summary.json").read_text())
     print("Delay and recovery: median, worst. ", end="")

@@ -1,9 +1,11 @@
-"""Is the registration's covariance right, and how long do its errors stay alike: target by target, against the truth.
+"""Is the registration's covariance right, and how long do its errors stay alike: target by target,
+against the truth.
 
 python tests/benchmarks/estimate_noise.py [--quick] [--target NAME]
 
-Simulated flash scans of several meshes from 1.2 extents away, each turned by 0.02 rad from scan to scan and registered
-from its true pose. Noise is in thousandths of the extent. Prints, of the whitened error w = C^-1/2 d:
+Simulated flash scans of several meshes from 1.2 extents away, each turned by 0.02 rad from scan to
+scan and registered from its true pose. Noise is in thousandths of the extent. Prints, of the
+whitened error w = C^-1/2 d:
 
     size    mean w'w / 6: 1 is right
     share   autocorrelation at turns up to 0.06 rad: what two nearly equal views have in common
@@ -28,9 +30,10 @@ from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array
 from avsreplay.log import parse_surface, read_surface
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
-from avsreplay.simulate.target import Shape, box, frustum, join, ply_bytes
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import Shape, box, builtin_surface, frustum, join, ply_bytes
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 TURN_RAD, FARTHEST_RAD, NEAR_RAD = 0.02, 0.6, 0.06
@@ -53,7 +56,10 @@ def meshes() -> Iterator[tuple[str, Surface]]:
     yield "satellite", builtin_surface()
     yield "bracket", builtin_surface(Shape.BRACKET)
     yield "box", _made("box", [box((-1.0, -0.8, -0.35), (0.0, 0.8, 0.35))])
-    yield "stage", _made("stage", [frustum(-3.0, 0.8, 0.0, 0.8, 48), frustum(-3.6, 0.7, -3.0, 0.3, 48)])
+    yield (
+        "stage",
+        _made("stage", [frustum(-3.0, 0.8, 0.0, 0.8, 48), frustum(-3.6, 0.7, -3.0, 0.3, 48)]),
+    )
     for name, file in (("bunny", "bun_zipper_res3.ply"), ("dragon", "dragon_vrip_res3.ply")):
         path = DATA / f"stanford-{name}" / file
         if path.exists():
@@ -86,7 +92,10 @@ def scenario(surface: Surface, noise: float, rays: int, seed: int, scans: int) -
 
 
 def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, Array]:
-    """(n, 6) whitened errors along one tumble, NaN where the view is degenerate; (n,) inliers (rms / extent)^2."""
+    """(n, 6) whitened errors along one tumble, NaN where the view is degenerate.
+
+    (n,) inliers (rms / extent)^2.
+    """
     out, edge = [], []
     for scan in true_scans(simulate(scenario_of(toml_document.parse(text, "noise")), surface)):
         found = registrar.register(scan.points, scan.truth)
@@ -99,7 +108,10 @@ def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, 
 
 
 def _root(C: Array) -> Array:
-    """Symmetric square root: the same axes from scan to scan, which a Cholesky factor's are too but less evenly."""
+    """Symmetric square root.
+
+    The same axes from scan to scan, which a Cholesky factor's are too but less evenly.
+    """
     values, vectors = np.linalg.eigh(C)
     return (vectors * np.sqrt(values)) @ vectors.T
 
@@ -108,13 +120,20 @@ def autocorrelations(runs: list[Array]) -> Array:
     """Over lags 1 to FARTHEST_RAD / TURN_RAD, pairs with a degenerate view left out."""
     power = np.nanmean(np.concatenate([w * w for w in runs]))
     lags = range(1, round(FARTHEST_RAD / TURN_RAD) + 1)
-    return np.array([np.nanmean(np.concatenate([w[k:] * w[:-k] for w in runs])) / power for k in lags])
+    return np.array(
+        [np.nanmean(np.concatenate([w[k:] * w[:-k] for w in runs])) / power for k in lags]
+    )
 
 
-def line(name: str, surface: Surface, registrar: Registrar, noise: float, rays: int, plan: Plan) -> str:
+def line(
+    name: str, surface: Surface, registrar: Registrar, noise: float, rays: int, plan: Plan
+) -> str:
     """One cell of the table."""
     seeds = range(plan.tumbles)
-    found = [whitened(surface, registrar, scenario(surface, noise, rays, seed, plan.scans)) for seed in seeds]
+    found = [
+        whitened(surface, registrar, scenario(surface, noise, rays, seed, plan.scans))
+        for seed in seeds
+    ]
     runs, edge = [w for w, _ in found], np.concatenate([x for _, x in found])
     every = np.concatenate(runs)
     good = np.isfinite(every[:, 0])
@@ -127,7 +146,8 @@ def line(name: str, surface: Surface, registrar: Registrar, noise: float, rays: 
     law = K * edge_mean / (1.0 + K * edge_mean)
     shown = share > 0.02
     return (
-        f"{head} {size:6.2f} {share:7.3f} {share / (1.0 - share) / edge_mean if shown else np.nan:6.1f}"
+        f"{head} {size:6.2f} {share:7.3f}"
+        f" {share / (1.0 - share) / edge_mean if shown else np.nan:6.1f}"
         f" {area / share if shown else np.nan:6.2f} {1.0 + 2.0 * rho.sum():8.2f}"
         f" {_colour(CONST):6.1f} {_colour(law):6.1f}"
     )
@@ -139,7 +159,9 @@ def _colour(share: float) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="two noise levels, one grid, shorter tumbles")
+    parser.add_argument(
+        "--quick", action="store_true", help="two noise levels, one grid, shorter tumbles"
+    )
     parser.add_argument("--target", help="only this one")
     args = parser.parse_args()
     plan = Plan(3, 80) if args.quick else Plan(5, 120)

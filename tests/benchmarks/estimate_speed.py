@@ -1,14 +1,15 @@
 """Processor time of the estimator's parts.
 
-``python tests/benchmarks/estimate_speed.py [--quick] [--scans] [--cases] [--long N] [--log LOG]``. Each figure is the
-least of five repeats, so that other load on the machine matters little. ``--scans``: instead, the time of estimator and
-monitors scan by scan over whole runs with simulated poses, mean and largest, the least of three repeats of each scan.
-``--cases``: that of the estimator in cases of ``estimate_surprises.py``, the least of three runs. ``--log LOG``: that
-of estimator and monitors in replays of a log, the least of three repeats of each scan. ``--long N``: as ``--scans``
-over a log of N scans at 10 Hz, by part of the log, for a tumbling body (the filter takes over), for a
-spin about the axis of the largest moment (it stays with the fit), and for one about that of the middle moment. The
-last is unstable: the rounding of the simulated motion, 1e-18 rad/s, grows 18 times in 100 s and turns the body over
-after 1,200 s.
+``python tests/benchmarks/estimate_speed.py [--quick] [--scans] [--cases] [--long N] [--log LOG]``.
+Each figure is the least of five repeats, so that other load on the machine matters little.
+``--scans``: instead, the time of estimator and monitors scan by scan over whole runs with simulated
+poses, mean and largest, the least of three repeats of each scan. ``--cases``: that of the estimator
+in cases of ``estimate_surprises.py``, the least of three runs. ``--log LOG``: that of estimator and
+monitors in replays of a log, the least of three repeats of each scan. ``--long N``: as ``--scans``
+over a log of N scans at 10 Hz, by part of the log, for a tumbling body (the filter takes over), for
+a spin about the axis of the largest moment (it stays with the fit), and for one about that of the
+middle moment. The last is unstable: the rounding of the simulated motion, 1e-18 rad/s, grows 18
+times in 100 s and turns the body over after 1,200 s.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from __future__ import annotations
 from avsreplay import arithmetic
 
 if __name__ == "__main__":
-    arithmetic.pin()  # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+    # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+    arithmetic.pin()
 
 import argparse
 import gc
@@ -39,8 +41,13 @@ from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.estimate.work import whole
-from avsreplay.monitor import FaultDetector, FaultParams
-from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams
+from avsreplay.monitor.convergence import (
+    Consistency,
+    ConsistencyParams,
+    Convergence,
+    ConvergenceParams,
+)
+from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
 from avsreplay.pipeline import Monitors
 from avsreplay.records import Alignment, Belief, ScanStatus
 from avsreplay.run import Job, Run
@@ -58,7 +65,9 @@ def least(run: Callable[[], object], count: int) -> float:
 
 
 def tracked(params: EstimatorParams, scans: int) -> tuple[Estimator, Track, Prediction, Alignment]:
-    """An estimator so many scans on at 5 Hz, its window full, all poses remembered, and the scan that is next."""
+    """An estimator so many scans on at 5 Hz, its window full, all poses remembered, and the scan
+    that is next.
+    """
     world = tumbling.draw(4, seconds=0.2 * scans, hz=5.0)
     rng = np.random.Generator(np.random.PCG64(0))
     seen = [tumbling.alignment(x.T_ac, rng, 0.005, 0.005) for x in world.states]
@@ -80,7 +89,9 @@ def scan_us(name: str, params: EstimatorParams, count: int) -> dict[str, float]:
     parts = {
         "predict": 1e6 * least(lambda: estimator.predict(track, t_ns), count),
         "innovate": 1e6 * least(lambda: estimator.innovate(prediction, seen), count),
-        f"update ({name})": 1e6 * least(lambda: estimator.update(track, prediction, innovation, 1), count),
+        f"update ({name})": (
+            1e6 * least(lambda: estimator.update(track, prediction, innovation, 1), count)
+        ),
     }
     return parts | {f"predict + update ({name})": parts["predict"] + parts[f"update ({name})"]}
 
@@ -98,7 +109,9 @@ def ahead_us(count: int) -> dict[str, float]:
 
 
 def audit_ms(scans: int) -> tuple[float, float]:
-    """An audit of the filter with so many poses remembered, and its share of each scan until the next [ms]."""
+    """An audit of the filter with so many poses remembered, and its share of each scan until the
+    next [ms].
+    """
     estimator, track, _, _ = tracked(EstimatorParams(start=Start.NEAR), scans)
     due = replace(track, since=len(track.fixes))
     whole = 1e3 * least(lambda: estimator.batch.check_against_batch(due), 1)
@@ -117,36 +130,60 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
         np.array([a.covariance for a in seen]),
     )
     prior = weak_prior(poses, EstimatorParams().resolved(2.0))
-    start = to_chart(world.states[0]).moved(np.repeat([5e-3, 2e-4, 5e-3, 1e-4, 0.05, 0.02], [3, 3, 3, 3, 5, 3]))
+    start = to_chart(world.states[0]).moved(
+        np.repeat([5e-3, 2e-4, 5e-3, 1e-4, 0.05, 0.02], [3, 3, 3, 3, 5, 3])
+    )
     once = least(lambda: rotation_history(world.states[0], world.times), 2)
     begun = time.process_time()
     fitted = whole(fit(poses, start, prior, FitParams()))
-    off = float(geometry.angle(geometry.multiply(geometry.conjugate(fitted.x.T_ac.q), world.states[0].T_ac.q)))
+    off = float(
+        geometry.angle(
+            geometry.multiply(geometry.conjugate(fitted.x.T_ac.q), world.states[0].T_ac.q)
+        )
+    )
     if off > 0.05:
         raise SystemExit("the fit did not find the motion")
     return once, time.process_time() - begun, fitted.steps
 
 
-RUNS = ((2.0, 80.0, 0.1), (5.0, 120.0, 0.1), (10.0, 60.0, 0.1), (10.0, 100.0, 0.3))  # hz, seconds, rad/s
+RUNS = (
+    (2.0, 80.0, 0.1),
+    (5.0, 120.0, 0.1),
+    (10.0, 60.0, 0.1),
+    (10.0, 100.0, 0.3),
+)  # hz, seconds, rad/s
 
 
 def run_ms(world: tumbling.World) -> np.ndarray:
     """(n, 2) milliseconds of estimator and monitors for each scan of a cold start."""
     rng = np.random.Generator(np.random.PCG64(6))
     seen = [tumbling.alignment(x.T_ac, rng, 0.002, np.radians(0.1)) for x in world.states]
-    estimator, detector = Estimator(EstimatorParams(correlated_share=0.1), None, 4.0), FaultDetector(FaultParams(), 4.0)
+    estimator, detector = (
+        Estimator(EstimatorParams(correlated_share=0.1), None, 4.0),
+        FaultDetector(FaultParams(), 4.0),
+    )
     monitors = Monitors(Consistency(ConsistencyParams()), Convergence(ConvergenceParams(), 4.0))
     state, track, spent = monitors.initial(np.ones(20)), estimator.initial(0, seen[0].T_ac), []
-    gc.freeze()  # no search for reference cycles among the simulated poses, which are none of the estimator's objects
+    # no search for reference cycles among the simulated poses, which are none of the estimator's
+    # objects
+    gc.freeze()
     for t, alignment in zip(world.times, seen, strict=True):
         begun = time.process_time()
         prediction = estimator.predict(track, round(t * 1e9))
         innovation = estimator.innovate(prediction, alignment)
         verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
-        track, verdict = estimator.step(track, prediction, innovation, verdict, state.convergence.converged)
+        track, verdict = estimator.step(
+            track, prediction, innovation, verdict, state.convergence.converged
+        )
         middle = time.process_time()
         state, _ = monitors.observe(
-            state, estimator, prediction, innovation, verdict.gamma, track, estimator.published(track)
+            state,
+            estimator,
+            prediction,
+            innovation,
+            verdict.gamma,
+            track,
+            estimator.published(track),
         )
         spent.append((1e3 * (middle - begun), 1e3 * (time.process_time() - middle)))
     return np.array(spent)
@@ -159,16 +196,22 @@ def whole_runs() -> None:
         least_ms = np.min([run_ms(world) for _ in range(3)], axis=0)
         both = least_ms.sum(axis=1)
         print(
-            f"{len(both)} scans at {hz:.0f} Hz, {rate} rad/s: estimator {least_ms[:, 0].mean():.2f} ms, at most"
-            f" {least_ms[:, 0].max():.0f}; with monitors {both.mean():.2f} ms, at most {both.max():.0f},"
-            f" {both[-len(both) // 3 :].mean():.2f} ms over the last third",
+            f"{len(both)} scans at {hz:.0f} Hz, {rate} rad/s: estimator {least_ms[:, 0].mean():.2f}"
+            f" ms, at most {least_ms[:, 0].max():.0f}; with monitors {both.mean():.2f} ms, at most"
+            f" {both.max():.0f}, {both[-len(both) // 3 :].mean():.2f} ms over the last third",
             flush=True,
         )
 
 
 def cases() -> None:
     """Mean and largest time of a scan of the estimator in cases that its model does not contain."""
-    for name in ("clean", "constant torque", "random torque and force 3", "random torque and force 1e-4", "a quarter"):
+    for name in (
+        "clean",
+        "constant torque",
+        "random torque and force 3",
+        "random torque and force 1e-4",
+        "a quarter",
+    ):
         case = next(c for c in surprises.CASES if c.name.startswith(name))
         runs = [surprises.run(case, 3001) for _ in range(3)]
         mean, worst = min(r.seconds / len(r.t) for r in runs), min(r.worst_ms for r in runs)
@@ -177,7 +220,11 @@ def cases() -> None:
 
 def long_runs(scans: int, repeats: int) -> None:
     """Mean, 99.9 % point and largest time of a scan of the estimator, by part of a long log."""
-    for name, order in (("tumbling", None), ("spin, largest moment", 2), ("spin, middle moment", 1)):
+    for name, order in (
+        ("tumbling", None),
+        ("spin, largest moment", 2),
+        ("spin, middle moment", 1),
+    ):
         world = tumbling.draw(1, seconds=0.1 * (scans - 1), hz=10.0, sigma_max=0.85)
         if order is not None:
             first = replace(world.states[0], w_b=0.1 * np.eye(3)[np.argsort(world.moments)[order]])
@@ -188,7 +235,8 @@ def long_runs(scans: int, repeats: int) -> None:
             part, both = spent[begin:end, 0], spent[begin:end].sum(axis=1)
             print(
                 f"{name}, scans {begin} to {end}: estimator {part.mean():.2f} ms,"
-                f" {np.quantile(part, 0.999):.1f} (99.9 %), at most {part.max():.1f}; with monitors {both.mean():.2f}",
+                f" {np.quantile(part, 0.999):.1f} (99.9 %), at most {part.max():.1f}; with monitors"
+                f" {both.mean():.2f}",
                 flush=True,
             )
 
@@ -233,13 +281,24 @@ def replay_ms(log: Path, assignments: Sequence[str], repeats: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses"
+    )
     parser.add_argument("--scans", action="store_true", help="times scan by scan over whole runs")
     parser.add_argument("--long", type=int, metavar="N", help="times over a log of N scans")
-    parser.add_argument("--repeats", type=int, default=1, help="repeats of --long; the least time of each scan counts")
-    parser.add_argument("--cases", action="store_true", help="times in cases of estimate_surprises.py")
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=1,
+        help="repeats of --long; the least time of each scan counts",
+    )
+    parser.add_argument(
+        "--cases", action="store_true", help="times in cases of estimate_surprises.py"
+    )
     parser.add_argument("--log", type=Path, metavar="LOG", help="times in replays of a log")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of --log")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="settings of --log"
+    )
     given = parser.parse_args()
     if given.log:
         replay_ms(given.log, given.set, max(3, given.repeats))
@@ -255,7 +314,9 @@ def main() -> None:
         return
     quick = given.quick
     count, near = 50 if quick else 400, EstimatorParams(start=Start.NEAR)
-    parts = scan_us("gain", replace(near, constraint=Constraint.GAIN), count) | scan_us("chart", near, count)
+    parts = scan_us("gain", replace(near, constraint=Constraint.GAIN), count) | scan_us(
+        "chart", near, count
+    )
     for name, value in (parts | ahead_us(count // 10)).items():
         print(f"{name:24s} {value:8.1f} us")
     for scans in (200,) if quick else (200, 500, 1000):
@@ -263,7 +324,10 @@ def main() -> None:
         print(f"audit over {scans:4d} poses: {whole:6.1f} ms, amortised {share:.2f} ms a scan")
     for n, seconds in ((200, 100.0),) if quick else ((200, 100.0), (600, 120.0), (5000, 1000.0)):
         once, whole, steps = fit_s(n, seconds)
-        print(f"fit of {n:5d} poses over {seconds:6.0f} s: {whole:6.3f} s, {steps} steps; rotation {1e3 * once:.1f} ms")
+        print(
+            f"fit of {n:5d} poses over {seconds:6.0f} s: {whole:6.3f} s, {steps} steps; rotation"
+            f" {1e3 * once:.1f} ms"
+        )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,19 @@
 """The estimator under conditions that its model does not contain.
 
-``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--poses] [--without] [--free]``.
+``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--poses]
+[--without] [--free]``.
 
-Each case is a random tumbling body of 4 m extent, seen at 2 Hz from a cold start, with poses simulated by a
-registration-noise model: white noise of 2 mm and 0.1 deg per axis, a tenth of its variance correlated over 0.4 rad of
-rotation. The events: manoeuvres, sensor biases, a constant torque, a noise burst, spins about a principal axis, a body
-at rest. Printed per case: scans from the event to the first flagged one, manoeuvres found, the error of the reported
-size in its own sigma, the scans until the error is below four claimed sigma for good, the scans that claim convergence
-although the error is above four claimed sigma, and the final error.
+Each case is a random tumbling body of 4 m extent, seen at 2 Hz from a cold start, with poses
+simulated by a registration-noise model: white noise of 2 mm and 0.1 deg per axis, a tenth of its
+variance correlated over 0.4 rad of rotation. The events: manoeuvres, sensor biases, a constant
+torque, a noise burst, spins about a principal axis, a body at rest. Printed per case: scans from
+the event to the first flagged one, manoeuvres found, the error of the reported size in its own
+sigma, the scans until the error is below four claimed sigma for good, the scans that claim
+convergence although the error is above four claimed sigma, and the final error.
 
-``--hz``, ``--rate``, ``--velocity`` and ``--turn`` set the scan rate, the rate of the body and the sizes of the steps.
-``--poses`` simulates the log of a tracker (``avsreplay run --backend poses``): the errors are white, and the expected
-changes of the motion are those of poses at this interval.
+``--hz``, ``--rate``, ``--velocity`` and ``--turn`` set the scan rate, the rate of the body and the
+sizes of the steps. ``--poses`` simulates the log of a tracker (``avsreplay run --backend poses``):
+the errors are white, and the expected changes of the motion are those of poses at this interval.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from __future__ import annotations
 from avsreplay import arithmetic
 
 if __name__ == "__main__":
-    arithmetic.pin()  # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+    # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+    arithmetic.pin()
 
 import argparse
 import gc
@@ -39,7 +42,6 @@ from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.track import in_doubt
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyParams,
@@ -47,6 +49,7 @@ from avsreplay.monitor.convergence import (
     ConvergenceParams,
     violations,
 )
+from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
 from avsreplay.records import Alignment, AlignStatus, Belief, Manoeuvre, ScanStatus, State
 
 NEES_S = (40.0, 60.0, 80.0)
@@ -87,14 +90,19 @@ class Case:
     velocity: float = 0.0  # step [m/s]
     rate: float = 0.0  # step [rad/s]
     torque: float = 0.0  # constant, per unit inertia [rad/s2]
-    random: tuple[float, float] = (0.0, 0.0)  # root densities of random torque [rad/s^1.5] and force [m/s^1.5]
+    random: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # root densities of random torque [rad/s^1.5] and force [m/s^1.5]
     bias: float = 0.0  # along the line of sight [m]
     noise: float = 1.0  # factor on sigma, not reported by the registration
     spin: int | None = None  # about this principal axis; 3 for that of the middle moment
     speed: float = 0.1  # rad/s
     hz: float = 2.0
     wrong: float = 0.0  # share of the poses that are 0.1 m (1 sigma of each component) off
-    correlated: float = 0.1  # share of the variance of the poses that neighbouring scans have in common
+    correlated: float = (
+        0.1  # share of the variance of the poses that neighbouring scans have in common
+    )
     tracker: bool = False  # the poses are those of a tracker
 
 
@@ -127,7 +135,10 @@ CASES = (
 
 @dataclass(slots=True)
 class Result:
-    """One body: per scan time, gamma, reason, converged, error and claimed sigma; manoeuvres at the end."""
+    """One body: per scan time, gamma, reason, converged, error and claimed sigma.
+
+    Manoeuvres at the end.
+    """
 
     t: list[float] = field(default_factory=list)
     gamma: list[int] = field(default_factory=list)
@@ -137,7 +148,9 @@ class Result:
     error: list[tuple[float, float]] = field(default_factory=list)
     grasp: list[float] = field(default_factory=list)
     nees: list[list[float]] = field(default_factory=list)
-    squares: list[Array] = field(default_factory=list)  # (2, 3) claimed and true, of position, attitude, velocity
+    squares: list[Array] = field(
+        default_factory=list
+    )  # (2, 3) claimed and true, of position, attitude, velocity
     violations: list[str] = field(default_factory=list)
     failed_at: list[float] = field(default_factory=list)  # times of these checks [s]
     track: Track | None = None
@@ -165,7 +178,9 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
             for _ in range(part):
                 push = case.torque * direction / (case.hz * part)
                 x = tumbling.follow(
-                    np.array([0.0, 1.0 / (case.hz * part)]), world.moments, replace(x, w_b=x.w_b + push)
+                    np.array([0.0, 1.0 / (case.hz * part)]),
+                    world.moments,
+                    replace(x, w_b=x.w_b + push),
                 )[-1]
             states.append(x)
         return list(world.times), states, dv, dw
@@ -176,7 +191,9 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
             for _ in range(part):
                 dw, dv = (size * rng.normal(size=3) / np.sqrt(case.hz * part) for size in sizes)
                 pushed = replace(x, w_b=x.w_b + dw, v_a=x.v_a + dv)
-                x = tumbling.follow(np.array([0.0, 1.0 / (case.hz * part)]), world.moments, pushed)[-1]
+                x = tumbling.follow(np.array([0.0, 1.0 / (case.hz * part)]), world.moments, pushed)[
+                    -1
+                ]
             states.append(x)
         return list(world.times), states, np.zeros(3), np.zeros(3)
     if not (case.velocity or case.rate):
@@ -188,7 +205,12 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
     pushed = replace(x, v_a=x.v_a + dv, w_b=x.w_b + dw)
     rest = world.times[len(before) :]
     later = tumbling.follow(np.append(0.0, rest - at), world.moments, pushed)[1:]
-    return list(world.times), world.states[: len(before)] + later, dv, geometry.matrix(x.q_bc).T @ dw
+    return (
+        list(world.times),
+        world.states[: len(before)] + later,
+        dv,
+        geometry.matrix(x.q_bc).T @ dw,
+    )
 
 
 def measured(case: Case, times: list[float], states: list[State], seed: int) -> list[Alignment]:
@@ -209,7 +231,11 @@ def measured(case: Case, times: list[float], states: list[State], seed: int) -> 
         if case.wrong and rng.random() < case.wrong:
             T = Pose(T.q, T.t + 0.1 * rng.normal(size=3))
         claimed = C * case.noise**2 if event else C
-        out.append(Alignment(T, 5, True, 4000, 3900, 0.008, np.linalg.inv(claimed), AlignStatus.ALIGNED, claimed))
+        out.append(
+            Alignment(
+                T, 5, True, 4000, 3900, 0.008, np.linalg.inv(claimed), AlignStatus.ALIGNED, claimed
+            )
+        )
     return out
 
 
@@ -234,7 +260,9 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         track, verdict = estimator.step(track, prediction, innovation, verdict, word.converged)
         spent = time.process_time() - begun
         result.axes |= {
-            e.detected_ns: track.belief.x.q_bc for e in track.manoeuvres if e.detected_ns not in result.axes
+            e.detected_ns: track.belief.x.q_bc
+            for e in track.manoeuvres
+            if e.detected_ns not in result.axes
         }
         result.seconds, result.worst_ms = result.seconds + spent, max(result.worst_ms, 1e3 * spent)
         seen_so_far = watch.observe(seen_so_far, innovation, verdict.gamma)
@@ -261,8 +289,12 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
     return result
 
 
-def score(result: Result, t: float, x: State, belief: Belief, gamma: int, reason: str, converged: bool) -> None:
-    """The error of the estimated pose, and its size in claimed sigma (position and attitude, whichever is larger)."""
+def score(
+    result: Result, t: float, x: State, belief: Belief, gamma: int, reason: str, converged: bool
+) -> None:
+    """The error of the estimated pose, and its size in claimed sigma (position and attitude,
+    whichever is larger).
+    """
     pose, truth, H = belief.x.T_ac, x.T_ac, measurement_jacobian(belief.x)
     S = H @ belief.P @ H.T
     position = float(np.linalg.norm(pose.t - truth.t))
@@ -277,7 +309,9 @@ def score(result: Result, t: float, x: State, belief: Belief, gamma: int, reason
 
 
 def squares_of(belief: Belief, truth: State) -> Array:
-    """(2, 3) claimed variance and squared error of the pose's position, its attitude, and the velocity."""
+    """(2, 3) claimed variance and squared error of the pose's position, its attitude, and the
+    velocity.
+    """
     H, pose = measurement_jacobian(belief.x), belief.x.T_ac
     S = H @ belief.P @ H.T
     claimed = np.trace(S[:3, :3]), 4.0 * np.trace(S[3:, 3:]), np.trace(belief.P[VEL, VEL])
@@ -287,7 +321,9 @@ def squares_of(belief: Belief, truth: State) -> Array:
 
 
 def nees_of(belief: Belief, truth: State) -> list[float]:
-    """NEES per degree of freedom of all states, then of each block in coordinates without an order of the axes."""
+    """NEES per degree of freedom of all states, then of each block in coordinates without an order
+    of the axes.
+    """
     here = to_chart(belief.x)
     T, y = to_errors(here), to_chart(truth).minus(here)
     P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
@@ -298,7 +334,9 @@ def nees_of(belief: Belief, truth: State) -> list[float]:
 
 
 def inside_band(nees: Array) -> Array:
-    """Share of the values (bodies, instants, blocks) of NEES per degree of freedom in the two-sided 95 % band."""
+    """Share of the values (bodies, instants, blocks) of NEES per degree of freedom in the two-sided
+    95 % band.
+    """
     low, high = chi2.ppf([[0.025], [0.975]], NEES_DOF) / NEES_DOF
     return ((nees >= low) & (nees <= high)).mean(axis=(0, 1))
 
@@ -311,13 +349,18 @@ def _direction(rng: np.random.Generator) -> Array:
 def line(case: Case, results: list[Result]) -> str:
     """One row of the table."""
     after = [
-        next(k for k, t in enumerate(r.t) if t >= case.at_s and (not (case.velocity or case.rate) or t > case.at_s))
+        next(
+            k
+            for k, t in enumerate(r.t)
+            if t >= case.at_s and (not (case.velocity or case.rate) or t > case.at_s)
+        )
         for r in results
     ]
     if case.bias and case.until_s < 1e9 and case.at_s == 0.0:
         after = [next(k for k, t in enumerate(r.t) if t >= case.until_s) for r in results]
     delay = [
-        next((k - a for k in range(a, len(r.t)) if not r.gamma[k]), None) for r, a in zip(results, after, strict=True)
+        next((k - a for k in range(a, len(r.t)) if not r.gamma[k]), None)
+        for r, a in zip(results, after, strict=True)
     ]
     back = []
     for r, a in zip(results, after, strict=True):
@@ -334,7 +377,13 @@ def line(case: Case, results: list[Result]) -> str:
         case.name,
         f"{_middle(first)} ({len(first)}/{len(results)})",
         str(sum(map(len, found))),
-        _middle([_scans_to_report(r, a) for r, a in zip(results, after, strict=True) if r.track.manoeuvres]),
+        _middle(
+            [
+                _scans_to_report(r, a)
+                for r, a in zip(results, after, strict=True)
+                if r.track.manoeuvres
+            ]
+        ),
         _drifts(results),
         _sizes(results, found),
         _middle(back),
@@ -343,14 +392,19 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * np.median(final[:, 0]):.1f} mm {np.median(final[:, 1]):.2f} deg",
         f"{1e3 * final[:, 0].max():.0f} mm {final[:, 1].max():.2f} deg",
         ", ".join(f"{reason} {n}" for reason, n in sorted(reasons.items())),
-        ", ".join(f"{n} {k}" for k, n in sorted(Counter(v for r in results for v in r.violations).items())) or "0",
+        ", ".join(
+            f"{n} {k}" for k, n in sorted(Counter(v for r in results for v in r.violations).items())
+        )
+        or "0",
         f"{1e3 * sum(r.seconds for r in results) / sum(len(r.t) for r in results):.2f}",
         f"{max(r.worst_ms for r in results):.0f}",
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
         _claims(results),
         ", ".join(f"{v:.2f}" for v in np.mean([r.nees for r in results], axis=(0, 1))),
         ", ".join(f"{v:.0%}" for v in inside_band(np.array([r.nees for r in results]))),
-        f"{np.median([r.t[r.converged.index(True)] if any(r.converged) else np.inf for r in results]):.1f}",
+        (
+            f"{np.median([r.t[r.converged.index(True)] if any(r.converged) else np.inf for r in results]):.1f}"
+        ),
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -365,18 +419,26 @@ def _claims(results: list[Result]) -> str:
 
 
 def _scans_to_report(r: Result, first: int) -> int:
-    """Scans from the first one after the event, counted as 1, to the one at which the last manoeuvre was reported."""
+    """Scans from the first one after the event, counted as 1, to the one at which the last
+    manoeuvre was reported.
+    """
     return int(np.searchsorted(r.t, r.track.manoeuvres[-1].detected_ns * 1e-9 - 1e-6)) - first + 1
 
 
 def _drifts(results: list[Result]) -> str:
-    """Bodies with a drift at the end; its torque [rad/s2] with 1 sigma and its onset [s], medians."""
+    """Bodies with a drift at the end.
+
+    Its torque [rad/s2] with 1 sigma and its onset [s], medians.
+    """
     found = [r.track.drift for r in results if r.track and r.track.drift]
     if not found:
         return "0"
     size = np.median([np.linalg.norm(d.rate) for d in found])
     sigma = np.median([np.sqrt(np.trace(d.P[:3, :3])) for d in found])
-    return f"{len(found)}: {size:.2g} +- {sigma:.1g}, {np.median([d.t_ns * 1e-9 for d in found]):.0f} s"
+    return (
+        f"{len(found)}: {size:.2g} +- {sigma:.1g},"
+        f" {np.median([d.t_ns * 1e-9 for d in found]):.0f} s"
+    )
 
 
 def _middle(values: list[int]) -> str:
@@ -384,7 +446,10 @@ def _middle(values: list[int]) -> str:
 
 
 def size_error(r: Result, event: Manoeuvre) -> float:
-    """Root of NEES of the size, of the rate in {C}: the principal axes of the estimate may have another order."""
+    """Root of NEES of the size, of the rate in {C}.
+
+    The principal axes of the estimate may have another order.
+    """
     to_c = geometry.matrix(r.axes[event.detected_ns]).T
     whole = np.kron(np.diag([1.0, 0.0]), to_c) + np.diag([0.0] * 3 + [1.0] * 3)
     d = np.concatenate([to_c @ event.rate - r.true_rate, event.velocity - r.true_velocity])
@@ -392,12 +457,21 @@ def size_error(r: Result, event: Manoeuvre) -> float:
 
 
 def _sizes(results: list[Result], found: list[tuple]) -> str:
-    """Of the reported change nearest to the true one: size and time against the truth in sigma, and the time error."""
+    """Of the reported change nearest to the true one.
+
+    Size and time against the truth in sigma, and the time error.
+    """
     off = []
     for r, events in zip(results, found, strict=True):
         if events and (r.true_velocity.any() or r.true_rate.any()):
             e = min(events, key=lambda e: abs(e.t_ns * 1e-9 - r.step_s))
-            off.append((size_error(r, e), abs(e.t_ns * 1e-9 - r.step_s) / e.t_1s_s, abs(e.t_ns * 1e-9 - r.step_s)))
+            off.append(
+                (
+                    size_error(r, e),
+                    abs(e.t_ns * 1e-9 - r.step_s) / e.t_1s_s,
+                    abs(e.t_ns * 1e-9 - r.step_s),
+                )
+            )
     if not off:
         return "-"
     size, late, seconds = np.array(off).T
@@ -406,18 +480,30 @@ def _sizes(results: list[Result], found: list[tuple]) -> str:
 
 def main() -> None:
     gc.set_threshold(10_000)  # as the command does
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--bodies", type=int, default=20)
-    parser.add_argument("--cases", default="", help="only those whose name contains this text, comma separated")
+    parser.add_argument(
+        "--cases", default="", help="only those whose name contains this text, comma separated"
+    )
     parser.add_argument("--first", type=int, default=0, help="seed of the first body")
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="angular rate [rad/s]")
-    parser.add_argument("--velocity", type=float, default=0.01, help="size of the step of the velocity [m/s]")
-    parser.add_argument("--turn", type=float, default=0.01, help="size of the step of the rate [rad/s]")
+    parser.add_argument(
+        "--velocity", type=float, default=0.01, help="size of the step of the velocity [m/s]"
+    )
+    parser.add_argument(
+        "--turn", type=float, default=0.01, help="size of the step of the rate [rad/s]"
+    )
     parser.add_argument("--poses", action="store_true", help="the poses are those of a tracker")
-    parser.add_argument("--seconds", type=float, default=None, help="duration of each case in place of its own [s]")
+    parser.add_argument(
+        "--seconds", type=float, default=None, help="duration of each case in place of its own [s]"
+    )
     parser.add_argument("--without", action="store_true", help="without the test of hypotheses")
-    parser.add_argument("--free", action="store_true", help="the estimator is told that there are no disturbances")
+    parser.add_argument(
+        "--free", action="store_true", help="the estimator is told that there are no disturbances"
+    )
     given = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |")
     print("|" + "---|" * len(HEADS))
@@ -428,10 +514,15 @@ def main() -> None:
             case = replace(case, seconds=given.seconds or case.seconds, tracker=given.poses)
             case = replace(case, correlated=0.0 if given.poses else case.correlated)
             case = replace(
-                case, velocity=given.velocity if case.velocity else 0.0, rate=given.turn if case.rate else 0.0
+                case,
+                velocity=given.velocity if case.velocity else 0.0,
+                rate=given.turn if case.rate else 0.0,
             )
             seeds = range(given.first, given.first + given.bodies)
-            print(line(case, [run(case, seed, not given.without, given.free) for seed in seeds]), flush=True)
+            print(
+                line(case, [run(case, seed, not given.without, given.free) for seed in seeds]),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Seeds and mutations of the fuzz campaigns: input i of a campaign depends only on (campaign, i)."""
+"""Seeds and mutations of the fuzz campaigns.
+
+Input i of a campaign depends only on (campaign, i).
+"""
 
 from __future__ import annotations
 
@@ -64,7 +67,8 @@ def seeds() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         out = {**_logs(Path(folder)), **_scans(), **_models(), **_poses()}
     out["scenario.toml"] = (
-        b'seed = 3\n[target]\nextent_m = 2.0\nname = "box"\n[[faults]]\nkind = "occlusion"\nstart_s = 1.0\n'
+        b'seed = 3\n[target]\nextent_m = 2.0\nname = "box"\n[[faults]]\nkind = "occlusion"\nstart_s'
+        b" = 1.0\n"
     )
     return out
 
@@ -78,7 +82,9 @@ def _logs(folder: Path) -> dict[str, bytes]:
     stream = io.BytesIO()
     writer = McapWriter(stream, use_chunking=False, compression=CompressionType.NONE)
     writer.start("ros2")
-    channel = writer.register_channel("/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+    channel = writer.register_channel(
+        "/p", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD))
+    )
     for c in clouds:
         writer.add_message(channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns)
     writer.finish()
@@ -95,10 +101,19 @@ def _text(text: str) -> bytes:
 
 def cloud1(points: np.ndarray) -> bytes:  # type: ignore[type-arg]
     """A PointCloud2 in the wire form of ROS 1."""
-    fields = b"".join(_text(name) + struct.pack("<IBI", 4 * i, 7, 1) for i, name in enumerate("xyz"))
+    fields = b"".join(
+        _text(name) + struct.pack("<IBI", 4 * i, 7, 1) for i, name in enumerate("xyz")
+    )
     data = np.ascontiguousarray(points, dtype="<f4").tobytes()
     head = struct.pack("<III", 1, 7, 8) + _text("lidar") + struct.pack("<III", 1, len(points), 3)
-    return head + fields + struct.pack("<?II", False, 12, len(data)) + struct.pack("<I", len(data)) + data + b"\x01"
+    return (
+        head
+        + fields
+        + struct.pack("<?II", False, 12, len(data))
+        + struct.pack("<I", len(data))
+        + data
+        + b"\x01"
+    )
 
 
 def _bag1(path: Path, compression: Ros1Writer.CompressionFormat | None) -> bytes:
@@ -131,20 +146,40 @@ def _scans() -> dict[str, bytes]:
     points = scans(1, 24)[0].points
     rows = "\n".join(" ".join(repr(float(v)) for v in p) for p in points)
     grid = b"element range_grid 4\nproperty list uchar int vertex_indices\n"
-    head = b"ply\nformat %s 1.0\ncomment x\nelement vertex 24\nproperty float x\nproperty float y\nproperty float z\n"
-    out = {"ascii.ply": head % b"ascii" + grid + b"end_header\n" + rows.encode() + b"\n0\n1 3\n2 1 2\n0\n"}
+    head = (
+        b"ply\nformat %s 1.0\ncomment x\nelement vertex 24\nproperty float x\nproperty float"
+        b" y\nproperty float z\n"
+    )
+    out = {
+        "ascii.ply": (
+            head % b"ascii" + grid + b"end_header\n" + rows.encode() + b"\n0\n1 3\n2 1 2\n0\n"
+        )
+    }
     lists = b"\x00\x01\x00\x00\x00\x03\x00\x02\x00\x00\x00\x01\x00\x00\x00\x02\x00"
-    out["little.ply"] = head % b"binary_little_endian" + grid + b"end_header\n" + points.astype("<f4").tobytes() + lists
+    out["little.ply"] = (
+        head % b"binary_little_endian"
+        + grid
+        + b"end_header\n"
+        + points.astype("<f4").tobytes()
+        + lists
+    )
     out["big.ply"] = head % b"binary_big_endian" + b"end_header\n" + points.astype(">f4").tobytes()
     pcd = "VERSION 0.7\nFIELDS x y z i\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1\n"
     pcd += "WIDTH 24\nHEIGHT 1\nPOINTS 24\nDATA {}\n"
-    out["ascii.pcd"] = (pcd.format("ascii") + "\n".join(r + " 3" for r in rows.split("\n"))).encode()
+    out["ascii.pcd"] = (
+        pcd.format("ascii") + "\n".join(r + " 3" for r in rows.split("\n"))
+    ).encode()
     table = np.zeros(24, dtype=[("p", "<f4", (3,)), ("i", "u1")])
     table["p"] = points
     out["binary.pcd"] = pcd.format("binary").encode() + table.tobytes()
     columns = points.T.astype("<f4").tobytes() + bytes(24)
-    packed = b"".join(bytes([len(columns[i : i + 32]) - 1]) + columns[i : i + 32] for i in range(0, len(columns), 32))
-    packed = packed[:-25] + b"\x00\x00" + bytes([0xE0, 14, 0])  # a literal zero and a reference 23 long
+    packed = b"".join(
+        bytes([len(columns[i : i + 32]) - 1]) + columns[i : i + 32]
+        for i in range(0, len(columns), 32)
+    )
+    packed = (
+        packed[:-25] + b"\x00\x00" + bytes([0xE0, 14, 0])
+    )  # a literal zero and a reference 23 long
     sizes = struct.pack("<II", len(packed), len(columns))
     out["packed.pcd"] = pcd.format("binary_compressed").encode() + sizes + packed
     out["kitti.bin"] = np.hstack([points, points[:, :1]]).astype("<f4").tobytes()
@@ -159,9 +194,13 @@ def _models() -> dict[str, bytes]:
     import trimesh
 
     box = trimesh.creation.box((1.0, 2.0, 3.0))
-    out = {f"model.{kind}": box.export(file_type=kind) for kind in ("stl", "obj", "off", "glb", "ply")}
+    out = {
+        f"model.{kind}": box.export(file_type=kind) for kind in ("stl", "obj", "off", "glb", "ply")
+    }
     out["model.ascii.stl"] = trimesh.exchange.stl.export_stl_ascii(box)
-    return {name: data.encode() if isinstance(data, str) else bytes(data) for name, data in out.items()}
+    return {
+        name: data.encode() if isinstance(data, str) else bytes(data) for name, data in out.items()
+    }
 
 
 def _poses() -> dict[str, bytes]:
@@ -170,13 +209,18 @@ def _poses() -> dict[str, bytes]:
         "poses.kitti": b"1 0 0 0 0 1 0 0 0 0 1 5\n1 0 0 0 0 1 0 0 0 0 1 6\n",
         "poses.euroc": b"#t,p\n1000000000,0,0,1,1,0,0,0\n",
         "poses.conf": b"camera 0 0 0 0 0 0 1\nbmesh a.ply 0 0 1 0 0 0 1\n",
-        "cloud.cdr": point_cloud2(5 * SECOND, "camera", scans(1, 9)[0].points, np.zeros(9, np.float32)),
+        "cloud.cdr": point_cloud2(
+            5 * SECOND, "camera", scans(1, 9)[0].points, np.zeros(9, np.float32)
+        ),
         "cloud.ros1": cloud1(scans(1, 9)[0].points),
     }
 
 
 def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
-    """One to eight mutations; an uncompressed MCAP's chunks are given checksums that hold again half of the time."""
+    """One to eight mutations.
+
+    An uncompressed MCAP's chunks are given checksums that hold again half of the time.
+    """
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 9))):
         if out:
@@ -187,7 +231,10 @@ def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
 
 
 def in_place(data: bytes, rng: np.random.Generator) -> bytes:
-    """One to three changes that keep the length; the checksums of an uncompressed MCAP hold again."""
+    """One to three changes that keep the length.
+
+    The checksums of an uncompressed MCAP hold again.
+    """
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 4))):
         if out:
@@ -256,21 +303,40 @@ def _word(out: bytearray, rng: np.random.Generator, _: list[bytes]) -> bytearray
 
 
 MUTATIONS: tuple[Callable[[bytearray, np.random.Generator, list[bytes]], bytearray], ...] = (
-    _flip, _flip, _set, _number, _number, _cut, _delete, _insert, _repeat, _splice, _word,
-)  # fmt: skip
+    _flip,
+    _flip,
+    _set,
+    _number,
+    _number,
+    _cut,
+    _delete,
+    _insert,
+    _repeat,
+    _splice,
+    _word,
+)
 
 
 def _mend(out: bytearray) -> None:
-    """Checksums of the uncompressed chunks that can still be walked to, so that what is inside them is parsed."""
+    """Checksums of the uncompressed chunks that can still be walked to, so that what is inside them
+    is parsed.
+    """
     at = 8
     while at + 49 <= len(out):
         opcode, length = struct.unpack_from("<BQ", out, at)
-        if opcode == mcap.CHUNK and length > 40 and at + 9 + length <= len(out) and out[at + 37 : at + 41] == bytes(4):
+        if (
+            opcode == mcap.CHUNK
+            and length > 40
+            and at + 9 + length <= len(out)
+            and out[at + 37 : at + 41] == bytes(4)
+        ):
             data = bytes(out[at + 49 : at + 9 + length])
             struct.pack_into("<QI", out, at + 25, len(data), zlib.crc32(data))
             struct.pack_into("<Q", out, at + 41, len(data))
         if opcode == mcap.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
-            struct.pack_into("<I", out, at + 5 + length, zlib.crc32(bytes(out[at + 9 : at + 5 + length])))
+            struct.pack_into(
+                "<I", out, at + 5 + length, zlib.crc32(bytes(out[at + 9 : at + 5 + length]))
+            )
         at += 9 + length
 
 

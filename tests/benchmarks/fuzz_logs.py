@@ -1,8 +1,9 @@
-"""Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_logs.py [--quick] [--inputs N]``.
+"""Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_logs.py [--quick]
+[--inputs N]``.
 
-Input i depends only on (campaign, i), so a finding is repeated with ``--only i``. Every input must end in scans or in
-one AvsError: a traceback, more than 10 s, more than the stated memory, a crash of the interpreter or a file written
-anywhere is a finding.
+Input i depends only on (campaign, i), so a finding is repeated with ``--only i``. Every input must
+end in scans or in one AvsError: a traceback, more than 10 s, more than the stated memory, a crash
+of the interpreter or a file written anywhere is a finding.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ LOGS, POSES = ("mcap", "bag", "db3"), ("tum", "kitti", "euroc")
 
 
 def check(name: str, data: bytes, folder: Path, deep: bool) -> str:
-    """Give one input to what reads it; what came of it in one word. Raises whatever is no AvsError."""
+    """Give one input to what reads it; what came of it in one word.
+
+    Raises whatever is no AvsError.
+    """
     kind = name.rsplit(".", 1)[-1]
     try:
         if kind in ("cdr", "ros1"):
@@ -88,15 +92,22 @@ def _doctored(path: Path, folder: Path) -> None:
 
 
 def corpus_of(folders: list[Path]) -> dict[str, bytes]:
-    """The seeds, or in their place every small file of the folders that a reader here knows by its ending."""
+    """The seeds, or in their place every small file of the folders that a reader here knows by its
+    ending.
+    """
     kinds = {*LOGS, "ply", "pcd", "conf", "obj"}
     files = sorted(p for folder in folders for p in folder.rglob("*") if p.suffix[1:] in kinds)
     small = [p for p in files if p.stat().st_size <= MAX_SEED]
-    named = {("model-" if p.suffix == ".obj" else f"{i}-") + p.name: p.read_bytes() for i, p in enumerate(small)}
+    named = {
+        ("model-" if p.suffix == ".obj" else f"{i}-") + p.name: p.read_bytes()
+        for i, p in enumerate(small)
+    }
     return named if folders else seeds()
 
 
-def campaign(number: int, inputs: list[int], batch: int, folders: list[Path] | None = None) -> Campaign:
+def campaign(
+    number: int, inputs: list[int], batch: int, folders: list[Path] | None = None
+) -> Campaign:
     """Run the inputs of a campaign in batches."""
     corpus = corpus_of(folders or [])
 
@@ -114,11 +125,15 @@ def main() -> int:
     parser.add_argument("--campaign", type=int, default=1)
     parser.add_argument("--only", type=int)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seeds", type=Path, nargs="*", default=[], help="folders with files to mutate")
+    parser.add_argument(
+        "--seeds", type=Path, nargs="*", default=[], help="folders with files to mutate"
+    )
     parser.add_argument("--quick", action="store_true", help="1,000 inputs")
     asked = parser.parse_args()
     count = 1000 if asked.quick else asked.inputs
-    inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
+    inputs = (
+        [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
+    )
     return report(asked.campaign, len(inputs), campaign(asked.campaign, inputs, 2500, asked.seeds))
 
 

@@ -1,7 +1,9 @@
-"""Coverage-guided fuzzing of the parsers that see bytes first, through atheris (``pip install atheris``).
+"""Coverage-guided fuzzing of the parsers that see bytes first, through atheris (``pip install
+atheris``).
 
-``python tests/benchmarks/fuzz_parsers.py {cdr,ros1,pcd,ply,lzf,npy} [-runs=200000] [-max_len=4096] [corpus folders]``:
-the arguments behind the parser's name are libFuzzer's. A crash file in the working folder is a finding.
+``python tests/benchmarks/fuzz_parsers.py {cdr,ros1,pcd,ply,lzf,npy} [-runs=200000] [-max_len=4096]
+[corpus folders]``: the arguments behind the parser's name are libFuzzer's. A crash file in the
+working folder is a finding.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The processes of the campaigns: workers of fuzz_logs.py and fuzz_commands.py, commands of outputs.py."""
+"""The processes of the campaigns.
+
+Workers of fuzz_logs.py and fuzz_commands.py, commands of outputs.py.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from command_server import exit_code
 
-if sys.platform != "win32":  # a campaign needs the forks, alarms and limits of POSIX; its inputs do not
+if (
+    sys.platform != "win32"
+):  # a campaign needs the forks, alarms and limits of POSIX; its inputs do not
     import resource
 
 WALL = 20  # limit of wall time per limit of processor time, because machines are shared
@@ -33,16 +38,20 @@ class Hang(BaseException):
     """Raised by an alarm; no handler of the package may catch it."""
 
 
-def run_campaign(inputs: list[int], task: Task, limit_s: int, limit_mib: int, batch: int) -> Campaign:
-    """Run a campaign in batches, each in a process of its own, so that a crash costs one input and is named.
+def run_campaign(
+    inputs: list[int], task: Task, limit_s: int, limit_mib: int, batch: int
+) -> Campaign:
+    """Run a campaign in batches, each in a process of its own, so that a crash costs one input and
+    is named.
 
-    A finding is an exception, a run longer than ``limit_s``, a crash, a process larger than ``limit_mib``, a file
-    beside the input's own folder, and anything that a library writes to the terminal.
+    A finding is an exception, a run longer than ``limit_s``, a crash, a process larger than
+    ``limit_mib``, a file beside the input's own folder, and anything that a library writes to the
+    terminal.
 
     Args:
         inputs: numbers of the mutations.
-        task: gives, for a number, what the input is called and a function of an empty folder that runs it and returns
-            one word about the outcome.
+        task: gives, for a number, what the input is called and a function of an empty folder that
+            runs it and returns one word about the outcome.
         limit_s: processor time for one input [s].
         limit_mib: memory of a process [MiB].
         batch: inputs for one process.
@@ -61,7 +70,9 @@ def run_campaign(inputs: list[int], task: Task, limit_s: int, limit_mib: int, ba
     while queue:
         todo = queue.pop(0)
         here, there = multiprocessing.Pipe(False)
-        worker = multiprocessing.get_context("fork").Process(target=_work, args=(todo, task, limit_s, there))
+        worker = multiprocessing.get_context("fork").Process(
+            target=_work, args=(todo, task, limit_s, there)
+        )
         worker.start()
         there.close()
         last: tuple[int, str] | None = None
@@ -80,7 +91,11 @@ def run_campaign(inputs: list[int], task: Task, limit_s: int, limit_mib: int, ba
             tally["finding"] += 1
             finding(*last, f"crash, exit code {worker.exitcode}")
             queue.insert(0, todo[todo.index(last[0]) + 1 :])
-        print(f"{sum(tally.values())} of {len(inputs)}: {dict(sorted(tally.items()))}", file=sys.stderr, flush=True)
+        print(
+            f"{sum(tally.values())} of {len(inputs)}: {dict(sorted(tally.items()))}",
+            file=sys.stderr,
+            flush=True,
+        )
     if peak > limit_mib:
         finding(-1, "", f"a process of {peak} MiB, over {limit_mib}")
     return tally, findings, peak
@@ -116,7 +131,9 @@ def _work(numbers: list[int], task: Task, limit_s: int, pipe: Connection) -> Non
 
 @contextmanager
 def _terminal(file: int) -> Iterator[None]:
-    """Send everything that is written to standard output and standard error, by any library, to a file."""
+    """Send everything that is written to standard output and standard error, by any library, to a
+    file.
+    """
     kept = os.dup(1), os.dup(2)
     os.dup2(file, 1)
     os.dup2(file, 2)
@@ -158,9 +175,14 @@ class Done:
 
 
 class Command:
-    """A command in a fork of this process, which has imported the package: it starts in milliseconds."""
+    """A command in a fork of this process, which has imported the package.
 
-    def __init__(self, args: Sequence[str], place: Path, file_bytes: int | None = None, limit_s: int = 600) -> None:
+    It starts in milliseconds.
+    """
+
+    def __init__(
+        self, args: Sequence[str], place: Path, file_bytes: int | None = None, limit_s: int = 600
+    ) -> None:
         """Start it.
 
         Args:
@@ -209,11 +231,22 @@ class Command:
 
 
 def report(campaign: int, count: int, result: Campaign) -> int:
-    """Print the result of a campaign as one JSON document; return the exit code, 1 on any finding."""
+    """Print the result of a campaign as one JSON document.
+
+    Return the exit code, 1 on any finding.
+    """
     tally, findings, peak = result
-    spent = sum(resource.getrusage(who).ru_utime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    document = {"campaign": campaign, "inputs": count, "outcomes": dict(sorted(tally.items())),
-                "largest_process_mib": peak, "processor_s": round(spent, 1), "findings": findings[:40],
-                "count_of_findings": len(findings)}  # fmt: skip
+    spent = sum(
+        resource.getrusage(who).ru_utime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    document = {
+        "campaign": campaign,
+        "inputs": count,
+        "outcomes": dict(sorted(tally.items())),
+        "largest_process_mib": peak,
+        "processor_s": round(spent, 1),
+        "findings": findings[:40],
+        "count_of_findings": len(findings),
+    }
     print(json.dumps(document, indent=1))
     return 1 if findings else 0

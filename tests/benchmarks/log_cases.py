@@ -16,11 +16,15 @@ SECOND = 1_000_000_000
 
 def state(rng: np.random.Generator) -> State:
     unit = geometry.normalise(rng.normal(size=(2, 4)))
-    return State(unit[0], *rng.normal(size=(3, 3)), rng.uniform(-0.5, 0.5, 2), rng.normal(size=3), unit[1])
+    return State(
+        unit[0], *rng.normal(size=(3, 3)), rng.uniform(-0.5, 0.5, 2), rng.normal(size=3), unit[1]
+    )
 
 
 def header(rng: np.random.Generator) -> LogHeader:
-    surface = Surface(rng.normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]], np.int32), "part.ply", "")
+    surface = Surface(
+        rng.normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]], np.int32), "part.ply", ""
+    )
     root = rng.normal(size=(20, 20))
     return LogHeader(
         surface=surface,
@@ -43,11 +47,21 @@ def scans(count: int = 12, points: int = 300, timed: bool = False) -> list[Scan]
         rng = np.random.Generator(np.random.PCG64(i))
         cloud = rng.normal(size=(points, 3)).astype(np.float32)
         times = np.linspace(0, 0.1, points, dtype=np.float32) if timed else None
-        out.append(Scan(i, SECOND + i * SECOND // 2, cloud, times_s=times, log_ns=SECOND + i * SECOND // 2 + 5))
+        out.append(
+            Scan(
+                i,
+                SECOND + i * SECOND // 2,
+                cloud,
+                times_s=times,
+                log_ns=SECOND + i * SECOND // 2 + 5,
+            )
+        )
     return out
 
 
-def write(path: Path, head: LogHeader, clouds: list[Scan], **options: object) -> list[tuple[Pose, State]]:
+def write(
+    path: Path, head: LogHeader, clouds: list[Scan], **options: object
+) -> list[tuple[Pose, State]]:
     rng = np.random.Generator(np.random.PCG64(99))
     truth = [(Pose(rng.normal(size=4), rng.normal(size=3)), state(rng)) for _ in clouds]
     with LogWriter(path, head, **options) as writer:  # type: ignore[arg-type]

@@ -1,8 +1,10 @@
-"""Damage matrix: kind x place x compression; what is recovered against what is intact, byte for byte.
+"""Damage matrix: kind x place x compression; what is recovered against what is intact, byte for
+byte.
 
-``python tests/benchmarks/log_damage.py [--quick] [--seed S]``. A scan is intact where no byte of its chunk's record is
-touched. Every cell damages the log at random places of its kind; the share of intact scans that come back bit for bit
-must be 100 %, no scan may come back other than it was written, and a damaged log must list a loss.
+``python tests/benchmarks/log_damage.py [--quick] [--seed S]``. A scan is intact where no byte of
+its chunk's record is touched. Every cell damages the log at random places of its kind; the share of
+intact scans that come back bit for bit must be 100 %, no scan may come back other than it was
+written, and a damaged log must list a loss.
 """
 
 from __future__ import annotations
@@ -45,7 +47,11 @@ def remove(data: bytes, at: int, rng: np.random.Generator) -> bytes:
 
 def insert(data: bytes, at: int, rng: np.random.Generator) -> bytes:
     """Bytes put in."""
-    return data[:at] + rng.integers(0, 256, int(rng.integers(1, 257)), dtype=np.uint8).tobytes() + data[at:]
+    return (
+        data[:at]
+        + rng.integers(0, 256, int(rng.integers(1, 257)), dtype=np.uint8).tobytes()
+        + data[at:]
+    )
 
 
 def cut(data: bytes, at: int, _rng: np.random.Generator) -> bytes:
@@ -53,7 +59,13 @@ def cut(data: bytes, at: int, _rng: np.random.Generator) -> bytes:
     return data[:at]
 
 
-KINDS: dict[str, Damage] = {"flip": flip, "zero": zero, "remove": remove, "insert": insert, "cut": cut}
+KINDS: dict[str, Damage] = {
+    "flip": flip,
+    "zero": zero,
+    "remove": remove,
+    "insert": insert,
+    "cut": cut,
+}
 
 
 def frames(data: bytes) -> list[tuple[int, int, int]]:
@@ -70,11 +82,19 @@ def places(data: bytes) -> dict[str, tuple[int, int]]:
     """Byte ranges by name."""
     found = frames(data)
     chunk = [(b, e) for op, b, e in found if op == mcap.CHUNK]
-    index = next((b, e) for op, b, e in found if op == mcap.MESSAGE_INDEX and b >= chunk[len(chunk) // 2][1])
+    index = next(
+        (b, e) for op, b, e in found if op == mcap.MESSAGE_INDEX and b >= chunk[len(chunk) // 2][1]
+    )
     end = next(e for op, _, e in found if op == mcap.DATA_END)
     named = {"header record": mcap.METADATA, "model": mcap.ATTACHMENT}
-    out = {name: next((b, e) for op, b, e in found if op == opcode) for name, opcode in named.items()}
-    out |= {"first chunk": chunk[0], "a chunk's head": (chunk[7][0], chunk[7][0] + 49), "middle chunk": chunk[9]}
+    out = {
+        name: next((b, e) for op, b, e in found if op == opcode) for name, opcode in named.items()
+    }
+    out |= {
+        "first chunk": chunk[0],
+        "a chunk's head": (chunk[7][0], chunk[7][0] + 49),
+        "middle chunk": chunk[9],
+    }
     return out | {"last chunk": chunk[-1], "message index": index, "summary": (end, len(data) - 8)}
 
 
@@ -86,7 +106,12 @@ def untouched(data: bytes, broken: bytes) -> set[int]:
 
 
 def cell(
-    data: bytes, span: tuple[int, int], kind: str, folder: Path, rng: np.random.Generator, tries: int
+    data: bytes,
+    span: tuple[int, int],
+    kind: str,
+    folder: Path,
+    rng: np.random.Generator,
+    tries: int,
 ) -> list[int]:
     """Intact, recovered of them, wrong, not told, refused: sums over the tries."""
     total = np.zeros(5, dtype=int)
@@ -110,7 +135,10 @@ def cell(
 
 
 def main() -> int:
-    """Print the matrix; exit 1 where an intact scan is not recovered, one is wrong, or a loss is not told."""
+    """Print the matrix.
+
+    Exit 1 where an intact scan is not recovered, one is wrong, or a loss is not told.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tries", type=int, default=40)
@@ -123,14 +151,22 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for compression in ("none", "lz4", "zstd"):
-            write(folder / "a.mcap", header(np.random.Generator(np.random.PCG64(1))), CLOUDS, compression=compression,
-                  overwrite=True)  # fmt: skip
+            write(
+                folder / "a.mcap",
+                header(np.random.Generator(np.random.PCG64(1))),
+                CLOUDS,
+                compression=compression,
+                overwrite=True,
+            )
             data = (folder / "a.mcap").read_bytes()
             for place, span in places(data).items():
                 for kind in KINDS:
                     row = cell(data, span, kind, folder, rng, 3 if asked.quick else asked.tries)
                     bad += row[0] - row[1] + row[2] + row[3]
-                    print(f"{compression:12s}{place:16s}{kind:8s}" + "{:8d}{:8d}{:7d}{:8d}{:9d}".format(*row))
+                    print(
+                        f"{compression:12s}{place:16s}{kind:8s}"
+                        + "{:8d}{:8d}{:7d}{:8d}{:9d}".format(*row)
+                    )
     print(json.dumps({"short of perfect": bad}))
     return 1 if bad else 0
 

@@ -1,7 +1,8 @@
 """kill -9 campaign: recordings killed at random moments are read back to their last full chunk.
 
-``python tests/benchmarks/log_kill.py [--quick] [--kills N] [--seed S]``. Each recorder says, after every scan it handed
-over, how many are in closed chunks; the reader must give at least those, bit for bit, and lose at most the open chunk.
+``python tests/benchmarks/log_kill.py [--quick] [--kills N] [--seed S]``. Each recorder says, after
+every scan it handed over, how many are in closed chunks; the reader must give at least those, bit
+for bit, and lose at most the open chunk.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def cloud(i: int) -> np.ndarray:  # type: ignore[type-arg]
 
 def record(path: Path, compression: str, streaming: bool) -> None:
     """Record until killed, saying after each scan how many were handed over."""
-    with LogWriter(path, LogHeader(scenario="x = 1\n"), compression=compression, streaming=streaming) as writer:
+    with LogWriter(
+        path, LogHeader(scenario="x = 1\n"), compression=compression, streaming=streaming
+    ) as writer:
         for i in range(100_000):
             t_ns = SECOND + i * SECOND // 5
             writer.write(Scan(i, t_ns, cloud(i), log_ns=t_ns))
@@ -46,7 +49,9 @@ def kill_one(folder: Path, rng: np.random.Generator) -> dict[str, object]:
     path = folder / "x.mcap"
     streaming, compression = bool(rng.random() < 0.5), str(rng.choice(["none", "lz4", "zstd"]))
     args = [sys.executable, __file__, "--record", str(path), "--compression", compression]
-    recorder = subprocess.Popen([*args, *(["--streaming"] if streaming else [])], stdout=subprocess.PIPE, text=True)
+    recorder = subprocess.Popen(
+        [*args, *(["--streaming"] if streaming else [])], stdout=subprocess.PIPE, text=True
+    )
     assert recorder.stdout is not None
     recorder.stdout.readline()
     time.sleep(float(rng.uniform(0.0, 0.25)))
@@ -57,7 +62,8 @@ def kill_one(folder: Path, rng: np.random.Generator) -> dict[str, object]:
     left = path if streaming else path.with_name("x.mcap.partial")
     result = {"handed": handed, "streaming": streaming, "compression": compression, **_read(left)}
     left.unlink(missing_ok=True)
-    # A chunk closes when the first scan of the next second is handed over, so that the open one holds at most five.
+    # A chunk closes when the first scan of the next second is handed over, so that the open one
+    # holds at most five.
     result["ok"] = bool(result["same"]) and int(result["read"]) >= handed - PER_CHUNK  # type: ignore[call-overload]
     return result
 
@@ -74,7 +80,10 @@ def _read(path: Path) -> dict[str, object]:
 
 
 def main() -> int:
-    """Run the campaign and print one JSON document; exit 1 where a recording lost more than its open chunk."""
+    """Run the campaign and print one JSON document.
+
+    Exit 1 where a recording lost more than its open chunk.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -91,12 +100,19 @@ def main() -> int:
         results = [kill_one(Path(folder), rng) for _ in range(10 if asked.quick else asked.kills)]
     bad = [r for r in results if not r["ok"]]
     lost = [int(r["handed"]) - int(r["read"]) for r in results]  # type: ignore[call-overload]
-    print(json.dumps({
-        "kills": len(results), "all read back to the last full chunk": not bad, "scans handed over": sum(
-            int(r["handed"]) for r in results),  # type: ignore[call-overload]
-        "most scans of an open chunk lost": max(lost), "with nothing yet on disk": sum(r["read"] == 0 for r in results),
-        "bad": bad,
-    }, indent=1))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "kills": len(results),
+                "all read back to the last full chunk": not bad,
+                "scans handed over": sum(int(r["handed"]) for r in results),  # type: ignore[call-overload]
+                "most scans of an open chunk lost": max(lost),
+                "with nothing yet on disk": sum(r["read"] == 0 for r in results),
+                "bad": bad,
+            },
+            indent=1,
+        )
+    )
     return 1 if bad else 0
 
 

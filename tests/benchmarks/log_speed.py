@@ -1,8 +1,9 @@
 """Speed and memory of reading: ``python tests/benchmarks/log_speed.py [--quick] [--gib G]``.
 
-Time per scan of 10,000 points (x y z float32 and a per-point time), checksums on, for the survey (every checksum of the
-file) and for the reading, apart and together, best of three. Memory: the peak of a process that reads a log of the
-stated size from end to end, less what the same process takes for a log of a few scans.
+Time per scan of 10,000 points (x y z float32 and a per-point time), checksums on, for the survey
+(every checksum of the file) and for the reading, apart and together, best of three. Memory: the
+peak of a process that reads a log of the stated size from end to end, less what the same process
+takes for a log of a few scans.
 """
 
 from __future__ import annotations
@@ -25,11 +26,16 @@ SECOND = 1_000_000_000
 
 
 def scan(i: int) -> Scan:
-    """A scan as a sensor gives it: a surface with noise, so that it does not compress to nothing."""
+    """A scan as a sensor gives it.
+
+    A surface with noise, so that it does not compress to nothing.
+    """
     rng = np.random.Generator(np.random.PCG64(i % 16))
     points = (rng.normal(size=(10_000, 3)) * 2.0).astype(np.float32)
     times = np.linspace(0.0, 0.1, 10_000, dtype=np.float32)
-    return Scan(i, SECOND + i * SECOND // 10, points, times_s=times, log_ns=SECOND + i * SECOND // 10)
+    return Scan(
+        i, SECOND + i * SECOND // 10, points, times_s=times, log_ns=SECOND + i * SECOND // 10
+    )
 
 
 def make(path: Path, count: int, compression: str) -> None:
@@ -54,7 +60,9 @@ def timed(path: Path) -> tuple[float, float, int]:
 def peak_of(path: Path) -> int:
     """Peak MiB of a process that reads a log to its end."""
     code = f"import log_speed, pathlib; print(log_speed.peak(pathlib.Path({str(path)!r})))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, check=True
+    )
     return int(done.stdout)
 
 

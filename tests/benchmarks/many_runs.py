@@ -1,9 +1,11 @@
-"""Many runs in one process through the Python API: ``python tests/benchmarks/many_runs.py [--quick] [--runs N]``.
+"""Many runs in one process through the Python API: ``python tests/benchmarks/many_runs.py [--quick]
+[--runs N]``.
 
-Replays a scan of a small log again and again; every 50th run has a blackout and a global search, every tenth is closed
-after its first row, and every hundredth is given a damaged log. Memory, open files and threads must not grow: they are
-sampled twenty times, and the largest value of the second half must not exceed that of the first half by more than the
-stated margin. Prints one JSON document; exit code 1 if anything grows.
+Replays a scan of a small log again and again; every 50th run has a blackout and a global search,
+every tenth is closed after its first row, and every hundredth is given a damaged log. Memory, open
+files and threads must not grow: they are sampled twenty times, and the largest value of the second
+half must not exceed that of the first half by more than the stated margin. Prints one JSON
+document; exit code 1 if anything grows.
 """
 
 from __future__ import annotations
@@ -33,14 +35,20 @@ def sample() -> dict[str, float]:
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     mib = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-    return {"memory_mib": round(mib, 1), "open_files": len(os.listdir("/proc/self/fd")),  # noqa: PTH208
-            "threads": threading.active_count()}  # fmt: skip
+    return {
+        "memory_mib": round(mib, 1),
+        "open_files": len(os.listdir("/proc/self/fd")),  # noqa: PTH208
+        "threads": threading.active_count(),
+    }
 
 
 def grown(samples: list[dict[str, float]]) -> dict[str, list[float]]:
     """What is larger in the second half than in the first half by more than its margin."""
     half = len(samples) // 2
-    ends = {name: [max(s[name] for s in part) for part in (samples[:half], samples[half:])] for name in MARGINS}
+    ends = {
+        name: [max(s[name] for s in part) for part in (samples[:half], samples[half:])]
+        for name in MARGINS
+    }
     return {name: pair for name, pair in ends.items() if pair[1] > pair[0] + MARGINS[name]}
 
 
@@ -62,7 +70,9 @@ def replay_once(number: int, log: Path, folder: Path) -> int:
 
 def main() -> int:
     """Run, sample, compare the halves."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--quick", action="store_true", help="200 runs")
     asked = parser.parse_args()

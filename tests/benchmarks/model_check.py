@@ -1,19 +1,22 @@
-"""What a run says of its model: mirror images, and the duration of scans beside a wrong size and noise.
+"""What a run says of its model: mirror images, and the duration of scans beside a wrong size and
+noise.
 
-python tests/benchmarks/model_check.py [mirror] [duration] [--seeds 0,1] [--kinds satellite,...] [--meshes FILE,...]
-    [--noise 0.002]
+python tests/benchmarks/model_check.py [mirror] [duration] [--seeds 0,1] [--kinds satellite,...]
+    [--meshes FILE,...] [--noise 0.002]
 
 Targets are the bodies of ``bodies.py`` for each kind and seed, and mesh files.
 
-mirror     Eight views of 3,000 points from random sides at three extents. "right" registers them from the true pose;
-           "mirrored" reflects the scans and registers them without a guess. The scanned target is the model, or the
-           model with a smooth deformation of 0.3 or 0.8 % of the extent (rms), without one part, with a further part,
-           with both, or 1.02 times as large. The table has the runs with accepted scans, and those with the message
-           that the mirror image is better. The runs of ``symmetric`` and of right models must have none.
-duration   60 scans at 2 Hz of a target that rotates by 0.1 to 0.3 rad/s; 80 x 80 rays, row by row or column by column,
-           are spread over the duration, and the points have no times. Size, duration and noise vary. The table has the
-           runs, and those that report a duration and a size; "off" is the largest difference of a reported duration
-           from the true one, over the latter.
+mirror     Eight views of 3,000 points from random sides at three extents. "right" registers them
+           from the true pose; "mirrored" reflects the scans and registers them without a guess. The
+           scanned target is the model, or the model with a smooth deformation of 0.3 or 0.8 % of
+           the extent (rms), without one part, with a further part, with both, or 1.02 times as
+           large. The table has the runs with accepted scans, and those with the message that the
+           mirror image is better. The runs of ``symmetric`` and of right models must have none.
+duration   60 scans at 2 Hz of a target that rotates by 0.1 to 0.3 rad/s; 80 x 80 rays, row by row
+           or column by column, are spread over the duration, and the points have no times. Size,
+           duration and noise vary. The table has the runs, and those that report a duration and a
+           size; "off" is the largest difference of a reported duration from the true one, over the
+           latter.
 """
 
 from __future__ import annotations
@@ -32,13 +35,26 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from avsreplay.geometry import Pose
 from avsreplay.records import AlignStatus, Scan, Surface
-from avsreplay.register import ModelCheck, Registrar
+from avsreplay.register.model_check import ModelCheck
+from avsreplay.register.registrar import Registrar
 
 VIEWS, POINTS, SCANS, HZ, RAYS = 8, 3000, 60, 2.0, 80
 REFLECTED = np.array([-1.0, 1.0, 1.0])
 DURATIONS = [  # size of the target over that of the model, duration [s], noise over the extent
-    *((1.0, 0.0, 0.0005), (1.02, 0.0, 0.0005), (0.98, 0.0, 0.0005), (1.0, 0.0, 0.004), (1.0, 0.0, 0.008)),
-    *((1.0, 0.2, 0.0005), (1.0, 0.6, 0.0005), (1.0, 0.6, 0.004), (1.02, 0.6, 0.0005), (1.0, -0.6, 0.0005)),
+    *(
+        (1.0, 0.0, 0.0005),
+        (1.02, 0.0, 0.0005),
+        (0.98, 0.0, 0.0005),
+        (1.0, 0.0, 0.004),
+        (1.0, 0.0, 0.008),
+    ),
+    *(
+        (1.0, 0.2, 0.0005),
+        (1.0, 0.6, 0.0005),
+        (1.0, 0.6, 0.004),
+        (1.02, 0.6, 0.0005),
+        (1.0, -0.6, 0.0005),
+    ),
 ]
 
 
@@ -56,7 +72,9 @@ def deformed(mesh: trimesh.Trimesh, share: float, rng: np.random.Generator) -> t
     extent = np.linalg.norm(mesh.extents)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     if len(faces) < 5000:
-        vertices, faces = trimesh.remesh.subdivide_to_size(vertices, faces, 0.05 * extent, max_iter=30)
+        vertices, faces = trimesh.remesh.subdivide_to_size(
+            vertices, faces, 0.05 * extent, max_iter=30
+        )
     moved = np.zeros_like(vertices)
     for _ in range(8):
         wave, phase = 2.0 * np.pi / extent * rng.normal(size=3), rng.uniform(0.0, 2.0 * np.pi)
@@ -70,7 +88,11 @@ def without_part(mesh: trimesh.Trimesh, rng: np.random.Generator) -> trimesh.Tri
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     areas = np.bincount(labels, mesh.area_faces)
     others = np.delete(np.arange(len(areas)), np.argmax(areas))
-    return mesh if not len(others) else mesh.submesh([labels != rng.choice(others)], append=True, repair=False)
+    return (
+        mesh
+        if not len(others)
+        else mesh.submesh([labels != rng.choice(others)], append=True, repair=False)
+    )
 
 
 def with_part(mesh: trimesh.Trimesh, rng: np.random.Generator) -> trimesh.Trimesh:
@@ -99,13 +121,16 @@ def mirror(asked: argparse.Namespace) -> None:
         registrar = Registrar(model)
         handed = "the same" if name.startswith("symmetric") else "another"
         for error, change in ERRORS.items():
-            target = bodies.surface_of(change(mesh.copy(), np.random.default_rng([number, 77])), name)
+            target = bodies.surface_of(
+                change(mesh.copy(), np.random.default_rng([number, 77])), name
+            )
             for mirrored in (0, 1):
                 runs[handed, error][mirrored] += run_of_views(
                     registrar, model, target, bool(mirrored), 7000 + number, asked.noise
                 )
     print(
-        "| mirror image | error of the model | right: runs with accepted scans, of these called mirrored | mirrored |"
+        "| mirror image | error of the model | right: runs with accepted scans, of these called"
+        " mirrored | mirrored |"
     )
     for (handed, error), ((accepted, said), (of_image, said_of_image)) in sorted(runs.items()):
         print(f"| {handed} | {error} | {accepted}, {said} | {of_image}, {said_of_image} |")
@@ -146,11 +171,15 @@ def scans(
         hits, rows, _ = caster.intersects_location(eyes, directions, multiple_hits=False)
         order = np.argsort(rows)
         hits, rows = hits[order], rows[order]
-        ranges = np.linalg.norm(hits - eyes[rows], axis=1) + noise * extent * rng.normal(size=len(rows))
+        ranges = np.linalg.norm(hits - eyes[rows], axis=1) + noise * extent * rng.normal(
+            size=len(rows)
+        )
         points = (ranges[:, None] * rays[rows]).astype(np.float32)
         before = (np.arange(len(points)) / len(points)).astype(np.float32)
         middle = k / HZ + duration_s * float(share[rows].mean())
-        pose = Pose((Rotation.from_rotvec(middle * spin) * start).as_quat(), place + middle * velocity)
+        pose = Pose(
+            (Rotation.from_rotvec(middle * spin) * start).as_quat(), place + middle * velocity
+        )
         taken = duration_s * float(share[rows[-1]] - share[rows[0]])
         yield Scan(k, round(1e9 * k / HZ), points, places=before), pose, taken
 
@@ -168,9 +197,18 @@ def duration(asked: argparse.Namespace) -> None:
                 check.add(scan, registrar.register(scan.points, T_ac))
                 taken.append(time_s)
             notes, result = check.notes(), check._durations.result(registrar.index)
-            off = abs(result.duration_s - np.mean(taken)) / abs(np.mean(taken)) if result and duration_s else 0.0
-            found[case].append((result is not None, any("--model-scale" in note for note in notes), off))
-    print("| size | duration of all rays [s] | noise | runs | report a duration | report a size | off |")
+            off = (
+                abs(result.duration_s - np.mean(taken)) / abs(np.mean(taken))
+                if result and duration_s
+                else 0.0
+            )
+            found[case].append(
+                (result is not None, any("--model-scale" in note for note in notes), off)
+            )
+    print(
+        "| size | duration of all rays [s] | noise | runs | report a duration | report a size |"
+        " off |"
+    )
     for (size, duration_s, noise), runs in found.items():
         reported, sized, off = zip(*runs, strict=True)
         counts = f"{len(runs)} | {sum(reported)} | {sum(sized)}"
@@ -179,8 +217,12 @@ def duration(asked: argparse.Namespace) -> None:
 
 def main() -> None:
     """Print the tables asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", default=["mirror", "duration"], choices=["mirror", "duration"])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "parts", nargs="*", default=["mirror", "duration"], choices=["mirror", "duration"]
+    )
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--kinds", default=",".join(bodies.KINDS))
     parser.add_argument("--meshes", default="")

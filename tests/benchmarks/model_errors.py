@@ -1,22 +1,24 @@
-"""Whole runs on logs of targets and sensors that differ from the model, made without code of avsreplay.
+"""Whole runs on logs of targets and sensors that differ from the model, made without code of
+avsreplay.
 
-python tests/benchmarks/model_errors.py [--cases size,panel,...] [--seeds 0,1] [--seconds 90] [--hz 2] [--rate 0.1]
-    [--keep FOLDER]
+python tests/benchmarks/model_errors.py [--cases size,panel,...] [--seeds 0,1] [--seconds 90] [--hz
+    2] [--rate 0.1] [--keep FOLDER]
 
 Targets, motion, rays and files are those of ``raycast_logs.py``; the cases are:
 
-size       the model is 0.4 % too large         ranges     ranges are 0.2 % too long
-panel      both panels rotated by 2 deg         turning    both panels rotate by 0.05 deg/s
-missing    a small part is not in the model     extra      a small part is in the model only
-incidence  ranges too long by up to 6 mm at     mixed      two fifths of the points at edges lie between the
+size       the model is 0.4 % too large         ranges     ranges are 0.2 % too long panel      both
+panels rotated by 2 deg         turning    both panels rotate by 0.05 deg/s missing    a small part
+is not in the model     extra      a small part is in the model only incidence  ranges too long by
+up to 6 mm at     mixed      two fifths of the points at edges lie between the
            grazing incidence                               surfaces before and behind
-speckle    5 mm of range error in blocks of     grazing    noise grows and points are lost at grazing incidence
-           8 x 8 rays                           steps      ranges rounded to 1 cm
-clutter    a tenth of the points anywhere       frozen     the sensor repeats a scan from 40 s to 44 s
-release    at rest until 30 s, then the motion of the other cases
+speckle    5 mm of range error in blocks of     grazing    noise grows and points are lost at
+           grazing incidence 8 x 8 rays                           steps      ranges rounded to 1 cm
+clutter    a tenth of the points anywhere       frozen     the sensor repeats a scan from 40 s to 44
+s release    at rest until 30 s, then the motion of the other cases
 
-The last columns are, over the healthy scans of the whole run: those beyond 4 claimed sigma; and the root mean square of
-the error of the position over that of its claimed 1 sigma, and the same of the attitude, where convergence is claimed.
+The last columns are, over the healthy scans of the whole run: those beyond 4 claimed sigma; and the
+root mean square of the error of the position over that of its claimed 1 sigma, and the same of the
+attitude, where convergence is claimed.
 """
 
 from __future__ import annotations
@@ -38,14 +40,31 @@ CASES = (
     *("mixed", "speckle", "grazing", "steps", "clutter", "frozen", "release"),
 )
 HEADS = (
-    *("case", "seed", "verdict", "t_1 [s]", "manoeuvres", "healthy scans", "converged", "of these > 4 sigma"),
-    *("healthy > 4 sigma", "position: error / claim", "attitude: error / claim", "error [mm]", "error [deg]"),
+    *(
+        "case",
+        "seed",
+        "verdict",
+        "t_1 [s]",
+        "manoeuvres",
+        "healthy scans",
+        "converged",
+        "of these > 4 sigma",
+    ),
+    *(
+        "healthy > 4 sigma",
+        "position: error / claim",
+        "attitude: error / claim",
+        "error [mm]",
+        "error [deg]",
+    ),
 )
 RAYS = 80
 
 
 def rotated_panels(parts: list[trimesh.Trimesh], angle: float) -> trimesh.Trimesh:
-    """The spacecraft with its two panels, the largest parts but the body, rotated about their long axes [rad]."""
+    """The spacecraft with its two panels, the largest parts but the body, rotated about their long
+    axes [rad].
+    """
     panels = sorted(range(len(parts)), key=lambda k: -parts[k].area)[1:3]
     out = [part.copy() for part in parts]
     for k in panels:
@@ -54,7 +73,9 @@ def rotated_panels(parts: list[trimesh.Trimesh], angle: float) -> trimesh.Trimes
     return trimesh.util.concatenate(out)
 
 
-def model_and_target(case: str, rng: np.random.Generator) -> tuple[trimesh.Trimesh, trimesh.Trimesh, list]:
+def model_and_target(
+    case: str, rng: np.random.Generator
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh, list]:
     """The model, the target that is scanned, and the parts of the spacecraft."""
     whole = logs.spacecraft(rng)
     parts = list(whole.split(only_watertight=False))
@@ -75,7 +96,10 @@ def model_and_target(case: str, rng: np.random.Generator) -> tuple[trimesh.Trime
 def measured(
     case: str, ranges: np.ndarray, rows: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Ranges (n,) with the errors of a sensor, NaN for points that are lost; ``rows``: numbers of the rays."""
+    """Ranges (n,) with the errors of a sensor, NaN for points that are lost; ``rows``.
+
+    Numbers of the rays.
+    """
     noise = 0.002 * rng.normal(size=len(ranges))
     if case == "mixed":
         grid = np.full(RAYS * RAYS, np.nan)
@@ -98,7 +122,9 @@ def measured(
     if case == "steps":
         ranges = np.round(ranges / 0.01) * 0.01
     if case == "clutter":
-        ranges = np.where(rng.random(len(ranges)) < 0.1, rng.uniform(1.0, 12.0, len(ranges)), ranges)
+        ranges = np.where(
+            rng.random(len(ranges)) < 0.1, rng.uniform(1.0, 12.0, len(ranges)), ranges
+        )
     return ranges
 
 
@@ -113,7 +139,9 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
     turns, places, _ = logs.motion(rng, times, case, asked.rate)
     if case == "release":
         k = int(np.searchsorted(times, 30.0))
-        turns, places = (np.concatenate([np.repeat(a[:1], k, axis=0), a[: len(a) - k]]) for a in (turns, places))
+        turns, places = (
+            np.concatenate([np.repeat(a[:1], k, axis=0), a[: len(a) - k]]) for a in (turns, places)
+        )
     caster, rays, points = RayMeshIntersector(target), logs.ray_grid(17.0, RAYS), np.empty((0, 3))
     with logs.recorded(folder / "log") as write:
         for t_s, turn, place in zip(times, turns, places, strict=True):
@@ -130,7 +158,15 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
 
 def examine(folder: Path, case: str, seed: int) -> list[str]:
     """Run avsreplay on the log of ``folder`` and return the cells of its line of the table."""
-    command = [sys.executable, "-m", "avsreplay", "run", str(folder / "log"), "--model", str(folder / "model.stl")]
+    command = [
+        sys.executable,
+        "-m",
+        "avsreplay",
+        "run",
+        str(folder / "log"),
+        "--model",
+        str(folder / "model.stl"),
+    ]
     done = subprocess.run(
         [*command, "--model-unit", "mm", "-o", str(folder / "result"), "--overwrite", "--json"],
         capture_output=True,
@@ -147,7 +183,9 @@ def examine(folder: Path, case: str, seed: int) -> list[str]:
         return sum(max(row[error] / row[claim] for error, claim in pairs) > 4.0 for row in rows)
 
     def rms(name: str) -> float:
-        return float(np.sqrt(np.mean([row[name] ** 2 for row in converged]))) if converged else np.nan
+        return (
+            float(np.sqrt(np.mean([row[name] ** 2 for row in converged]))) if converged else np.nan
+        )
 
     t1, changes = summary["convergence"]["t1_s"], summary["velocity_changes"]
     return [
@@ -168,13 +206,17 @@ def examine(folder: Path, case: str, seed: int) -> list[str]:
 
 def main() -> None:
     """Make the logs, run avsreplay on each and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--seconds", type=float, default=90.0)
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="mean rate of the targets [rad/s]")
-    parser.add_argument("--keep", type=Path, help="write the logs and results to this folder and keep them")
+    parser.add_argument(
+        "--keep", type=Path, help="write the logs and results to this folder and keep them"
+    )
     asked = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS), flush=True)
     with tempfile.TemporaryDirectory() as scratch:

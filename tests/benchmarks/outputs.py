@@ -1,8 +1,10 @@
-"""Outputs of every command: every kind of file node, full disks, two writers at once, and kill -9 at random moments.
+"""Outputs of every command: every kind of file node, full disks, two writers at once, and kill -9
+at random moments.
 
-``python tests/benchmarks/outputs.py [--quick] [--kills N] [--seed S] [--only COMMAND]``. The outputs are listed from
-the options of the commands: a new one without a case here ends the campaign. A node must keep its kind, an output must
-be complete, old or absent, nothing else may be left behind, and the same command must succeed afterwards.
+``python tests/benchmarks/outputs.py [--quick] [--kills N] [--seed S] [--only COMMAND]``. The
+outputs are listed from the options of the commands: a new one without a case here ends the
+campaign. A node must keep its kind, an output must be complete, old or absent, nothing else may be
+left behind, and the same command must succeed afterwards.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 from fuzz_commands import OUTPUTS, build
 from fuzz_workers import Command, Done
 
-from avsreplay.cli import SUMMARIES, group
+from avsreplay.cli.main import SUMMARIES, group
 from avsreplay.errors import AvsError
 from avsreplay.log import open_source
 from avsreplay.log.header import read_surface
@@ -39,8 +41,30 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "output"): (*RUN, "-o", "OUT", "--overwrite"),
     ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
     ("doctor", "output"): ("log.mcap", "--repair", "OUT", "--overwrite"),
-    ("plan", "export"): ("result", "--at", "0", "--samples", "1", "--every", "1", "--export", "OUT", "--overwrite"),
-    ("plan", "animate"): ("result", "--at", "0", "--samples", "1", "--every", "1", "--animate", "OUT", "--overwrite"),
+    ("plan", "export"): (
+        "result",
+        "--at",
+        "0",
+        "--samples",
+        "1",
+        "--every",
+        "1",
+        "--export",
+        "OUT",
+        "--overwrite",
+    ),
+    ("plan", "animate"): (
+        "result",
+        "--at",
+        "0",
+        "--samples",
+        "1",
+        "--every",
+        "1",
+        "--animate",
+        "OUT",
+        "--overwrite",
+    ),
     ("report", "output"): ("result", "-o", "OUT", "--overwrite"),
     ("export", "output"): ("result", "--to", "csv", "-o", "OUT", "--overwrite"),
     ("compare", "output"): ("result", "result", "-o", "OUT", "--overwrite"),
@@ -52,8 +76,24 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
 }
 FOLDERS = {("run", "output"), ("sweep", "output")}
-NODES = ("file", "null", "full", "fifo", "socket", "folder", "link to a file", "link to null", "link to a folder",
-         "dangling link", "loop of links", "missing folder", "long name", "empty name", "dot", "root")  # fmt: skip
+NODES = (
+    "file",
+    "null",
+    "full",
+    "fifo",
+    "socket",
+    "folder",
+    "link to a file",
+    "link to null",
+    "link to a folder",
+    "dangling link",
+    "loop of links",
+    "missing folder",
+    "long name",
+    "empty name",
+    "dot",
+    "root",
+)
 
 
 def listed() -> list[tuple[str, str]]:
@@ -72,7 +112,9 @@ def listed() -> list[tuple[str, str]]:
 
 def command_line(case: tuple[str, str], seeds: Path, output: str) -> list[str]:
     """The arguments of a case."""
-    words = (output if w == "OUT" else str(seeds / w) if (seeds / w).exists() else w for w in CASES[case])
+    words = (
+        output if w == "OUT" else str(seeds / w) if (seeds / w).exists() else w for w in CASES[case]
+    )
     return [case[0], *words]
 
 
@@ -96,7 +138,13 @@ def node(kind: str, place: Path) -> str:
         other.write_text("old") if kind == "link to a file" else None
         other.mkdir() if kind == "link to a folder" else None
         path.symlink_to({"link to null": Path("/dev/null"), "loop of links": path}.get(kind, other))
-    names = {"missing folder": "missing/out", "long name": "x" * 300, "empty name": "", "dot": ".", "root": "/"}
+    names = {
+        "missing folder": "missing/out",
+        "long name": "x" * 300,
+        "empty name": "",
+        "dot": ".",
+        "root": "/",
+    }
     if kind in ("empty name", "dot", "root"):
         return names[kind]
     return str(place / names.get(kind, "out"))
@@ -110,7 +158,11 @@ def kinds(place: Path) -> dict[str, int]:
 def errors(done: Done) -> list[str]:
     """The error lines of a command, without its warnings and findings on the log."""
     lines = [line for line in done.stderr.splitlines() if line.startswith("avsreplay: ")]
-    return [line for line in lines if "warning" not in line and not line.startswith("avsreplay: background: ")]
+    return [
+        line
+        for line in lines
+        if "warning" not in line and not line.startswith("avsreplay: background: ")
+    ]
 
 
 def try_node(case: tuple[str, str], kind: str, seeds: Path, root: Path) -> str:
@@ -121,10 +173,19 @@ def try_node(case: tuple[str, str], kind: str, seeds: Path, root: Path) -> str:
     done = Command(command_line(case, seeds, output), place, limit_s=120).wait()
     after = kinds(place)
     lines = errors(done)
-    if "Traceback" in done.stderr or done.returncode in (1, 70) or (done.returncode and len(lines) != 1):
+    if (
+        "Traceback" in done.stderr
+        or done.returncode in (1, 70)
+        or (done.returncode and len(lines) != 1)
+    ):
         return f"FINDING {case} {kind}: exit {done.returncode}: {done.stderr[-300:]}"
     changed = [name for name, what in before.items() if after.get(name) != what]
-    allowed = ("out", "other", "report.html", *(("missing",) if case in FOLDERS else ()))  # their parents are created
+    allowed = (
+        "out",
+        "other",
+        "report.html",
+        *(("missing",) if case in FOLDERS else ()),
+    )  # their parents are created
     extra = [name for name in after.keys() - before.keys() if not name.startswith(allowed)]
     if changed or extra or any(".part" in name for name in after):
         return f"FINDING {case} {kind}: changed {changed}, left {extra}"
@@ -165,19 +226,28 @@ SUFFIX = {
 
 def output_of(case: tuple[str, str], place: Path) -> Path:
     """Name of an output in a folder."""
-    suffixes = {("compare", "output"): ".html", ("compare", "junit"): ".xml", ("run", "update_golden"): ".jsonl",
-                ("plan", "animate"): ".html"}  # fmt: skip
+    suffixes = {
+        ("compare", "output"): ".html",
+        ("compare", "junit"): ".xml",
+        ("run", "update_golden"): ".jsonl",
+        ("plan", "animate"): ".html",
+    }
     return place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
 
 
 def finished(line: list[str], place: Path, file_bytes: int | None = None) -> Done:
-    """Run a command to its end; with ``file_bytes`` no file may become larger, as on a full disk."""
+    """Run a command to its end.
+
+    With ``file_bytes`` no file may become larger, as on a full disk.
+    """
     return Command(line, place, file_bytes).wait()
 
 
 def beside(path: Path, *kept: Path) -> list[str]:
     """What stands in the folder of an output, without the second output of a command."""
-    return sorted(p.name for p in path.parent.iterdir() if p not in (path, *kept) and p.name != "other.ply")
+    return sorted(
+        p.name for p in path.parent.iterdir() if p not in (path, *kept) and p.name != "other.ply"
+    )
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -187,7 +257,10 @@ def contents(path: Path) -> dict[str, bytes]:
 
 
 def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
-    """Write an output where no file may become larger than it, in steps; the old output must stay as it is."""
+    """Write an output where no file may become larger than it, in steps.
+
+    The old output must stay as it is.
+    """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
     line = command_line(case, seeds, str(path))
@@ -209,7 +282,10 @@ def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
 
 
 def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
-    """Two processes write the same output at the same time; it must be complete, and nothing else may be left."""
+    """Two processes write the same output at the same time.
+
+    It must be complete, and nothing else may be left.
+    """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
     line = command_line(case, seeds, str(path))
@@ -222,11 +298,14 @@ def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
     return "two writers"
 
 
-def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.random.Generator) -> Iterator[str]:
-    """Write an output, then kill ``kills`` further writers at random moments; every fifth time one may finish.
+def kill(
+    case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.random.Generator
+) -> Iterator[str]:
+    """Write an output, then kill ``kills`` further writers at random moments; every fifth time one
+    may finish.
 
-    A campaign continues where it was killed and must have the summary of one without a disturbance when it is complete;
-    then it begins anew.
+    A campaign continues where it was killed and must have the summary of one without a disturbance
+    when it is complete; then it begins anew.
     """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
@@ -267,7 +346,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200, help="per output")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="no kills, and only the first node of each output")
+    parser.add_argument(
+        "--quick", action="store_true", help="no kills, and only the first node of each output"
+    )
     parser.add_argument("--only", help="one command")
     asked = parser.parse_args()
     rng = np.random.Generator(np.random.PCG64(asked.seed))
@@ -278,13 +359,24 @@ def main() -> int:
         build(Path(seeds))
         for case in cases:
             kept = contents(Path(seeds))
-            found += [try_node(case, kind, Path(seeds), Path(root)) for kind in NODES[: 2 if asked.quick else None]]
+            found += [
+                try_node(case, kind, Path(seeds), Path(root))
+                for kind in NODES[: 2 if asked.quick else None]
+            ]
             if not asked.quick:
-                found += [*full_disk(case, Path(seeds), Path(root)), two_writers(case, Path(seeds), Path(root))]
+                found += [
+                    *full_disk(case, Path(seeds), Path(root)),
+                    two_writers(case, Path(seeds), Path(root)),
+                ]
                 killed += kill(case, Path(seeds), Path(root), asked.kills, rng)
             if contents(Path(seeds)) != kept:
                 found.append(f"FINDING {case}: an input has changed")
-            print(case, dict(Counter(text[:15] for text in (*found, *killed))), file=sys.stderr, flush=True)
+            print(
+                case,
+                dict(Counter(text[:15] for text in (*found, *killed))),
+                file=sys.stderr,
+                flush=True,
+            )
     findings = [text for text in (*found, *killed) if text.startswith("FINDING")]
     outcomes = {
         "nodes, full disks, two writers": dict(Counter(t.split(":")[0][:11] for t in found)),

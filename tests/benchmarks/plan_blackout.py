@@ -1,9 +1,10 @@
-"""Approaches of the whole chain with vision lost before the capture; writes the table of docs/planning-results.md.
+"""Approaches of the whole chain with vision lost before the capture; writes the table of
+docs/planning-results.md.
 
 python tests/benchmarks/plan_blackout.py [--check]
 
-The built-in scenario is recorded for 60 s with one occlusion of 12 s in place of its faults, and replayed with its own
-settings. ``--check`` compares the table with the page and writes nothing.
+The built-in scenario is recorded for 60 s with one occlusion of 12 s in place of its faults, and
+replayed with its own settings. ``--check`` compares the table with the page and writes nothing.
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ import tomli_w
 
 from avsreplay import replay, toml_document
 from avsreplay.record import record
-from avsreplay.simulate import load_scenario
+from avsreplay.simulate.scenario import load_scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "planning-results.md"
 LENGTH_S, DURATION_S = 12.0, 60.0
 STARTS_S = (10.0, 14.0)
-HEAD = "| occlusion from | actions | closed at | miss | relative speed | angle |\n|---|---|---|---|---|---|"
+HEAD = (
+    "| occlusion from | actions | closed at | miss | relative speed | angle"
+    " |\n|---|---|---|---|---|---|"
+)
 
 
 def approach(start_s, folder):
@@ -30,21 +34,26 @@ def approach(start_s, folder):
     table = dict(toml_document.parse(load_scenario(None).text, "built-in scenario").table)
     fault = {"kind": "occlusion", "start_s": start_s, "duration_s": LENGTH_S}
     scenario, log = folder / f"{start_s}.toml", folder / f"{start_s}.mcap"
-    scenario.write_text(tomli_w.dumps(table | {"duration_s": DURATION_S, "fault": [fault]}), encoding="utf-8")
+    scenario.write_text(
+        tomli_w.dumps(table | {"duration_s": DURATION_S, "fault": [fault]}), encoding="utf-8"
+    )
     record(scenario, log)
     return list(replay(log))
 
 
 def line(start_s, rows):
     """One line of the table."""
-    changes = [b for a, b in zip([None, *rows], rows, strict=False) if a is None or a.action != b.action]
+    changes = [
+        b for a, b in zip([None, *rows], rows, strict=False) if a is None or a.action != b.action
+    ]
     actions = ", ".join(f"{row.action} from {row.t_s:.1f} s" for row in changes)
     end = next((row for row in rows if row.capture_miss_m is not None), None)
     if end is None:
         return f"| {start_s:g} s | {actions} | no capture | | | |"
     closed = rows[rows.index(end) - 1].capture_time_s
     errors = (
-        f"{1e3 * end.capture_miss_m:.1f} mm | {1e3 * end.capture_miss_mps:.1f} mm/s | {end.capture_miss_deg:.2f} deg"
+        f"{1e3 * end.capture_miss_m:.1f} mm | {1e3 * end.capture_miss_mps:.1f} mm/s |"
+        f" {end.capture_miss_deg:.2f} deg"
     )
     return f"| {start_s:g} s | {actions} | {closed:.1f} s | {errors} |"
 
@@ -64,7 +73,9 @@ def written(lines, page):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--check", action="store_true", help="compare with the page only")
     args, page = parser.parse_args(), PAGE.read_text(encoding="utf-8")
     lines = table()

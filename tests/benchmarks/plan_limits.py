@@ -1,10 +1,11 @@
-"""Constrained plans: excess at 20,000 instants, processor time, and the time later than IPOPT with 200 nodes.
+"""Constrained plans: excess at 20,000 instants, processor time, and the time later than IPOPT with
+200 nodes.
 
     python tests/benchmarks/plan_limits.py --kind cone --count 100 --ipopt 100
     python tests/benchmarks/plan_limits.py --kind body --count 50 --ipopt 50
 
-The reference has no aborts, so that ``--kind aborts`` shows what they cost. ``--first`` skips problems, so that a
-campaign can be made in parts. ``plan_reference`` describes the reference.
+The reference has no aborts, so that ``--kind aborts`` shows what they cost. ``--first`` skips
+problems, so that a campaign can be made in parts. ``plan_reference`` describes the reference.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ from functools import partial
 import numpy as np
 from plan_scenes import problems
 
-from avsreplay.plan import Limits, PlanParams, constrained, path_of, rendezvous
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.path import path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
 
 EXTENT_M = 8.0
 LIMITS = {
@@ -30,14 +34,19 @@ LIMITS = {
 
 
 def violations(problem, limits, t, r):
-    """Excess (n,) at instants of a path, positions (n, 3) [m], written independently of the package's own check."""
+    """Excess (n,) at instants of a path, positions (n, 3) [m], written independently of the
+    package's own check.
+    """
     q = problem.scene.attitude(t)
     d = r - problem.scene.goal(t)[0]
     x, w = -q[:, :3], q[:, 3:]
     y = d + 2.0 * np.cross(x, np.cross(x, d) + w * d)  # conjugate rotation
     reach, across = np.linalg.norm(y, axis=1), np.hypot(y[:, 1], y[:, 2])
     least, inside_last = np.full(len(t), np.inf), np.full(len(t), -np.inf)
-    for degrees, length in ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m)):
+    for degrees, length in (
+        (limits.cone_deg, limits.cone_range_m),
+        (limits.final_deg, limits.final_range_m),
+    ):
         if degrees is not None:
             inside = math.tan(math.radians(degrees)) * y[:, 0] + limits.mouth_m - across
             inside_last = np.minimum(inside, length - reach)
@@ -66,14 +75,20 @@ def measured(problem, limits, compare):
     """Figures of one problem: plan, excess, times, and the reference where ``compare``."""
     params, rest, scene = PlanParams(a_max_mps2=problem.a_max), np.zeros(3), problem.scene
     free = rendezvous(scene.goal, problem.r0, rest, params)
-    plan, cold_ms = timed(lambda: constrained(scene, problem.r0, rest, params, limits, extent_m=EXTENT_M))
+    plan, cold_ms = timed(
+        lambda: constrained(scene, problem.r0, rest, params, limits, extent_m=EXTENT_M)
+    )
     resolved, path = limits.resolved(EXTENT_M), None
     out = {"plan": plan, "cold": cold_ms, "later": plan.t_go_s - free.t_go_s}
     if plan.found:
         path = path_of(plan, problem.r0, rest)
         out["excess"] = excess(problem, resolved, plan.t_go_s, lambda t: path.at(t)[0])
         (r, v), ahead = path.at(np.array([1.0])), scene.after(1.0)
-        again = timed(lambda: constrained(ahead, r[0], v[0], params, limits, extent_m=EXTENT_M, warm=(path, 1.0)))
+        again = timed(
+            lambda: constrained(
+                ahead, r[0], v[0], params, limits, extent_m=EXTENT_M, warm=(path, 1.0)
+            )
+        )
         out["warm"], out["warm_later"] = again[1], again[0].t_go_s + 1.0 - plan.t_go_s
     if compare:
         from plan_reference import flown, ipopt
@@ -99,11 +114,15 @@ def line(k, of):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kind", choices=LIMITS, default="cone")
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="number of the first problem")
-    parser.add_argument("--ipopt", type=int, default=0, help="compare the first problems with IPOPT")
+    parser.add_argument(
+        "--ipopt", type=int, default=0, help="compare the first problems with IPOPT"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--nodes", type=int, default=Limits().nodes)
     args = parser.parse_args()
@@ -126,10 +145,16 @@ def main():
     compared = [of for of in done if "best" in of]
     known = [of for of in compared if not math.isnan(of["best"])]
     if known:
-        late = np.array([of["plan"].t_go_s - of["best"] if of["plan"].found else math.inf for of in known])
+        late = np.array(
+            [of["plan"].t_go_s - of["best"] if of["plan"].found else math.inf for of in known]
+        )
         most = 1e3 * max(of["best_excess"] for of in known)
-        print(f"IPOPT found {len(known)} of {len(compared)}; its own excess is {most:.1f} mm at worst")
-        print(f"the plan is at most 0.1 s later than IPOPT in {np.sum(late <= 0.1)} of {len(known)}")
+        print(
+            f"IPOPT found {len(known)} of {len(compared)}; its own excess is {most:.1f} mm at worst"
+        )
+        print(
+            f"the plan is at most 0.1 s later than IPOPT in {np.sum(late <= 0.1)} of {len(known)}"
+        )
         print(f"later by {np.median(late):+.3f} s in the median, {late.max():+.3f} s at worst")
 
 

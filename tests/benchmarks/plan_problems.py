@@ -1,4 +1,7 @@
-"""Seeded rendezvous problems: a grasp point on a torque-free tumbling body, integrated by DOP853 and tabulated."""
+"""Seeded rendezvous problems.
+
+A grasp point on a torque-free tumbling body, integrated by DOP853 and tabulated.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,10 @@ from scipy.spatial.transform import Rotation
 
 
 class Table:
-    """Position, velocity, acceleration on a grid joined by quintic pieces: as exact as the integration, and cheap."""
+    """Position, velocity, acceleration on a grid joined by quintic pieces.
+
+    As exact as the integration, and cheap.
+    """
 
     def __init__(self, step, position, velocity, acceleration):
         self.step, self.p, self.v, self.a = step, position, velocity, acceleration
@@ -45,7 +51,9 @@ def tumbling(rng, rate_radps, arm_m, distance_m, horizon_s=125.0, step_s=0.05):
 
     start = np.r_[Rotation.from_rotvec(rng.normal(size=3)).as_quat(), w]
     times = np.arange(0.0, horizon_s + step_s, step_s)
-    y = solve_ivp(flow, [0.0, times[-1]], start, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times).y.T
+    y = solve_ivp(
+        flow, [0.0, times[-1]], start, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times
+    ).y.T
     R, w = Rotation.from_quat(y[:, :4]), y[:, 4:]
     position = centre + drift * times[:, None] + R.apply(c)
     velocity = drift + R.apply(np.cross(w, c))
@@ -54,7 +62,10 @@ def tumbling(rng, rate_radps, arm_m, distance_m, horizon_s=125.0, step_s=0.05):
 
 
 def problems(count, hard, seed=1):
-    """(goal, a_max) pairs: hard is 0.1-0.35 rad/s, 1.5 m arm, 0.02-0.1 m/s2; ordinary half the rate and 1 m."""
+    """(goal, a_max) pairs: hard is 0.1-0.35 rad/s, 1.5 m arm, 0.02-0.1 m/s2.
+
+    Ordinary half the rate and 1 m.
+    """
     rng = np.random.default_rng(seed)
     for _ in range(count):
         rate = rng.uniform(0.1, 0.35) if hard else rng.uniform(0.03, 0.1)

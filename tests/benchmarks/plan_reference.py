@@ -1,10 +1,11 @@
 """Reference solutions of constrained planning problems by CasADi with IPOPT.
 
-A direct transcription with free end time and constant thrust in every interval. Each alternative (inside the cone, or
-outside its range) is a smoothed maximum. Its constraints hold only at the nodes; where the path between two nodes
-violates them by more than 1 mm, the margin of both nodes is raised and the problem is solved again.
-Five paths of different arrival time, and a path given by the caller, are solved on a coarse grid; the three
-earliest results are the initial paths of the fine grid.
+A direct transcription with free end time and constant thrust in every interval. Each alternative
+(inside the cone, or outside its range) is a smoothed maximum. Its constraints hold only at the
+nodes; where the path between two nodes violates them by more than 1 mm, the margin of both nodes is
+raised and the problem is solved again. Five paths of different arrival time, and a path given by
+the caller, are solved on a coarse grid; the three earliest results are the initial paths of the
+fine grid.
 """
 
 from __future__ import annotations
@@ -18,10 +19,19 @@ from scipy.spatial.transform import Rotation
 
 COARSE, FINE = 50, 200  # intervals
 SMOOTH_M = 1e-2  # distance of the smoothed maximum from the maximum, twice
-FACTORS = (1.0, 1.15, 1.4, 1.8, 2.3)  # end times of the initial paths over the least time without constraints
+FACTORS = (
+    1.0,
+    1.15,
+    1.4,
+    1.8,
+    2.3,
+)  # end times of the initial paths over the least time without constraints
 LATEST_S = 119.0
 REFINED = 3  # coarse results that are refined
-RAISED, EXCESS_M = 6, 1e-3  # largest number of times that the margins are raised; accepted violation between the nodes
+RAISED, EXCESS_M = (
+    6,
+    1e-3,
+)  # largest number of times that the margins are raised; accepted violation between the nodes
 
 
 @dataclass(frozen=True)
@@ -57,7 +67,10 @@ def node_constraints(problem, limits):
     y = ca.mtimes(ca.reshape(m[3:], 3, 3), r - m[:3])  # the column-major reshape is the transpose
     reach, across = norm(y), norm(y[1:])
     values, corridor = [], None
-    for degrees, length in ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m)):
+    for degrees, length in (
+        (limits.cone_deg, limits.cone_range_m),
+        (limits.final_deg, limits.final_range_m),
+    ):
         if degrees is not None:
             inside = math.tan(math.radians(degrees)) * y[0] + limits.mouth_m - across
             values.append(either(inside, reach - length))
@@ -91,13 +104,20 @@ class Transcription:
         poses = motion.map(n - 1)(h * ca.DM(np.arange(1, n)).T)
         values = node_constraints(problem, limits).map(n - 1)(r[:, 1:n], poses)
         self.margins = opti.parameter(1, n - 1)
-        opti.subject_to(ca.vec(values - 2.0 * ca.repmat(self.margins, values.shape[0], 1)) >= 0)  # ``either`` is twice
+        opti.subject_to(
+            ca.vec(values - 2.0 * ca.repmat(self.margins, values.shape[0], 1)) >= 0
+        )  # ``either`` is twice
         self.options = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-5}
 
     def solved(self, t_end, positions, thrust=None, margins=0.0):
-        """Reference from an initial path, positions (n + 1, 3) and thrust (n, 3); None where IPOPT fails."""
+        """Reference from an initial path, positions (n + 1, 3) and thrust (n, 3).
+
+        None where IPOPT fails.
+        """
         times, opti = np.linspace(0.0, t_end, self.n + 1), self.opti
-        barrier = {"mu_init": 0.1 if thrust is None else 1e-3}  # a path with its thrust is near a minimum
+        barrier = {
+            "mu_init": 0.1 if thrust is None else 1e-3
+        }  # a path with its thrust is near a minimum
         opti.solver("ipopt", {"print_time": False}, {**self.options, **barrier})
         opti.set_initial(self.r, positions.T)
         opti.set_initial(self.v, np.gradient(positions, times, axis=0).T)
@@ -127,13 +147,18 @@ def flown(reference, times):
     h = reference.t_s / n
     k = np.minimum((times / h).astype(int), n - 1)
     v = h * np.concatenate([np.zeros((1, 3)), np.cumsum(reference.u, axis=0)])
-    r = np.concatenate([np.zeros((1, 3)), np.cumsum(h * v[:-1] + 0.5 * h * h * reference.u, axis=0)])
+    r = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(h * v[:-1] + 0.5 * h * h * reference.u, axis=0)]
+    )
     s = (times - k * h)[:, None]
     return r[k] + s * v[k] + 0.5 * s * s * reference.u[k]
 
 
 def refined(grid, draft, violation):
-    """The draft on the fine grid, with margins at the nodes; None where IPOPT fails or the excess remains."""
+    """The draft on the fine grid, with margins at the nodes.
+
+    None where IPOPT fails or the excess remains.
+    """
     n, found = grid.n, draft
     margins, thrust = np.zeros(n - 1), np.repeat(draft.u, n // len(draft.u), axis=0)
     for _ in range(RAISED):
@@ -153,7 +178,8 @@ def refined(grid, draft, violation):
 def ipopt(problem, limits, free_s, violation, given=None, fine=FINE):
     """Earliest reference that IPOPT finds on the fine grid; None if it finds none.
 
-    ``violation`` is a function of times (m,) and positions (m, 3) to the excess (m,). ``given`` is a further initial
+    ``violation`` is a function of times (m,) and positions (m, 3) to the excess (m,). ``given`` is
+    a further initial
     path: its end time, and functions of times (m,) to positions and thrust (m, 3).
     """
     motion, rate = motion_of(problem.scene)
@@ -168,4 +194,6 @@ def ipopt(problem, limits, free_s, violation, given=None, fine=FINE):
     drafts.sort(key=lambda draft: draft.t_s)
     grid = Transcription(problem, limits, free_s, motion, rate, fine)
     found = [refined(grid, draft, violation) for draft in drafts[:REFINED]]
-    return min((path for path in found if path is not None), key=lambda path: path.t_s, default=None)
+    return min(
+        (path for path in found if path is not None), key=lambda path: path.t_s, default=None
+    )

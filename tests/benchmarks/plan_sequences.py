@@ -2,9 +2,9 @@
 
     python tests/benchmarks/plan_sequences.py --count 1000
 
-Checked in every sequence: it ends in a capture or an abort, or the approach never began; the attempts are limited; a
-capture or an abort is final; a withdrawal comes no closer to the centre of mass than braking needs. Exit code 1 if a
-property does not hold.
+Checked in every sequence: it ends in a capture or an abort, or the approach never began; the
+attempts are limited; a capture or an abort is final; a withdrawal comes no closer to the centre of
+mass than braking needs. Exit code 1 if a property does not hold.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from test_plan_guidance import CENTRE, DRIFT, PARAMS, ROBOT, WITHDRAWN, flights
 
-from avsreplay.plan import Action
+from avsreplay.plan.supervisor import Action
 
 
 def broken(seed):
@@ -48,7 +48,9 @@ def broken(seed):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1000)
     args = parser.parse_args()

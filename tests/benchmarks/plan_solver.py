@@ -1,7 +1,8 @@
-"""The certified planner against an exhaustive search, an independent integration, and direct transcription.
+"""The certified planner against an exhaustive search, an independent integration, and direct
+transcription.
 
-python tests/benchmarks/plan_solver.py [--quick] [--casadi N]      (N problems also through CasADi + IPOPT)
-Times are of the process, so that other work on the machine does not count.
+python tests/benchmarks/plan_solver.py [--quick] [--casadi N]      (N problems also through CasADi +
+IPOPT) Times are of the process, so that other work on the machine does not count.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from plan_problems import problems
 from scipy.integrate import solve_ivp
 
 from avsreplay.outcome import PlanStatus
-from avsreplay.plan import CostatePath, PlanParams, rendezvous
+from avsreplay.plan.path import CostatePath
 from avsreplay.plan.reachable_set import gauge
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
 
 ORIGIN = np.zeros(3)
 HEAD = (
-    "set       problems  optimal  median_ms  worst_ms  later_s   missed  false_infeasible  split_sets  r_err_m"
-    "   v_err_mps  gap_s"
+    "set       problems  optimal  median_ms  worst_ms  later_s   missed  false_infeasible "
+    " split_sets  r_err_m   v_err_mps  gap_s"
 )
 
 
@@ -55,7 +57,12 @@ def flown(plan, goal):
         return np.r_[y[3:], flight.thrust(np.array([min(t, plan.t_go_s)]))[0]]
 
     dv = flight.p(np.array([0.0, plan.t_go_s]))
-    turn = float(np.clip(dv[0] @ (dv[0] - dv[1]) / max(np.sum((dv[0] - dv[1]) ** 2), 1e-300), 0.0, 1.0)) * plan.t_go_s
+    turn = (
+        float(
+            np.clip(dv[0] @ (dv[0] - dv[1]) / max(np.sum((dv[0] - dv[1]) ** 2), 1e-300), 0.0, 1.0)
+        )
+        * plan.t_go_s
+    )
     y, at = np.zeros(6), 0.0
     for stop in (turn, plan.t_go_s):
         if stop > at:
@@ -119,8 +126,9 @@ def measured(name, cases):
             compare.append((goal, a_max, plan.t_go_s, span))
     r, v = np.max(errors, axis=0)
     print(
-        f"{name:9s} {len(spans):8d} {optimal:8d} {1e3 * np.median(spans):10.2f} {1e3 * np.max(spans):9.2f}"
-        f" {np.max(later):8.1e} {missed:8d} {false_infeasible:17d} {split:11d} {r:9.1e} {v:10.1e} {np.max(gaps):7.1e}"
+        f"{name:9s} {len(spans):8d} {optimal:8d} {1e3 * np.median(spans):10.2f}"
+        f" {1e3 * np.max(spans):9.2f} {np.max(later):8.1e} {missed:8d} {false_infeasible:17d}"
+        f" {split:11d} {r:9.1e} {v:10.1e} {np.max(gaps):7.1e}"
     )
     return compare
 
@@ -139,9 +147,13 @@ def versus(compare):
     factor, late = np.array(theirs) / np.array(ours), np.array(late)
     print(f"\nCasADi + IPOPT, 50 nodes, {len(compare)} problems, failed {failed}")
     print(
-        f"  median {1e3 * np.median(theirs):.1f} ms; ours {np.median(factor):.0f}x faster (least {factor.min():.0f}x)"
+        f"  median {1e3 * np.median(theirs):.1f} ms; ours {np.median(factor):.0f}x faster (least"
+        f" {factor.min():.0f}x)"
     )
-    print(f"  IPOPT earlier in {beaten}; later by {np.median(late):.4f} s (median), {late.max():.2f} s (worst),")
+    print(
+        f"  IPOPT earlier in {beaten}; later by {np.median(late):.4f} s (median), {late.max():.2f}"
+        " s (worst),"
+    )
     print(f"  by more than 0.1 s in {np.sum(late > 0.1)}")
 
 

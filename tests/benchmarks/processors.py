@@ -1,16 +1,20 @@
-"""Are the results the same bytes on every processor? ``python tests/benchmarks/processors.py [--quick] [--qemu]``
+"""Are the results the same bytes on every processor? ``python tests/benchmarks/processors.py
+[--quick] [--qemu]``
 
-Replays the fixtures with every installed back end and records a scenario, each run in a process of its own, on this
-processor and on emulated ones, and compares ``rows.jsonl`` and the recorded log byte for byte. For each environment
-that differs it prints the first differing cells and the columns with the largest differences.
+Replays the fixtures with every installed back end and records a scenario, each run in a process of
+its own, on this processor and on emulated ones, and compares ``rows.jsonl`` and the recorded log
+byte for byte. For each environment that differs it prints the first differing cells and the columns
+with the largest differences.
 
-Two kinds of emulation. Environment variables choose the kernel of OpenBLAS, numpy's SIMD variants and the variants of
-glibc: quick, but the command itself sets these variables unless ``AVSREPLAY_ARITHMETIC=native`` (``--native``) asks it
-not to. ``--qemu`` runs the whole interpreter on an emulated processor (package qemu-user), which nothing in the process
-can override. ``--aarch64 PYTHON`` adds an interpreter for aarch64 with this project installed (``PYTHON`` may be a
-command line, for example ``qemu-aarch64 -L ROOT ROOT/usr/bin/python3``).
+Two kinds of emulation. Environment variables choose the kernel of OpenBLAS, numpy's SIMD variants
+and the variants of glibc: quick, but the command itself sets these variables unless
+``AVSREPLAY_ARITHMETIC=native`` (``--native``) asks it not to. ``--qemu`` runs the whole interpreter
+on an emulated processor (package qemu-user), which nothing in the process can override. ``--aarch64
+PYTHON`` adds an interpreter for aarch64 with this project installed (``PYTHON`` may be a command
+line, for example ``qemu-aarch64 -L ROOT ROOT/usr/bin/python3``).
 
-Exit code 1 if any compared run differs, except the back ends of others (``--exact`` names those that must agree).
+Exit code 1 if any compared run differs, except the back ends of others (``--exact`` names those
+that must agree).
 """
 
 from __future__ import annotations
@@ -44,38 +48,78 @@ AVX2 = f"AVX F16C FMA3 AVX2 X86_V3 {AVX512}"
 NO_FMA = "glibc.cpu.hwcaps=-AVX2_Usable,-FMA_Usable,-FMA4_Usable,-AVX2,-FMA,-FMA4"
 NO_AVX = f"{NO_FMA},-AVX_Usable,-AVX,-AVX512F,-ERMS"
 ENVIRONMENTS: dict[str, dict[str, str]] = {
-    **{f"BLAS {name}": {"OPENBLAS_CORETYPE": name}
-       for name in ("Prescott", "Core2", "Nehalem", "Sandybridge", "Haswell", "Zen", "SkylakeX", "Cooperlake")},
+    **{
+        f"BLAS {name}": {"OPENBLAS_CORETYPE": name}
+        for name in (
+            "Prescott",
+            "Core2",
+            "Nehalem",
+            "Sandybridge",
+            "Haswell",
+            "Zen",
+            "SkylakeX",
+            "Cooperlake",
+        )
+    },
     "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": AVX512},
     "numpy without AVX2": {"NPY_DISABLE_CPU_FEATURES": AVX2},
     "glibc without FMA": {"GLIBC_TUNABLES": NO_FMA},
     "glibc without AVX": {"GLIBC_TUNABLES": NO_AVX},
     "all as Haswell": {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": AVX512},
-    "all as Nehalem": {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": AVX2, "GLIBC_TUNABLES": NO_AVX},
-}  # fmt: skip
+    "all as Nehalem": {
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": AVX2,
+        "GLIBC_TUNABLES": NO_AVX,
+    },
+}
 QEMU = ("Nehalem", "Haswell")  # it emulates no AVX-512
 OVERRIDDEN = (*arithmetic.PINS, arithmetic.VARIABLE)
 
 
 def replay(python: list[str], case: str, out: Path, extra: dict[str, str]) -> bytes:
-    """``rows.jsonl`` of one run, or the log that a scenario gives. Raises SystemExit if the command fails."""
+    """``rows.jsonl`` of one run, or the log that a scenario gives.
+
+    Raises SystemExit if the command fails.
+    """
     name, *flags = CASES[case]
     command = "record" if name.endswith(".toml") else "run"
     out = out / f"{command}.mcap" if command == "record" else out / command
-    words = [*python, "-m", "avsreplay", command, str(ROOT / "fixtures" / name), "-o", str(out), "--overwrite", *flags]
+    words = [
+        *python,
+        "-m",
+        "avsreplay",
+        command,
+        str(ROOT / "fixtures" / name),
+        "-o",
+        str(out),
+        "--overwrite",
+        *flags,
+    ]
     env = {k: v for k, v in os.environ.items() if k not in OVERRIDDEN}
-    done = subprocess.run(words, cwd=ROOT, env={**env, **extra}, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=ROOT, env={**env, **extra}, capture_output=True, text=True, check=False
+    )
     if done.returncode not in (0, 4):
-        raise SystemExit(f"{shlex.join(words)}\nended with {done.returncode}:\n{done.stderr[-2000:]}")
+        raise SystemExit(
+            f"{shlex.join(words)}\nended with {done.returncode}:\n{done.stderr[-2000:]}"
+        )
     return out.read_bytes() if command == "record" else (out / "rows.jsonl").read_bytes()
 
 
 def difference(one: bytes, other: bytes) -> dict[str, object]:
     """What differs between two files of rows, or between two logs."""
     if not one.startswith(b"{"):
-        return {"bytes": sum(x != y for x, y in zip(one, other, strict=False)), "lengths": [len(one), len(other)]}
+        return {
+            "bytes": sum(x != y for x, y in zip(one, other, strict=False)),
+            "lengths": [len(one), len(other)],
+        }
     a, b = ([json.loads(line) for line in text.splitlines()] for text in (one, other))
-    cells = [(i, name) for i, (x, y) in enumerate(zip(a, b, strict=True)) for name in x if x[name] != y.get(name)]
+    cells = [
+        (i, name)
+        for i, (x, y) in enumerate(zip(a, b, strict=True))
+        for name in x
+        if x[name] != y.get(name)
+    ]
     largest: dict[str, float] = {}
     flags = 0
     for i, name in cells:
@@ -85,8 +129,13 @@ def difference(one: bytes, other: bytes) -> dict[str, object]:
         else:
             flags += 1
     worst = dict(sorted(largest.items(), key=lambda item: -item[1])[:6])
-    return {"cells": len(cells), "not numbers": flags, "rows": len({i for i, _ in cells}), "first": cells[:3],
-            "largest": {name: float(f"{value:.2g}") for name, value in worst.items()}}  # fmt: skip
+    return {
+        "cells": len(cells),
+        "not numbers": flags,
+        "rows": len({i for i, _ in cells}),
+        "first": cells[:3],
+        "largest": {name: float(f"{value:.2g}") for name, value in worst.items()},
+    }
 
 
 def environments(asked: argparse.Namespace) -> dict[str, tuple[list[str], dict[str, str]]]:
@@ -97,7 +146,9 @@ def environments(asked: argparse.Namespace) -> dict[str, tuple[list[str], dict[s
         found |= {name: (here, variables) for name, variables in ENVIRONMENTS.items()}
     if asked.qemu or asked.qemu_only:
         # The pins are set from outside: a process that replaces itself would leave the emulator.
-        found |= {f"qemu {cpu}": (["qemu-x86_64", "-cpu", cpu, *here], arithmetic.PINS) for cpu in QEMU}
+        found |= {
+            f"qemu {cpu}": (["qemu-x86_64", "-cpu", cpu, *here], arithmetic.PINS) for cpu in QEMU
+        }
     if asked.aarch64:
         found["aarch64"] = (shlex.split(asked.aarch64), {})
     if asked.quick:
@@ -108,13 +159,21 @@ def environments(asked: argparse.Namespace) -> dict[str, tuple[list[str], dict[s
 
 def main() -> int:
     """Run and print one JSON document per run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--exact", nargs="*", default=list(EXACT), help="cases that must agree byte for byte")
-    parser.add_argument("--qemu", action="store_true", help="also on processors emulated by qemu-user")
+    parser.add_argument(
+        "--exact", nargs="*", default=list(EXACT), help="cases that must agree byte for byte"
+    )
+    parser.add_argument(
+        "--qemu", action="store_true", help="also on processors emulated by qemu-user"
+    )
     parser.add_argument("--qemu-only", action="store_true", help="only those")
     parser.add_argument("--aarch64", help="command line of a Python interpreter for aarch64")
-    parser.add_argument("--native", action="store_true", help="let the libraries choose their arithmetic")
+    parser.add_argument(
+        "--native", action="store_true", help="let the libraries choose their arithmetic"
+    )
     parser.add_argument("--quick", action="store_true", help="two environments")
     asked = parser.parse_args()
     wrong = 0

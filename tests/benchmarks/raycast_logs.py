@@ -1,24 +1,27 @@
-"""Whole runs on logs made without code of avsreplay: own dynamics, ray casting by Embree, written by rosbags.
+"""Whole runs on logs made without code of avsreplay: own dynamics, ray casting by Embree, written
+by rosbags.
 
-python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1] [--mesh FILE]
-    [--origin METRES] [--keep FOLDER]
+python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1]
+    [--mesh FILE] [--origin METRES] [--keep FOLDER]
 
-The target is a spacecraft of primitives of trimesh (body, two panels, dish, boom) with random sizes, or the mesh of
-FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres, with its origin METRES off the centre.
-Its inertia tensor and its mass centre are random, its motion is integrated from the full tensor with DOP853, and 80 x
-80 rays with 2 mm range noise (1 sigma) give the scans at HZ for SECONDS. A case adds an event:
+The target is a spacecraft of primitives of trimesh (body, two panels, dish, boom) with random
+sizes, or the mesh of FILE, enlarged to a diagonal of 4 m. It is written as an STL file in
+millimetres, with its origin METRES off the centre. Its inertia tensor and its mass centre are
+random, its motion is integrated from the full tensor with DOP853, and 80 x 80 rays with 2 mm range
+noise (1 sigma) give the scans at HZ for SECONDS. A case adds an event:
 
 clean   none                                    wall    a wall behind the target, half of all points
-push    velocity step of 10 mm/s at 44.8 s      turn    rate step of 0.01 rad/s at 44.8 s
-bias    range bias of 50 mm from 45 s to 60 s   drift   constant torque of 1e-4 rad/s^2 of angular acceleration
-block   no target between 45 s and 57 s         noise   range noise five times as large from 45 s to 65 s
-first   range bias of 150 mm for the first 10 s
+push    velocity step of 10 mm/s at 44.8 s      turn    rate step of 0.01 rad/s at 44.8 s bias
+range bias of 50 mm from 45 s to 60 s   drift   constant torque of 1e-4 rad/s^2 of angular
+acceleration block   no target between 45 s and 57 s         noise   range noise five times as large
+from 45 s to 65 s first   range bias of 150 mm for the first 10 s
 
-The program runs ``avsreplay run`` on each log as a user would and prints, per log: the verdict; manoeuvres that the run
-reports; scans outside the event that were flagged; healthy scans whose error is beyond 4 claimed sigma, converged or
-not; scans for which convergence is claimed; the rms error of the estimate where convergence is claimed, and the median
-NEES per degree of freedom of the mass centre's position and velocity there (0.79 if consistent, the median of the
-chi-square distribution with 3 degrees of freedom, divided by 3); t_1; processor time per scan.
+The program runs ``avsreplay run`` on each log as a user would and prints, per log: the verdict;
+manoeuvres that the run reports; scans outside the event that were flagged; healthy scans whose
+error is beyond 4 claimed sigma, converged or not; scans for which convergence is claimed; the rms
+error of the estimate where convergence is claimed, and the median NEES per degree of freedom of the
+mass centre's position and velocity there (0.79 if consistent, the median of the chi-square
+distribution with 3 degrees of freedom, divided by 3); t_1; processor time per scan.
 """
 
 from __future__ import annotations
@@ -75,12 +78,17 @@ HEADS = (
 
 
 def spacecraft(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A body with two panels, a dish and a boom; parts overlap, so that the mesh has interior faces."""
+    """A body with two panels, a dish and a boom.
+
+    Parts overlap, so that the mesh has interior faces.
+    """
     x, y, z = rng.uniform([0.9, 0.8, 1.0], [1.4, 1.2, 1.8])
     parts = [trimesh.creation.box((x, y, z))]
     for side, length in ((-1, rng.uniform(0.8, 1.3)), (1, rng.uniform(1.2, 1.8))):
         panel = trimesh.creation.box((length, 0.03, rng.uniform(0.5, 0.9)))
-        panel.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0.1, 0.5), (1, 0, 0)))
+        panel.apply_transform(
+            trimesh.transformations.rotation_matrix(rng.uniform(0.1, 0.5), (1, 0, 0))
+        )
         panel.apply_translation((side * (x / 2 + 0.25 + length / 2), 0, rng.uniform(-0.2, 0.2)))
         yoke = trimesh.creation.cylinder(0.03, 0.6, sections=12)
         yoke.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)))
@@ -107,9 +115,11 @@ def of_file(path: Path) -> trimesh.Trimesh:
 def motion(
     rng: np.random.Generator, times: np.ndarray, case: str, rate: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pose of the model's frame in the camera's frame, and motion of the mass centre, at ``times`` [s].
+    """Pose of the model's frame in the camera's frame, and motion of the mass centre, at ``times``
+    [s].
 
-    Returns rotations (n, 3, 3), positions (n, 3) [m], and position and velocity of the mass centre (n, 6) [m, m/s].
+    Returns rotations (n, 3, 3), positions (n, 3) [m], and position and velocity of the mass centre
+    (n, 6) [m, m/s].
     """
     masses = rng.dirichlet((2, 2, 2))
     axes = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
@@ -126,7 +136,12 @@ def motion(
         turn, w = s[:9].reshape(3, 3), s[9:12]
         cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
         return np.concatenate(
-            [(turn @ cross).ravel(), np.linalg.solve(tensor, -np.cross(w, tensor @ w)) + torque, s[15:], np.zeros(3)]
+            [
+                (turn @ cross).ravel(),
+                np.linalg.solve(tensor, -np.cross(w, tensor @ w)) + torque,
+                s[15:],
+                np.zeros(3),
+            ]
         )
 
     state = np.concatenate([start.ravel(), spin, place + start @ arm, speed])
@@ -135,7 +150,13 @@ def motion(
     for part in (times[times < EVENT_S], times[times >= EVENT_S]) if stepped else (times,):
         end = EVENT_S if stepped and not found else times[-1] + 1e-6
         flow = solve_ivp(
-            slope, (done, end), state, method="DOP853", t_eval=np.append(part, end), rtol=1e-11, atol=1e-12
+            slope,
+            (done, end),
+            state,
+            method="DOP853",
+            t_eval=np.append(part, end),
+            rtol=1e-11,
+            atol=1e-12,
         )
         found.append(flow.y[:, :-1].T)
         state, done = flow.y[:, -1].copy(), end
@@ -148,7 +169,9 @@ def motion(
 
 
 def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
-    """Write ``log`` (a ROS 2 bag), ``model.stl`` and ``centre.npy`` (motion of the mass centre) to ``folder``."""
+    """Write ``log`` (a ROS 2 bag), ``model.stl`` and ``centre.npy`` (motion of the mass centre) to
+    ``folder``.
+    """
     rng = np.random.default_rng([seed, 77])
     mesh = spacecraft(rng) if asked.mesh is None else of_file(asked.mesh)
     mm = mesh.copy()
@@ -166,15 +189,24 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
             points_rays = rays[rows]
             begin, end = EVENTS.get(case, (0.0, 0.0))
             inside = begin <= t_s < end
-            ranges += 0.002 * (5.0 if case == "noise" and inside else 1.0) * rng.normal(size=len(ranges))
+            ranges += (
+                0.002 * (5.0 if case == "noise" and inside else 1.0) * rng.normal(size=len(ranges))
+            )
             ranges += {"bias": 0.05, "first": 0.15}.get(case, 0.0) * inside
             points = ranges[:, None] * points_rays
             if case == "block" and inside:
-                points = np.column_stack([rng.uniform(-1, 1, (300, 2)), 2.0 + 0.01 * rng.normal(size=300)])
+                points = np.column_stack(
+                    [rng.uniform(-1, 1, (300, 2)), 2.0 + 0.01 * rng.normal(size=300)]
+                )
             if case == "wall":
                 n = len(points)
                 points = np.concatenate(
-                    [points, np.column_stack([rng.uniform(-4, 4, (n, 2)), 10 + 0.003 * rng.normal(size=n)])]
+                    [
+                        points,
+                        np.column_stack(
+                            [rng.uniform(-4, 4, (n, 2)), 10 + 0.003 * rng.normal(size=n)]
+                        ),
+                    ]
                 )
             write(t_s, points, turn, place - asked.origin * turn[:, 0])
 
@@ -189,7 +221,9 @@ def ray_grid(half_deg: float, count: int) -> np.ndarray:
 def cast(
     caster: RayMeshIntersector, rays: np.ndarray, turn: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ranges (k,) [m] of the rays that hit the body in a pose, their numbers and the faces that they hit."""
+    """Ranges (k,) [m] of the rays that hit the body in a pose, their numbers and the faces that
+    they hit.
+    """
     hits, rows, faces = caster.intersects_location(
         np.tile(-place @ turn, (len(rays), 1)), rays @ turn, multiple_hits=False
     )
@@ -198,28 +232,41 @@ def cast(
 
 @contextmanager
 def recorded(path: Path) -> Iterator[Callable[[float, np.ndarray, np.ndarray, np.ndarray], None]]:
-    """A ROS 2 bag; the function writes a scan and its true pose: time [s], points, rotation and position."""
+    """A ROS 2 bag; the function writes a scan and its true pose.
+
+    Time [s], points, rotation and position.
+    """
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
         poses = bag.add_connection("/truth/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
 
         def write(t_s: float, points: np.ndarray, turn: np.ndarray, place: np.ndarray) -> None:
             ns = START_NS + round(t_s * 1e9)
-            bag.write(clouds, ns, STORE.serialize_cdr(cloud(ns, points), "sensor_msgs/msg/PointCloud2"))
-            bag.write(poses, ns, STORE.serialize_cdr(stamped(ns, turn, place), "geometry_msgs/msg/PoseStamped"))
+            bag.write(
+                clouds, ns, STORE.serialize_cdr(cloud(ns, points), "sensor_msgs/msg/PointCloud2")
+            )
+            bag.write(
+                poses,
+                ns,
+                STORE.serialize_cdr(stamped(ns, turn, place), "geometry_msgs/msg/PoseStamped"),
+            )
 
         yield write
 
 
 def header(ns: int) -> object:
     """A std_msgs Header."""
-    return TYPES["std_msgs/msg/Header"](TYPES["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9), "lidar")
+    return TYPES["std_msgs/msg/Header"](
+        TYPES["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9), "lidar"
+    )
 
 
 def cloud(ns: int, points: np.ndarray) -> object:
     """A PointCloud2 with x, y, z as float32."""
     data = np.frombuffer(points.astype("<f4").tobytes(), np.uint8)
-    fields = [TYPES["sensor_msgs/msg/PointField"](name, 4 * k, 7, 1) for k, name in enumerate("xyz")]
+    fields = [
+        TYPES["sensor_msgs/msg/PointField"](name, 4 * k, 7, 1) for k, name in enumerate("xyz")
+    ]
     return TYPES["sensor_msgs/msg/PointCloud2"](
         header(ns), 1, len(points), fields, False, 12, 12 * len(points), data, True
     )
@@ -235,7 +282,9 @@ def stamped(ns: int, turn: np.ndarray, place: np.ndarray) -> object:
 
 
 def changed(change: dict, name: str, unit: str) -> str:
-    """A reported step of the velocity or of the rate with its 1 sigma, in 1e-3 of its unit, and its time."""
+    """A reported step of the velocity or of the rate with its 1 sigma, in 1e-3 of its unit, and its
+    time.
+    """
     size, sigma = change[f"{name}_{unit}"], change[f"{name}_1s_{unit}"]
     return f"{1e3 * size:.2f} +- {1e3 * sigma:.2f} at {change['t_s']:.2f} s"
 
@@ -256,7 +305,9 @@ def examine(folder: Path, case: str, seed: int) -> list[str]:
     ]
     crop = ["--crop-range", "0,9.3"] if case == "wall" else []
     done = subprocess.run(
-        [*command, *crop, "-o", str(folder / "result"), "--overwrite", "--json"], capture_output=True, check=False
+        [*command, *crop, "-o", str(folder / "result"), "--overwrite", "--json"],
+        capture_output=True,
+        check=False,
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
@@ -270,13 +321,19 @@ def examine(folder: Path, case: str, seed: int) -> list[str]:
         if row["converged"]:
             for name, at, of in (("position", 6, 7), ("velocity", 9, 10)):
                 error = beliefs["x"][k, of : of + 3] - centre[row["seq"], at - 6 : at - 3]
-                nees[name].append(error @ np.linalg.solve(beliefs["P"][k, at : at + 3, at : at + 3], error) / 3)
+                nees[name].append(
+                    error @ np.linalg.solve(beliefs["P"][k, at : at + 3, at : at + 3], error) / 3
+                )
     begin, end = EVENTS.get(case, (0.0, 0.0))
     flagged = [begin <= row["t_s"] < end for row in rows if row["gamma"] == 0]
-    beyond = [max(row["pos_err_m"] / row["pos_1s_m"], row["rot_err_deg"] / row["rot_1s_deg"]) > 4 for row in rows]
+    beyond = [
+        max(row["pos_err_m"] / row["pos_1s_m"], row["rot_err_deg"] / row["rot_1s_deg"]) > 4
+        for row in rows
+    ]
     converged = [row for row in rows if row["converged"]]
     changes = " ".join(
-        changed(c, "velocity", "mps") + ", " + changed(c, "rate", "radps") for c in summary["velocity_changes"]
+        changed(c, "velocity", "mps") + ", " + changed(c, "rate", "radps")
+        for c in summary["velocity_changes"]
     )
     rms = [
         np.sqrt(np.mean([row[name] ** 2 for row in converged])) if converged else np.nan
@@ -305,15 +362,26 @@ def examine(folder: Path, case: str, seed: int) -> list[str]:
 
 def main() -> None:
     """Make the logs, run avsreplay on each and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--seconds", type=float, default=100.0)
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="mean rate of the targets [rad/s]")
-    parser.add_argument("--mesh", type=Path, help="mesh of the target, in place of random spacecraft")
-    parser.add_argument("--origin", type=float, default=0.0, help="distance of the model's origin from its centre [m]")
-    parser.add_argument("--keep", type=Path, help="write the logs and results to this folder and keep them")
+    parser.add_argument(
+        "--mesh", type=Path, help="mesh of the target, in place of random spacecraft"
+    )
+    parser.add_argument(
+        "--origin",
+        type=float,
+        default=0.0,
+        help="distance of the model's origin from its centre [m]",
+    )
+    parser.add_argument(
+        "--keep", type=Path, help="write the logs and results to this folder and keep them"
+    )
     asked = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS), flush=True)
     with tempfile.TemporaryDirectory() as scratch:

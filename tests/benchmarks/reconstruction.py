@@ -1,11 +1,13 @@
-"""Accuracy of reconstructed models: poses against ground truth, surface against the CAD model, processor time.
+"""Accuracy of reconstructed models: poses against ground truth, surface against the CAD model,
+processor time.
 
-    python tests/benchmarks/reconstruction.py                 # the built-in scenario and the scans of ../shared/data
-    python tests/benchmarks/reconstruction.py LOG --every 4   # a log that carries model and ground truth
-    python tests/benchmarks/reconstruction.py LOG --beside    # KISS-ICP and small_gicp odometry, and replays, beside it
+    python tests/benchmarks/reconstruction.py                 # the built-in scenario and the scans
+    of ../shared/data python tests/benchmarks/reconstruction.py LOG --every 4   # a log that carries
+    model and ground truth python tests/benchmarks/reconstruction.py LOG --beside    # KISS-ICP and
+    small_gicp odometry, and replays, beside it
 
-The ground truth is used for the comparison only. The frames are related by the mean of the constant transformations
-between true and reconstructed poses.
+The ground truth is used for the comparison only. The frames are related by the mean of the constant
+transformations between true and reconstructed poses.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from avsreplay import geometry
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.reconstruct import reconstruct
+from avsreplay.reconstruct.reconstruction import reconstruct
 from avsreplay.reconstruct.views import extent_of
 from avsreplay.record import RecordOptions, record
 from avsreplay.register.surface_index import SurfaceIndex
@@ -50,11 +52,17 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("log", nargs="?", type=Path)
-    parser.add_argument("--every", type=int, default=4, help="take every N-th scan of a simulated log")
+    parser.add_argument(
+        "--every", type=int, default=4, help="take every N-th scan of a simulated log"
+    )
     parser.add_argument("--scans", type=int, default=60, help="at most so many")
-    parser.add_argument("--beside", action="store_true", help="also odometry alone, and replays with both models")
+    parser.add_argument(
+        "--beside", action="store_true", help="also odometry alone, and replays with both models"
+    )
     parser.add_argument("--model", type=Path, help="CAD model, for a log that carries none")
     options = parser.parse_args()
     if options.log:
@@ -65,7 +73,11 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "built-in.mcap"
-        subprocess.run([sys.executable, "-m", "avsreplay", "record", "-o", log], check=True, capture_output=True)
+        subprocess.run(
+            [sys.executable, "-m", "avsreplay", "record", "-o", log],
+            check=True,
+            capture_output=True,
+        )
         report(log, SourceOptions(every=options.every, n_scans=options.scans))
         for name, distance_m, noise_m in (("HST", 22.0, 0.02), ("Kepler", 8.0, 0.01)):
             mesh = DATA / "spacecraft-meshes" / f"{name}.obj"
@@ -74,7 +86,10 @@ def main() -> None:
                 scenario.write_text(SPACECRAFT.format(distance_m=distance_m, noise_m=noise_m))
                 record(scenario, log, options=RecordOptions(model=mesh))
                 report(log, SourceOptions(n_scans=options.scans))
-    for name, model in (("stanford-dragon", "dragon_vrip_res3.ply"), ("stanford-bunny", "bun_zipper.ply")):
+    for name, model in (
+        ("stanford-dragon", "dragon_vrip_res3.ply"),
+        ("stanford-bunny", "bun_zipper.ply"),
+    ):
         if (DATA / name).is_dir():
             report(DATA / name, SourceOptions(model=DATA / name / model))
         else:
@@ -102,15 +117,17 @@ def report(log: Path, options: SourceOptions) -> None:
     surface_m = np.sqrt(np.minimum(d2, reach**2))
     rms = np.sqrt(np.mean(errors**2, axis=0))
     print(
-        f"{log.name}: {made.used} of {made.offered} scans, {made.searches} searches, pose rms {1e3 * rms[0]:.2f} mm "
-        f"{rms[1]:.3f} deg, surface median {1e3 * np.median(surface_m):.2f} mm, "
-        f"95 % {1e3 * np.quantile(surface_m, 0.95):.2f} mm, "
-        f"coverage {100 * made.coverage:.0f} %, {spent:.1f} s"
+        f"{log.name}: {made.used} of {made.offered} scans, {made.searches} searches, pose rms"
+        f" {1e3 * rms[0]:.2f} mm {rms[1]:.3f} deg, surface median {1e3 * np.median(surface_m):.2f}"
+        f" mm, 95 % {1e3 * np.quantile(surface_m, 0.95):.2f} mm, coverage {100 * made.coverage:.0f}"
+        f" %, {spent:.1f} s"
     )
 
 
 def beside(log: Path, options: SourceOptions) -> None:
-    """Print the pose errors of two odometries on the same scans, and of replays with the CAD model and without it."""
+    """Print the pose errors of two odometries on the same scans, and of replays with the CAD model
+    and without it.
+    """
     with open_source(log, options) as source:
         scans = [scan for scan in source.scans() if len(scan.points) >= 100]
         truth = [source.truth_of(scan).pose for scan in scans]
@@ -118,19 +135,29 @@ def beside(log: Path, options: SourceOptions) -> None:
     extent = float(np.median([extent_of(cloud[:: max(1, len(cloud) // 3000)]) for cloud in clouds]))
     for name, odometry in (("KISS-ICP", kiss_poses), ("small_gicp, scan to scan", gicp_poses)):
         poses = odometry(clouds, extent)
-        print(f"  {name}: {_errors([(true, T) for true, T in zip(truth, poses, strict=True) if true is not None])}")
+        print(
+            f"  {name}:"
+            f" {_errors([(true, T) for true, T in zip(truth, poses, strict=True) if true is not None])}"
+        )
     for name, model in (("CAD model", options.model), ("model auto", Path("auto"))):
         begun = time.process_time()
         with Run(Job(source=log, options=replace(options, model=model))) as run:
             found: list[tuple[Pose, Pose]] = []
 
             def healthy(scan: ReplayedScan, found: list[tuple[Pose, Pose]] = found) -> None:
-                if scan.row.gamma and scan.truth.pose is not None and scan.outcome.alignment is not None:
+                if (
+                    scan.row.gamma
+                    and scan.truth.pose is not None
+                    and scan.outcome.alignment is not None
+                ):
                     found.append((scan.truth.pose, scan.outcome.alignment.T_ac))
 
             count = sum(1 for _ in run.rows([healthy]))
         spent = (time.process_time() - begun) / max(count, 1)
-        print(f"  replay, {name}: {len(found)} of {count} healthy, {_errors(found)}, {1e3 * spent:.0f} ms a scan")
+        print(
+            f"  replay, {name}: {len(found)} of {count} healthy, {_errors(found)},"
+            f" {1e3 * spent:.0f} ms a scan"
+        )
 
 
 def _errors(pairs: list[tuple[Pose, Pose]]) -> str:
@@ -141,7 +168,9 @@ def _errors(pairs: list[tuple[Pose, Pose]]) -> str:
 
 
 def kiss_poses(clouds: list[np.ndarray], extent: float) -> list[Pose]:
-    """Poses T_ac by KISS-ICP with its adaptive threshold and its voxel map, the target taken as the world."""
+    """Poses T_ac by KISS-ICP with its adaptive threshold and its voxel map, the target taken as the
+    world.
+    """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
 
@@ -164,9 +193,14 @@ def gicp_poses(clouds: list[np.ndarray], extent: float) -> list[Pose]:
     poses = [Pose(geometry.IDENTITY_QUAT, centre)]
     for before, cloud in pairwise(clouds):
         found = small_gicp.align(
-            before - centre, cloud - centre, moved, registration_type="GICP", downsampling_resolution=extent / 100.0,
-            max_correspondence_distance=0.06 * extent, num_threads=1,
-        )  # fmt: skip
+            before - centre,
+            cloud - centre,
+            moved,
+            registration_type="GICP",
+            downsampling_resolution=extent / 100.0,
+            max_correspondence_distance=0.06 * extent,
+            num_threads=1,
+        )
         moved = found.T_target_source
         T = T @ moved
         poses.append(Pose(geometry.IDENTITY_QUAT, centre) @ _pose(np.linalg.inv(T)))

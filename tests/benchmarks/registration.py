@@ -1,10 +1,12 @@
-"""Registration against a fixed model: ours and the peers on the same inputs, one process, in turn, medians of ratios.
+"""Registration against a fixed model: ours and the peers on the same inputs, one process, in turn,
+medians of ratios.
 
-    python tests/benchmarks/registration.py [--quick] [--model 100000] [--scan 10000] [--reps 7] [--only index,passes]
+    python tests/benchmarks/registration.py [--quick] [--model 100000] [--scan 10000] [--reps 7]
+    [--only index,passes]
 
-The target is the built-in satellite; the scan is ray-cast from one side with 1 cm noise and a share of outliers.
-Structures of the model are built beforehand; the scan covariances of GICP are part of its work. Peers that are not
-installed are left out and named.
+The target is the built-in satellite; the scan is ray-cast from one side with 1 cm noise and a share
+of outliers. Structures of the model are built beforehand; the scan covariances of GICP are part of
+its work. Peers that are not installed are left out and named.
 """
 
 from __future__ import annotations
@@ -45,14 +47,16 @@ from avsreplay.register import quality
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
-from avsreplay.simulate import builtin_surface
+from avsreplay.simulate.target import builtin_surface
 
 EPS_RAD, EPS_M = 1e-5, 1e-5
 STARTS = ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05), (0.0, 10.0, 0.15))  # outliers, deg, m
 
 
 def fixed(n_max: int, n_plane: int = 0, **more: Any) -> IcpParams:
-    return IcpParams(n_max=n_max, n_plane=n_plane, tighten=0.0, eps_rad=0.0, eps_m=0.0, newton=False, **more)
+    return IcpParams(
+        n_max=n_max, n_plane=n_plane, tighten=0.0, eps_rad=0.0, eps_m=0.0, newton=False, **more
+    )
 
 
 def settled(n_plane: int = 3, **more: Any) -> IcpParams:
@@ -62,7 +66,10 @@ def settled(n_plane: int = 3, **more: Any) -> IcpParams:
 def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     """Build time and memory."""
     print(f"\nindex, reach {REACH_M} m")
-    jobs: list[tuple[str, Surface, float]] = [("built-in mesh", surface, REACH_M), (cloud.name, cloud, REACH_M)]
+    jobs: list[tuple[str, Surface, float]] = [
+        ("built-in mesh", surface, REACH_M),
+        (cloud.name, cloud, REACH_M),
+    ]
     if not args.quick:
         jobs.append(("500000 points", sample(surface, 500_000, 1), REACH_M))
     hubble = shared("spacecraft-meshes", "HST.obj")
@@ -75,7 +82,9 @@ def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
             model = SurfaceIndex.build(target, reach)
             clock.append(time.perf_counter() - start)
             processor.append(time.process_time() - busy)
-        times = f"{statistics.median(clock):7.3f} s, processor {statistics.median(processor):7.3f} s"
+        times = (
+            f"{statistics.median(clock):7.3f} s, processor {statistics.median(processor):7.3f} s"
+        )
         print(f"{name:28} {times} {model.nbytes / 1e6:8.1f} MB")
 
 
@@ -111,16 +120,26 @@ def converged(cloud: Surface, surface: Surface, args: argparse.Namespace) -> Non
         scan, truth = look(surface, args.scan, outliers, 3)
         guess = off(truth, deg, metres, 4)
         cases = {
-            "ours, mesh, sides that face the camera": Case(ours(mesh, scan, guess, settled(facing=True))),
-            "the same, Horn only": Case(ours(mesh, scan, guess, settled(0, facing=True, newton=False))),
+            "ours, mesh, sides that face the camera": Case(
+                ours(mesh, scan, guess, settled(facing=True))
+            ),
+            "the same, Horn only": Case(
+                ours(mesh, scan, guess, settled(0, facing=True, newton=False))
+            ),
             "ours, mesh, both sides": Case(ours(mesh, scan, guess, settled())),
-            "ours, mesh, both sides, gate not tightened": Case(ours(mesh, scan, guess, settled(tighten=0.0))),
+            "ours, mesh, both sides, gate not tightened": Case(
+                ours(mesh, scan, guess, settled(tighten=0.0))
+            ),
             "ours, cloud": Case(ours(model, scan, guess, settled())),
         }
         makers = {
             "small_gicp GICP": partial(small_gicp, points, scan, guess, "GICP", 200, EPS_RAD),
-            "small_gicp PLANE_ICP": partial(small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD),
-            "Open3D point-to-plane (its own threads)": partial(open3d_plane, points, normals, scan, guess),
+            "small_gicp PLANE_ICP": partial(
+                small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD
+            ),
+            "Open3D point-to-plane (its own threads)": partial(
+                open3d_plane, points, normals, scan, guess
+            ),
         }
         cases.update(peers(makers))
         in_turn(cases, args.reps)
@@ -129,7 +148,9 @@ def converged(cloud: Surface, surface: Surface, args: argparse.Namespace) -> Non
 
 
 def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Nanoseconds a point of one fused pass, searched and kept, and what a second thread gives at 50k points."""
+    """Nanoseconds a point of one fused pass, searched and kept, and what a second thread gives at
+    50k points.
+    """
     print("\nfused pass, processor ns a point, one thread (start 0.5 deg, no outliers)")
     scan, truth = look(surface, args.scan, 0.0, 3)
     guess = off(truth, 0.5, 0.01, 4)
@@ -138,8 +159,12 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         still = Pose.from_matrix(model.icp(scan, guess, fixed(60)).T_ca)
         cases = {}
         for kind, n_plane in (("point", 0), ("plane", 20)):
-            cases[f"{kind}, searched"] = Case(ours(model, scan, guess, fixed(20, n_plane, keep=False)))
-            cases[f"{kind}, kept (from the fixed point)"] = Case(ours(model, scan, still, fixed(20, n_plane)))
+            cases[f"{kind}, searched"] = Case(
+                ours(model, scan, guess, fixed(20, n_plane, keep=False))
+            )
+            cases[f"{kind}, kept (from the fixed point)"] = Case(
+                ours(model, scan, still, fixed(20, n_plane))
+            )
         in_turn(cases, args.reps)
         for kind, case in cases.items():
             nanoseconds = (1e9 * f(case.cpu) / 20 / len(scan) for f in (statistics.median, min))
@@ -148,7 +173,9 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     guess = off(truth, 3.0, 0.05, 4)
     for name, target in (("cloud", cloud), ("mesh", surface)):
         model = SurfaceIndex.build(target, REACH_M)
-        cases = {f"{t} threads": Case(ours(model, many, guess, fixed(20, threads=t))) for t in (1, 2)}
+        cases = {
+            f"{t} threads": Case(ours(model, many, guess, fixed(20, threads=t))) for t in (1, 2)
+        }
         in_turn(cases, args.reps)
         gain = ratio(*(c.seconds for c in cases.values()))
         same = np.array_equal(cases["1 threads"].T_ca, cases["2 threads"].T_ca)
@@ -156,10 +183,11 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 
 def accuracy(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Errors of the poses over many sides, of `Registrar.register` and of the peers on the same scans.
+    """Errors of the poses over many sides, of `Registrar.register` and of the peers on the same
+    scans.
 
-    A ratio is the error of `register` over that of the peer on the same scan. The range is that of one standard error
-    of the median, from the order of the ratios.
+    A ratio is the error of `register` over that of the peer on the same scan. The range is that of
+    one standard error of the median, from the order of the ratios.
     """
     for mesh in [*real_meshes(surface, args), stage()]:
         registrar = Registrar(mesh, RegisterParams(index_cache=False))
@@ -167,12 +195,19 @@ def accuracy(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None
         for start in STARTS[:2]:
             sides = range(3 if args.quick else args.views)
             found = [_errors(registrar, mesh, points, start, side, args) for side in sides]
-            print(f"\n{mesh.name}, outliers {start[0]:.0%}, start {start[1]} deg: median errors, {len(found)} sides")
+            print(
+                f"\n{mesh.name}, outliers {start[0]:.0%}, start {start[1]} deg: median errors,"
+                f" {len(found)} sides"
+            )
             for name in found[0]:
                 each = np.array([errors[name] for errors in found])
                 deg, mm = np.median(each, axis=0)
                 ratios = np.array([errors["register"] for errors in found]) / each
-                text = "" if name == "register" else f"{_median(ratios[:, 0])} deg  {_median(ratios[:, 1])} mm"
+                text = (
+                    ""
+                    if name == "register"
+                    else f"{_median(ratios[:, 0])} deg  {_median(ratios[:, 1])} mm"
+                )
                 print(f"{name:12} {deg:8.4f} deg {mm:7.3f} mm   {text}", flush=True)
 
 
@@ -184,14 +219,21 @@ def _errors(
     side: int,
     args: argparse.Namespace,
 ) -> dict[str, tuple[float, float]]:
-    """The error of each method in the motions that `register` reports as determined by this view."""
+    """The error of each method in the motions that `register` reports as determined by this
+    view.
+    """
     scan, truth = look(mesh, args.scan, start[0], side, partial(_ranges, registrar))
     guess = off(truth, *start[1:], 100 + side)
     found = registrar.register(scan, guess.inverse())
     kinds = ("GICP", "PLANE_ICP")
     makers = {kind: partial(small_gicp, points, scan, guess, kind, 200, EPS_RAD) for kind in kinds}
-    poses = {"register": found.T_ac.inverse().matrix, **{name: case.run()[0] for name, case in peers(makers)}}
-    return {name: determined_error(T_ca, truth, found.free, mesh.extent) for name, T_ca in poses.items()}
+    poses = {
+        "register": found.T_ac.inverse().matrix,
+        **{name: case.run()[0] for name, case in peers(makers)},
+    }
+    return {
+        name: determined_error(T_ca, truth, found.free, mesh.extent) for name, T_ca in poses.items()
+    }
 
 
 def _ranges(registrar: Registrar, eye: Array, rays: Array) -> Array:
@@ -205,7 +247,10 @@ def _median(x: Array) -> str:
 
 
 def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Six meshes: index, one searched pass, and the whole of Registrar.register against the peers' registration."""
+    """Six meshes.
+
+    Index, one searched pass, and the whole of Registrar.register against the peers' registration.
+    """
     for mesh in [*real_meshes(surface, args), stage()]:
         one_mesh(mesh, args)
 
@@ -223,8 +268,13 @@ def real_meshes(surface: Surface, args: argparse.Namespace) -> list[Surface]:
 
 
 def fixed_point(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Passes of an alignment over sides and starts, and the distance of its result from the fixed point."""
-    print("\npasses over all points: least, median, most; alignments with more than 12; distance to the fixed point")
+    """Passes of an alignment over sides and starts, and the distance of its result from the fixed
+    point.
+    """
+    print(
+        "\npasses over all points: least, median, most; alignments with more than 12; distance to"
+        " the fixed point"
+    )
     for mesh in real_meshes(surface, args):
         registrar = Registrar(mesh, RegisterParams(index_cache=False))
         rule = registrar._backend._rules[True]
@@ -239,8 +289,14 @@ def fixed_point(cloud: Surface, surface: Surface, args: argparse.Namespace) -> N
                 apart = Pose.from_matrix(fit.T_ca).inverse() @ Pose.from_matrix(end.T_ca)
                 far.append(np.degrees(geometry.angle(apart.q)))
             most = sum(n > 12 for n in passes)
-            counts = f"{min(passes):2} {statistics.median(passes):4} {max(passes):3}, {most} of {len(passes)}"
-            print(f"{mesh.name:24} {deg:4} deg {outliers:3.0%}: {counts}; {np.median(far):.0e} to {max(far):.0e} deg")
+            counts = (
+                f"{min(passes):2} {statistics.median(passes):4} {max(passes):3}, {most} of"
+                f" {len(passes)}"
+            )
+            print(
+                f"{mesh.name:24} {deg:4} deg {outliers:3.0%}: {counts}; {np.median(far):.0e} to"
+                f" {max(far):.0e} deg"
+            )
 
 
 def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
@@ -250,8 +306,8 @@ def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
     built = time.process_time() - busy
     clock = time.perf_counter() - start
     print(
-        f"\n{mesh.name}: {len(mesh.faces)} triangles; index {built:.3f} s ({clock:.3f} by the clock), "
-        f"{index.nbytes / 1e6:.1f} MB"
+        f"\n{mesh.name}: {len(mesh.faces)} triangles; index {built:.3f} s ({clock:.3f} by the"
+        f" clock), {index.nbytes / 1e6:.1f} MB"
     )
     registrar, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
     points = sample(mesh, args.model, 1).vertices
@@ -263,12 +319,18 @@ def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
             "register, 1 thread": Case(registered(registrar, scan, guess)),
             "register, 2 threads": Case(registered(two, scan, guess)),
             "  align alone": Case(aligned(registrar, scan, guess)),
-            "  20 searched passes": Case(ours(index, scan, truth, fixed(20, keep=False, facing=True, gate_m=0.05))),
+            "  20 searched passes": Case(
+                ours(index, scan, truth, fixed(20, keep=False, facing=True, gate_m=0.05))
+            ),
         }
         makers = {
             "small_gicp GICP": partial(small_gicp, points, scan, guess, "GICP", 200, EPS_RAD),
-            "small_gicp PLANE_ICP": partial(small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD),
-            "Open3D point-to-plane (its own threads)": partial(open3d_plane, points, normals, scan, guess),
+            "small_gicp PLANE_ICP": partial(
+                small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD
+            ),
+            "Open3D point-to-plane (its own threads)": partial(
+                open3d_plane, points, normals, scan, guess
+            ),
         }
         cases.update(peers(makers))
         in_turn(cases, args.reps)
@@ -280,7 +342,10 @@ def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
         )
         searched = statistics.median(cases["  20 searched passes"].cpu) / 20 / len(scan)
         align = ratio(cases["  align alone"].cpu, cases["register, 1 thread"].cpu)
-        print(f"searched pass {1e9 * searched:.0f} ns a point; outside align {100 * (1 - align):.0f} % of register")
+        print(
+            f"searched pass {1e9 * searched:.0f} ns a point; outside align {100 * (1 - align):.0f}"
+            " % of register"
+        )
 
 
 def registered(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
@@ -309,20 +374,28 @@ def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         vertices, faces = bunny.vertices, bunny.faces
         for _ in range(0 if args.quick else 2):
             vertices, faces = trimesh.remesh.subdivide(vertices, faces)
-        targets.append(scaled(Surface(np.asarray(vertices), np.asarray(faces, np.int32), "bunny, subdivided", "")))
+        targets.append(
+            scaled(
+                Surface(np.asarray(vertices), np.asarray(faces, np.int32), "bunny, subdivided", "")
+            )
+        )
     for mesh in targets:
         start, busy = time.perf_counter(), time.process_time()
         SurfaceIndex.build(mesh, 0.15 * mesh.extent, threads=2)
         clock, built = time.perf_counter() - start, time.process_time() - busy
         print(
-            f"\n{mesh.name}: {len(mesh.faces)} triangles, index {built:.2f} s ({clock:.2f} s by the clock, 2 threads)"
+            f"\n{mesh.name}: {len(mesh.faces)} triangles, index {built:.2f} s ({clock:.2f} s by the"
+            " clock, 2 threads)"
         )
         one, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
         cast = partial(_ranges, one)
         for n in (1_000, 4_000) if args.quick else (1_000, 10_000, 100_000, 1_000_000):
             scan, truth = look(mesh, n, 0.0, 3, cast)
             guess = off(truth, 3.0, 0.05, 4)
-            cases = {"1": Case(registered(one, scan, guess)), "2": Case(registered(two, scan, guess))}
+            cases = {
+                "1": Case(registered(one, scan, guess)),
+                "2": Case(registered(two, scan, guess)),
+            }
             cases["align"] = Case(aligned(one, scan, guess))
             in_turn(cases, 1 if n > 100_000 else args.reps)
             ms = 1e3 * statistics.median(cases["1"].cpu)
@@ -330,13 +403,17 @@ def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
             gain = ratio(cases["1"].seconds, cases["2"].seconds)
             same = np.array_equal(cases["1"].T_ca, cases["2"].T_ca)
             print(
-                f"{n:8} points: {ms:8.1f} ms processor, {1e6 * ms / n:7.0f} ns a point, {cases['1'].passes} passes, "
-                f"outside align {100 * outside:.0f} %, 2 threads {gain:.2f}x by the clock, same bits: {same}"
+                f"{n:8} points: {ms:8.1f} ms processor, {1e6 * ms / n:7.0f} ns a point,"
+                f" {cases['1'].passes} passes, outside align {100 * outside:.0f} %, 2 threads"
+                f" {gain:.2f}x by the clock, same bits: {same}"
             )
 
 
 def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """The parts of `register` in tracking; the quality of the pose also without the neighbours that `align` kept."""
+    """The parts of `register` in tracking.
+
+    The quality of the pose also without the neighbours that `align` kept.
+    """
     for mesh in [*real_meshes(surface, args), stage()]:
         one = Registrar(mesh, RegisterParams(index_cache=False))
         scan, truth = look(mesh, args.scan, 0.0, 3, partial(_ranges, one))
@@ -346,15 +423,28 @@ def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         cases = {
             "register": Case(registered(one, scan, guess)),
             "align": Case(aligned(one, scan, guess)),
-            "quality": Case(partial(_graded, one, scan, fit, (one.limits, one.params, False, *rest))),
-            "with halves": Case(partial(_graded, one, scan, fit, (one.limits, one.params, True, *rest))),
+            "quality": Case(
+                partial(_graded, one, scan, fit, (one.limits, one.params, False, *rest))
+            ),
+            "with halves": Case(
+                partial(_graded, one, scan, fit, (one.limits, one.params, True, *rest))
+            ),
             "every search": Case(
-                partial(_graded, one, scan, replace(fit, matches=None), (one.limits, one.params, False, *rest))
+                partial(
+                    _graded,
+                    one,
+                    scan,
+                    replace(fit, matches=None),
+                    (one.limits, one.params, False, *rest),
+                )
             ),
         }
         in_turn(cases, args.reps)
         print(
-            f"{mesh.name}:", ", ".join(f"{name} {1e3 * statistics.median(c.cpu):.2f} ms" for name, c in cases.items())
+            f"{mesh.name}:",
+            ", ".join(
+                f"{name} {1e3 * statistics.median(c.cpu):.2f} ms" for name, c in cases.items()
+            ),
         )
 
 
@@ -377,12 +467,16 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="small and few: does it run")
     parser.add_argument("--model", type=int, default=100_000)
     parser.add_argument("--scan", type=int, default=10_000)
     parser.add_argument("--reps", type=int, default=7)
-    parser.add_argument("--views", type=int, default=30, help="sides of a mesh of which the errors are measured")
+    parser.add_argument(
+        "--views", type=int, default=30, help="sides of a mesh of which the errors are measured"
+    )
     parser.add_argument("--only", default=",".join(PARTS))
     args = parser.parse_args()
     if args.quick:

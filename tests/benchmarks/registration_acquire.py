@@ -1,9 +1,11 @@
-"""Acquisition without a guess, and registration from far guesses: how often right, and what it costs.
+"""Acquisition without a guess, and registration from far guesses: how often right, and what it
+costs.
 
 python tests/benchmarks/registration_acquire.py [--quick]
 
-The built-in target at random attitudes, 5 m and 3 m away, seeded; the scans of bunny and dragon where ../shared/data
-is there. Right is within 2 deg of the truth. Times are processor seconds of one thread, median and largest.
+The built-in target at random attitudes, 5 m and 3 m away, seeded; the scans of bunny and dragon
+where ../shared/data is there. Right is within 2 deg of the truth. Times are processor seconds of
+one thread, median and largest.
 """
 
 from __future__ import annotations
@@ -20,8 +22,10 @@ from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
-from avsreplay.register import Registrar
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import builtin_surface
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FOLDERS = (
@@ -41,7 +45,9 @@ def built_in(count: int, distance_m: float, seed: int) -> list[Case]:
             f"seed = {k}\nduration_s = 1.0\nrate_hz = 5.0\n[motion]\nattitude_xyzw = {q}\n"
             f"rate_radps = [0.0, 0.0, 0.0]\nposition_m = [0.15, -0.1, {distance_m}]\n"
         )
-        scan = next(true_scans(simulate(scenario_of(toml_document.parse(text, "acquire")), surface)))
+        scan = next(
+            true_scans(simulate(scenario_of(toml_document.parse(text, "acquire")), surface))
+        )
         assert scan.truth is not None
         cases.append((scan.points, scan.truth))
     return cases
@@ -53,8 +59,13 @@ def real(folder: str, conf: str) -> list[Case]:
     for line in (DATA / folder / conf).read_text().splitlines():
         words = line.split()
         if words and words[0] == "bmesh":
-            T_ca = Pose(geometry.conjugate(np.array(words[5:9], dtype=float)), np.array(words[2:5], dtype=float))
-            cases.append((read_ply((DATA / folder / words[1]).read_bytes()).points(), T_ca.inverse()))
+            T_ca = Pose(
+                geometry.conjugate(np.array(words[5:9], dtype=float)),
+                np.array(words[2:5], dtype=float),
+            )
+            cases.append(
+                (read_ply((DATA / folder / words[1]).read_bytes()).points(), T_ca.inverse())
+            )
     return cases
 
 
@@ -72,10 +83,15 @@ def acquired(name: str, registrar: Registrar, cases: list[Case]) -> None:
         right += off_deg(truth, found.T_ac) < RIGHT_DEG
         statuses[found.status.value] += 1
     cost = f"{np.median(seconds):.2f} s, largest {max(seconds):.2f} s"
-    print(f"{name:28s} from nothing  {right:4d} of {len(cases):3d}   {cost}   {dict(statuses)}", flush=True)
+    print(
+        f"{name:28s} from nothing  {right:4d} of {len(cases):3d}   {cost}   {dict(statuses)}",
+        flush=True,
+    )
 
 
-def from_guess(name: str, registrar: Registrar, middle: Array, cases: list[Case], degrees: float) -> None:
+def from_guess(
+    name: str, registrar: Registrar, middle: Array, cases: list[Case], degrees: float
+) -> None:
     rng, right, errors = np.random.default_rng(3), 0, []
     for points, truth in cases:
         axis = rng.normal(size=3)
@@ -83,10 +99,13 @@ def from_guess(name: str, registrar: Registrar, middle: Array, cases: list[Case]
         found = registrar.register(points, truth @ Pose(q, middle - geometry.matrix(q) @ middle))
         if off_deg(truth, found.T_ac) < RIGHT_DEG:
             right += 1
-            errors.append((off_deg(truth, found.T_ac), 1e3 * np.linalg.norm(found.T_ac.t - truth.t)))
+            errors.append(
+                (off_deg(truth, found.T_ac), 1e3 * np.linalg.norm(found.T_ac.t - truth.t))
+            )
     rms = np.sqrt(np.mean(np.square(errors), axis=0)) if errors else np.full(2, np.nan)
     print(
-        f"{name:28s} from {degrees:3.0f} deg  {right:4d} of {len(cases):3d}   rms {rms[0]:.3f} deg {rms[1]:.3f} mm",
+        f"{name:28s} from {degrees:3.0f} deg  {right:4d} of {len(cases):3d}   rms {rms[0]:.3f} deg"
+        f" {rms[1]:.3f} mm",
         flush=True,
     )
 

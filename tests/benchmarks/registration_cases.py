@@ -1,4 +1,7 @@
-"""Shared parts of the benchmarks of registration: scans, meshes, candidates that run in turn, and the peers."""
+"""Shared parts of the benchmarks of registration.
+
+Scans, meshes, candidates that run in turn, and the peers.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +25,39 @@ NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 def sample(surface: Surface, n: int, seed: int) -> Surface:
-    """A cloud of n points on the surface, spread evenly over its area; coordinates rounded to single precision."""
+    """A cloud of n points on the surface, spread evenly over its area.
+
+    Coordinates rounded to single precision.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     corners = surface.vertices[surface.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    k = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(n) + rng.random(n)) / n).clip(0, len(area) - 1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    k = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(n) + rng.random(n)) / n).clip(
+        0, len(area) - 1
+    )
     a, b = rng.random(n), rng.random(n)
     flip = a + b > 1
     a[flip], b[flip] = 1 - a[flip], 1 - b[flip]
-    p = corners[k, 0] + a[:, None] * (corners[k, 1] - corners[k, 0]) + b[:, None] * (corners[k, 2] - corners[k, 0])
+    p = (
+        corners[k, 0]
+        + a[:, None] * (corners[k, 1] - corners[k, 0])
+        + b[:, None] * (corners[k, 2] - corners[k, 0])
+    )
     return Surface(p.astype(np.float32).astype(np.float64), NO_FACES, f"{n} points", "")
 
 
-Cast = Callable[[Array, Array], Array]  # ranges, inf: none, of the first faces on rays (n, 3) from a point, in {C}
+Cast = Callable[
+    [Array, Array], Array
+]  # ranges, inf: none, of the first faces on rays (n, 3) from a point, in {C}
 
 
-def look(surface: Surface, n: int, outliers: float, seed: int, cast: Cast | None = None) -> tuple[Array, Pose]:
-    """A scan (n, 3) float32 in {A} from a random side, 6 extents away in angle terms, and the true T_ca.
+def look(
+    surface: Surface, n: int, outliers: float, seed: int, cast: Cast | None = None
+) -> tuple[Array, Pose]:
+    """A scan (n, 3) float32 in {A} from a random side, 6 extents away in angle terms, and the true
+    T_ca.
 
     ``cast`` finds the points on the surface; by default trimesh does, which takes much longer.
     """
@@ -60,7 +79,11 @@ def look(surface: Surface, n: int, outliers: float, seed: int, cast: Cast | None
         distance = ranges[seen] + NOISE_M * rng.standard_normal(np.count_nonzero(seen))
         hits = np.concatenate([hits, d[seen] * distance[:, None]])
     hits = hits[:n]
-    hits = hits[np.lexsort((np.floor(hits[:, 0] / hits[:, 2] * 300), np.floor(hits[:, 1] / hits[:, 2] * 300)))]
+    hits = hits[
+        np.lexsort(
+            (np.floor(hits[:, 0] / hits[:, 2] * 300), np.floor(hits[:, 1] / hits[:, 2] * 300))
+        )
+    ]
     wrong = rng.choice(n, int(outliers * n), replace=False)
     hits[wrong] = rng.uniform(hits.min(0) - 0.5, hits.max(0) + 0.5, (len(wrong), 3))
     return hits.astype(np.float32), T_ca
@@ -73,7 +96,9 @@ def trimesh_rays(surface: Surface) -> Cast:
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
 
     def cast(eye: Array, directions: Array) -> Array:
-        at, ray, _ = mesh.ray.intersects_location(np.tile(eye, (len(directions), 1)), directions, multiple_hits=False)
+        at, ray, _ = mesh.ray.intersects_location(
+            np.tile(eye, (len(directions), 1)), directions, multiple_hits=False
+        )
         ranges = np.full(len(directions), np.inf)
         ranges[ray] = np.linalg.norm(at - eye, axis=1)
         return ranges
@@ -82,7 +107,10 @@ def trimesh_rays(surface: Surface) -> Cast:
 
 
 def off(T_ca: Pose, deg: float, metres: float, seed: int) -> Pose:
-    """T_ca with its error: `deg` about the target's middle and `metres` of shift, in random directions."""
+    """T_ca with its error.
+
+    `deg` about the target's middle and `metres` of shift, in random directions.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     a, b = rng.standard_normal(3), rng.standard_normal(3)
     return Pose(exp(np.radians(deg) * a / np.linalg.norm(a)), metres * b / np.linalg.norm(b)) @ T_ca
@@ -91,22 +119,34 @@ def off(T_ca: Pose, deg: float, metres: float, seed: int) -> Pose:
 def error(T_ca: Array, truth: Pose) -> tuple[float, float]:
     """Degrees, and millimetres at the target's origin."""
     d = Pose.from_matrix(T_ca) @ truth.inverse()
-    return float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(d.q[:3]))))), float(1e3 * np.linalg.norm(d.t))
+    return float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(d.q[:3]))))), float(
+        1e3 * np.linalg.norm(d.t)
+    )
 
 
-def determined_error(T_ca: Array, truth: Pose, free: Array | None, extent: float) -> tuple[float, float]:
-    """As `error`, without the part along the motions d = [turn; shift] in {C} of ``free`` (6, k), None: none."""
+def determined_error(
+    T_ca: Array, truth: Pose, free: Array | None, extent: float
+) -> tuple[float, float]:
+    """As `error`, without the part along the motions d = [turn.
+
+    Shift] in {C} of ``free`` (6, k), None: none.
+    """
     d = Pose.from_matrix(T_ca) @ truth.inverse()
     lengths = np.concatenate([2 * np.arcsin(np.clip(d.q[:3], -1.0, 1.0)) * extent, d.t])
     if free is not None:
         motions = np.concatenate([free[:3] * extent, free[3:]])
         lengths = lengths - motions @ np.linalg.lstsq(motions, lengths, rcond=None)[0]
-    return float(np.degrees(np.linalg.norm(lengths[:3]) / extent)), float(1e3 * np.linalg.norm(lengths[3:]))
+    return float(np.degrees(np.linalg.norm(lengths[:3]) / extent)), float(
+        1e3 * np.linalg.norm(lengths[3:])
+    )
 
 
 @dataclass
 class Case:
-    """One candidate: what it does, how long each turn took [s], by the clock and by the processor, where it ended."""
+    """One candidate.
+
+    What it does, how long each turn took [s], by the clock and by the processor, where it ended.
+    """
 
     run: Callable[[], tuple[Array, int]]
     seconds: list[float] = field(default_factory=list)
@@ -136,18 +176,27 @@ def ratio(a: list[float], b: list[float]) -> float:
 
 
 def table(title: str, cases: dict[str, Case], truth: Pose, ours: str) -> None:
-    """Times, how many times slower than ours turn by turn (clock, processor over all threads), where each ended."""
+    """Times, how many times slower than ours turn by turn (clock, processor over all threads),
+    where each ended.
+    """
     print(f"\n{title}")
-    print(f"{'method':40} {'ms':>9} {'cpu ms':>9} {'x ours':>7} {'x cpu':>7} {'passes':>7} {'deg':>8} {'mm':>8}")
+    print(
+        f"{'method':40} {'ms':>9} {'cpu ms':>9} {'x ours':>7} {'x cpu':>7} {'passes':>7} {'deg':>8}"
+        f" {'mm':>8}"
+    )
     base = cases[ours]
     for name, case in cases.items():
         slower, busier = ratio(case.seconds, base.seconds), ratio(case.cpu, base.cpu)
         deg, mm = error(case.T_ca, truth)
-        times = f"{case.ms:9.2f} {1e3 * statistics.median(case.cpu):9.2f} {slower:7.2f} {busier:7.2f}"
+        times = (
+            f"{case.ms:9.2f} {1e3 * statistics.median(case.cpu):9.2f} {slower:7.2f} {busier:7.2f}"
+        )
         print(f"{name:40} {times} {case.passes:7d} {deg:8.4f} {mm:8.3f}", flush=True)
 
 
-def ours(model: SurfaceIndex, scan: Array, guess: Pose, rule: IcpParams) -> Callable[[], tuple[Array, int]]:
+def ours(
+    model: SurfaceIndex, scan: Array, guess: Pose, rule: IcpParams
+) -> Callable[[], tuple[Array, int]]:
     def run() -> tuple[Array, int]:
         r = model.icp(scan, guess, rule)
         return r.T_ca, r.iterations
@@ -155,7 +204,9 @@ def ours(model: SurfaceIndex, scan: Array, guess: Pose, rule: IcpParams) -> Call
     return run
 
 
-def scipy_horn(points: Array, scan: Array, guess: Pose, n_max: int, eps: float) -> Callable[[], tuple[Array, int]]:
+def scipy_horn(
+    points: Array, scan: Array, guess: Pose, n_max: int, eps: float
+) -> Callable[[], tuple[Array, int]]:
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points)
@@ -208,7 +259,9 @@ def small_gicp(
     return run
 
 
-def open3d_plane(points: Array, normals: Array, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
+def open3d_plane(
+    points: Array, normals: Array, scan: Array, guess: Pose
+) -> Callable[[], tuple[Array, int]]:
     import open3d as o3d
 
     reg = o3d.pipelines.registration
@@ -226,7 +279,9 @@ def open3d_plane(points: Array, normals: Array, scan: Array, guess: Pose) -> Cal
     return run
 
 
-def peers(make: dict[str, Callable[[], Callable[[], tuple[Array, int]]]]) -> Iterator[tuple[str, Case]]:
+def peers(
+    make: dict[str, Callable[[], Callable[[], tuple[Array, int]]]],
+) -> Iterator[tuple[str, Case]]:
     for name, build in make.items():
         try:
             yield name, Case(build())
@@ -244,7 +299,9 @@ def shared(*path: str) -> Surface | None:
     import trimesh
 
     mesh = trimesh.load(file, force="mesh", process=False)
-    return Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), file.stem, "")
+    return Surface(
+        np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), file.stem, ""
+    )
 
 
 def stage() -> Surface:
@@ -259,6 +316,8 @@ def stage() -> Surface:
 
 
 def scaled(surface: Surface) -> Surface:
-    """The surface at the size of the built-in target, so that the noise and the starts are the same for all."""
+    """The surface at the size of the built-in target, so that the noise and the starts are the same
+    for all.
+    """
     size = 5.3 / surface.extent
     return Surface(surface.vertices * size, surface.faces, surface.name, "")

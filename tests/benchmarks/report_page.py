@@ -17,12 +17,12 @@ import numpy as np
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Surface
-from avsreplay.report import Summary
 from avsreplay.report.jsonl import field_types
 from avsreplay.report.page import build_page
+from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, thin_cloud, thin_surface
 from avsreplay.rows import Row
-from avsreplay.simulate import builtin_surface
+from avsreplay.simulate.target import builtin_surface
 
 STEP_NS = 200_000_000
 
@@ -31,12 +31,23 @@ def made_up(n: int, seed: int = 0) -> tuple[list[Row], list[tuple[int, Pose]]]:
     """Rows with every number filled in at random, and true poses."""
     rng = np.random.Generator(np.random.PCG64(seed))
     types = field_types()
-    fill = {str: lambda: "ok", int: lambda: 3, float: lambda: float(rng.normal()), bool: lambda: True}
+    fill = {
+        str: lambda: "ok",
+        int: lambda: 3,
+        float: lambda: float(rng.normal()),
+        bool: lambda: True,
+    }
     rows, poses = [], []
     for k in range(n):
         pose = Pose(exp([0.02 * k, 0.3, 0.01 * k]), [0.3, 0.2, 5.0])
         row = Row(**{name: fill[kind]() for name, (kind, _) in types.items()})
-        where = dict(zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), map(float, (*pose.t, *pose.q)), strict=True))
+        where = dict(
+            zip(
+                ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+                map(float, (*pose.t, *pose.q)),
+                strict=True,
+            )
+        )
         blind = 300 <= k % 600 < 360
         row = dataclasses.replace(
             row,
@@ -67,7 +78,10 @@ def clouds(rows: list[Row], poses: list[tuple[int, Pose]], surface: Surface) -> 
 
 
 def opened(path: Path, times: int) -> tuple[float, float] | None:
-    """Medians [ms] until the page answers and from a slider move to its frame; None without a browser."""
+    """Medians [ms] until the page answers and from a slider move to its frame.
+
+    None without a browser.
+    """
     if not (shutil.which("chromium") and shutil.which("chromedriver")):
         return None
     from selenium import webdriver
@@ -91,7 +105,9 @@ def opened(path: Path, times: int) -> tuple[float, float] | None:
     try:
         for k in range(times):
             browser.get(path.as_uri())
-            ready.append(float(browser.execute_script("return document.documentElement.dataset.ready")))
+            ready.append(
+                float(browser.execute_script("return document.documentElement.dataset.ready"))
+            )
             moves += [float(browser.execute_async_script(move, 20 * k + j)) for j in range(10)]
     finally:
         browser.quit()

@@ -1,14 +1,17 @@
 """Do two versions of avsreplay write the same bytes?
 
-Save the reference with the version before the change, compare with the version after it, on the same machine:
+Save the reference with the version before the change, compare with the version after it, on the
+same machine:
 
-    python tests/benchmarks/same_bytes.py --save before.json     # in a checkout of the version before
-    python tests/benchmarks/same_bytes.py --against before.json  # in the checkout with the change
+    python tests/benchmarks/same_bytes.py --save before.json     # in a checkout of the version
+    before python tests/benchmarks/same_bytes.py --against before.json  # in the checkout with the
+    change
 
-Every case records a log and replays it into a result directory, each in a process of its own. The SHA-256 of every
-file is compared. Files that state the version or the settings in force (``run.json``) are left out of the comparison.
-Cases: the two fixtures, the built-in scenario and, where ``../shared/data`` exists, real scans of the Stanford
-turntable. ``--quick`` leaves out the built-in scenario. Exit code 1 if any file differs, is missing or is new.
+Every case records a log and replays it into a result directory, each in a process of its own. The
+SHA-256 of every file is compared. Files that state the version or the settings in force
+(``run.json``) are left out of the comparison. Cases: the two fixtures, the built-in scenario and,
+where ``../shared/data`` exists, real scans of the Stanford turntable. ``--quick`` leaves out the
+built-in scenario. Exit code 1 if any file differs, is missing or is new.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ LEFT_OUT = ("run.json", "report.html")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--save", type=Path, help="write the hashes to this file")
     parser.add_argument("--against", type=Path, help="compare the hashes with this file")
     parser.add_argument("--keep", type=Path, help="keep the outputs in this folder")
@@ -36,11 +41,18 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
-        hashes = {name: hashes_of(produce(folder / name)) for name, produce in cases(options.quick).items()}
+        hashes = {
+            name: hashes_of(produce(folder / name))
+            for name, produce in cases(options.quick).items()
+        }
     if options.save:
         options.save.write_text(json.dumps(hashes, indent=1) + "\n", encoding="utf-8")
         print(f"{sum(map(len, hashes.values()))} files of {len(hashes)} cases saved")
-    return compare(hashes, json.loads(options.against.read_text(encoding="utf-8"))) if options.against else 0
+    return (
+        compare(hashes, json.loads(options.against.read_text(encoding="utf-8")))
+        if options.against
+        else 0
+    )
 
 
 def cases(quick: bool):
@@ -51,7 +63,14 @@ def cases(quick: bool):
         "recorded-tumble": lambda out: recorded(out, ROOT / "fixtures" / "tumble.toml"),
         "auto-start": lambda out: replay(ROOT / "fixtures" / "tumble.mcap", out, "--init", "auto"),
         "open-loop-fit": lambda out: replay(
-            ROOT / "fixtures" / "tumble.mcap", out, "--guess", "last", "--policy", "all", "--reference", "fit"
+            ROOT / "fixtures" / "tumble.mcap",
+            out,
+            "--guess",
+            "last",
+            "--policy",
+            "all",
+            "--reference",
+            "fit",
         ),
     }
     if not quick:
@@ -84,10 +103,16 @@ def replay(log: Path, out: Path, *flags) -> Path:
 
 def command(*words) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "avsreplay", *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "avsreplay", *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode not in (0, 4):
-        raise SystemExit(f"avsreplay {' '.join(map(str, words))}\nended with {done.returncode}:\n{done.stderr}")
+        raise SystemExit(
+            f"avsreplay {' '.join(map(str, words))}\nended with {done.returncode}:\n{done.stderr}"
+        )
 
 
 def hashes_of(folder: Path) -> dict[str, str]:
@@ -104,7 +129,10 @@ def compare(after: dict, before: dict) -> int:
             a, b = before[case].get(name), after[case].get(name)
             if a != b:
                 wrong += 1
-                print(f"{case}/{name}: {'missing' if b is None else 'new' if a is None else 'differs'}")
+                print(
+                    f"{case}/{name}:"
+                    f" {'missing' if b is None else 'new' if a is None else 'differs'}"
+                )
     print(f"{sum(map(len, after.values()))} files of {len(after)} cases compared, {wrong} differ")
     return 1 if wrong else 0
 

@@ -1,23 +1,27 @@
-"""Registration in difficult scenes: share correct, share accepted although wrong (must be 0), work and time.
+"""Registration in difficult scenes: share correct, share accepted although wrong (must be 0), work
+and time.
 
-    python tests/benchmarks/scenes.py [--quick] [--meshes hst,kepler,...] [--scenes wall,outliers,...] [--views 2]
-                                      [--points 4000] [--backend horn] [--seed 1]
+    python tests/benchmarks/scenes.py [--quick] [--meshes hst,kepler,...] [--scenes
+                                      wall,outliers,...] [--views 2] [--points 4000] [--backend
+                                      horn] [--seed 1]
 
-Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a cylinder stage (a
-cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, mesh files by their path, and
-bodies of bodies.py by kind and seed, as grid:51.
-Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray; "close" is
-at 0.65 extents and "closer" at 0.5, with a quarter of the noise. The scenes
-add walls, outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the
-same extent alone, at the predicted place if there is a guess. "Correct": within 2 deg and 0.02 of the extent of the
-true pose, or of a pose that differs by a symmetry of the mesh. With an error of scale up to 10 % the pose counts; with
-a factor of 1000, and of another body, no pose is correct. "Accepted": status aligned. "Wrong": accepted, not correct,
-and the row says neither that the scan fits a target of another size, nor that the view does not determine the size, nor
-that noise leaves the attitude uncertain by more than 1 deg; where no pose is correct, every accepted one is wrong.
-"Beyond": accepted, and the squared error in the metric of the claimed covariance exceeds the 99.99 % point of
-Hotelling's T^2, whatever the row says. NEES is the mean of this squared error over 6, 1 for a correct covariance. Time
-is processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
-and with --each one per scene and mesh.
+Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a
+cylinder stage (a cylinder with closed ends), a box, a bracket of three boxes, a box with a thin
+panel, mesh files by their path, and bodies of bodies.py by kind and seed, as grid:51. Every view is
+ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray;
+"close" is at 0.65 extents and "closer" at 0.5, with a quarter of the noise. The scenes add walls,
+outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body
+of the same extent alone, at the predicted place if there is a guess. "Correct": within 2 deg and
+0.02 of the extent of the true pose, or of a pose that differs by a symmetry of the mesh. With an
+error of scale up to 10 % the pose counts; with a factor of 1000, and of another body, no pose is
+correct. "Accepted": status aligned. "Wrong": accepted, not correct, and the row says neither that
+the scan fits a target of another size, nor that the view does not determine the size, nor that
+noise leaves the attitude uncertain by more than 1 deg; where no pose is correct, every accepted one
+is wrong. "Beyond": accepted, and the squared error in the metric of the claimed covariance exceeds
+the 99.99 % point of Hotelling's T^2, whatever the row says. NEES is the mean of this squared error
+over 6, 1 for a correct covariance. Time is processor time; "x" is the ratio to the median of the
+clean scans of the same mesh. A row per scene over all meshes, and with --each one per scene and
+mesh.
 """
 
 from __future__ import annotations
@@ -38,8 +42,9 @@ from avsreplay.estimate.measurement import from_chi2
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.log import read_surface
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import RegisterParams, Registrar
-from avsreplay.simulate import builtin_surface
+from avsreplay.register.params import RegisterParams
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.target import builtin_surface
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FILES = {
@@ -50,12 +55,22 @@ FILES = {
 }
 BOXES = {  # sizes and middles of the boxes of a body
     "box": [((2.0, 1.0, 0.6), (0.0, 0.0, 0.0))],
-    "bracket": [((2.0, 1.2, 0.2), (0, 0, 0)), ((0.2, 1.2, 1.5), (-0.9, 0, 0.75)), ((0.5, 0.3, 0.3), (0.4, 0.3, 0.25))],
-    "panel": [((1.5, 1.2, 1.0), (0, 0, 0)), ((3.0, 0.8, 0.05), (2.4, 0, 0.1)), ((0.3, 0.3, 0.5), (0.4, -0.4, 0.7))],
+    "bracket": [
+        ((2.0, 1.2, 0.2), (0, 0, 0)),
+        ((0.2, 1.2, 1.5), (-0.9, 0, 0.75)),
+        ((0.5, 0.3, 0.3), (0.4, 0.3, 0.25)),
+    ],
+    "panel": [
+        ((1.5, 1.2, 1.0), (0, 0, 0)),
+        ((3.0, 0.8, 0.05), (2.4, 0, 0.1)),
+        ((0.3, 0.3, 0.5), (0.4, -0.4, 0.7)),
+    ],
 }
 NOISE = 0.002  # of the extent
 DISTANCE, CLOSE, CLOSER = 3.0, 0.65, 0.5  # extents from the camera to the middle of the target
-CLAIM = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a larger squared error contradicts the claim
+# 99.99 % point of chi-square with 6 degrees of freedom: a larger squared error contradicts the
+# claim
+CLAIM = 27.86
 RIGHT_DEG, RIGHT_OF_EXTENT = 2.0, 0.02
 
 
@@ -75,7 +90,10 @@ class View:
 
 @dataclass(frozen=True)
 class Case:
-    """What is registered: points, the guess (None: global search), and the true pose (None: nothing is right)."""
+    """What is registered: points, the guess (None: global search), and the true pose (None.
+
+    Nothing is right).
+    """
 
     points: Array
     guess: Pose | None
@@ -92,7 +110,9 @@ def meshes(names: list[str]) -> dict[str, Surface]:
         elif name == "builtin":
             found[name] = builtin_surface()
         elif name == "cylinder":
-            found[name] = _surface(trimesh.creation.cylinder(radius=1.8, height=9.0, sections=64), name)
+            found[name] = _surface(
+                trimesh.creation.cylinder(radius=1.8, height=9.0, sections=64), name
+            )
         elif name in BOXES:
             parts = [trimesh.creation.box(size).apply_translation(at) for size, at in BOXES[name]]
             found[name] = _surface(trimesh.util.concatenate(parts), name)
@@ -110,11 +130,16 @@ def _surface(shape: trimesh.Trimesh, name: str) -> Surface:
 
 
 def cast(surfaces: list[tuple[Surface, Pose]], directions: Array) -> tuple[Array, Array]:
-    """Range (n,) of the first hit (inf: none) and which surface was hit (n,), from the origin of {A}."""
+    """Range (n,) of the first hit (inf.
+
+    None) and which surface was hit (n,), from the origin of {A}.
+    """
     best, which = np.full(len(directions), np.inf), np.full(len(directions), -1)
     for k, (surface, T_ac) in enumerate(surfaces):
         mesh = trimesh.Trimesh(T_ac.apply(surface.vertices), surface.faces, process=False)
-        at, ray, _ = mesh.ray.intersects_location(np.zeros_like(directions), directions, multiple_hits=False)
+        at, ray, _ = mesh.ray.intersects_location(
+            np.zeros_like(directions), directions, multiple_hits=False
+        )
         distance = np.linalg.norm(at, axis=1)
         nearer = distance < best[ray]
         best[ray[nearer]], which[ray[nearer]] = distance[nearer], k
@@ -134,7 +159,9 @@ def pose(surface: Surface, rng: np.random.Generator, distance: float = DISTANCE)
     q = rng.standard_normal(4)
     turn = Pose(q / np.linalg.norm(q), np.zeros(3))
     middle = (surface.vertices.max(0) + surface.vertices.min(0)) / 2
-    place = surface.extent * (np.array([0.0, 0.0, distance]) + 0.2 * distance / DISTANCE * rng.uniform(-1, 1, 3))
+    place = surface.extent * (
+        np.array([0.0, 0.0, distance]) + 0.2 * distance / DISTANCE * rng.uniform(-1, 1, 3)
+    )
     return Pose(turn.q, place - turn.R @ middle)
 
 
@@ -146,7 +173,9 @@ def view(
     noise: float = NOISE,
     distance: float = DISTANCE,
 ):
-    """A view of about ``count`` points on the target and what ``others`` (surfaces and poses) adds to it."""
+    """A view of about ``count`` points on the target and what ``others`` (surfaces and poses) adds
+    to it.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     T_ac = pose(surface, rng, distance)
     scene = [(surface, T_ac), *others(T_ac)]
@@ -160,26 +189,39 @@ def view(
 
 
 def off(v: View, degrees: float, share: float) -> Pose:
-    """The true pose with a rotation error about the middle of the target and a position error, in random directions."""
+    """The true pose with a rotation error about the middle of the target and a position error, in
+    random directions.
+    """
     axis, shift = v.rng.standard_normal((2, 3))
     turn = exp(np.radians(degrees) * axis / np.linalg.norm(axis))
     middle = (v.surface.vertices.max(0) + v.surface.vertices.min(0)) / 2
-    D = Pose(turn, middle - geometry.matrix(turn) @ middle + share * v.extent * shift / np.linalg.norm(shift))
+    D = Pose(
+        turn,
+        middle - geometry.matrix(turn) @ middle + share * v.extent * shift / np.linalg.norm(shift),
+    )
     return v.T_ac @ D
 
 
 def with_wall(v: View) -> Array:
-    """As many points on a wall behind the target as on the target, where the target does not hide it."""
+    """As many points on a wall behind the target as on the target, where the target does not hide
+    it.
+    """
     rng, L = v.rng, v.extent
     n = np.array([*rng.uniform(-0.5, 0.5, 2), -1.0])
     n /= np.linalg.norm(n)
     centre = v.points.mean(0)
     anchor = centre * (1.0 + 0.8 * L / np.linalg.norm(centre))
-    rays = cone(np.vstack([v.points, centre + L * np.eye(3), centre - L * np.eye(3)]), rng, 6 * len(v.points))
+    rays = cone(
+        np.vstack([v.points, centre + L * np.eye(3), centre - L * np.eye(3)]),
+        rng,
+        6 * len(v.points),
+    )
     ranges = (n @ anchor) / (rays @ n)
     hidden, _ = cast([(v.surface, v.T_ac)], rays)
     wall = (rays * ranges[:, None])[~np.isfinite(hidden) & (ranges > 0)][: len(v.points)]
-    wall = wall + NOISE * L * rng.standard_normal((len(wall), 1)) * wall / np.linalg.norm(wall, axis=1, keepdims=True)
+    wall = wall + NOISE * L * rng.standard_normal((len(wall), 1)) * wall / np.linalg.norm(
+        wall, axis=1, keepdims=True
+    )
     return np.vstack([v.points, wall])
 
 
@@ -187,13 +229,18 @@ def with_outliers(v: View, share: float) -> Array:
     """``share`` of the points replaced by points anywhere in a box a fifth larger than the scan."""
     points = v.points.copy()
     wrong = v.rng.random(len(points)) < share
-    centre, half = (points.max(0) + points.min(0)) / 2, 0.6 * np.ptp(points, axis=0) + 0.1 * v.extent
+    centre, half = (
+        (points.max(0) + points.min(0)) / 2,
+        0.6 * np.ptp(points, axis=0) + 0.1 * v.extent,
+    )
     points[wrong] = v.rng.uniform(centre - half, centre + half, (wrong.sum(), 3))
     return points
 
 
 def visible_part(v: View, share: float) -> Array:
-    """The points on one side of a straight edge through the image, so that ``share`` of them are left."""
+    """The points on one side of a straight edge through the image, so that ``share`` of them are
+    left.
+    """
     angle = v.rng.uniform(0, 2 * np.pi)
     across = (v.points[:, :2] / v.points[:, 2:]) @ np.array([np.cos(angle), np.sin(angle)])
     return v.points[across <= np.quantile(across, share)]
@@ -218,7 +265,11 @@ def random_object(surface: Surface, seed: int) -> Callable[[Pose], list]:
     parts = []
     for _ in range(rng.integers(1, 4)):
         size = rng.uniform(0.1, 1.0, 3)
-        made = trimesh.creation.box(size) if rng.random() < 0.6 else trimesh.creation.cylinder(0.5 * size[0], size[1])
+        made = (
+            trimesh.creation.box(size)
+            if rng.random() < 0.6
+            else trimesh.creation.cylinder(0.5 * size[0], size[1])
+        )
         made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
         parts.append(made.apply_translation(rng.uniform(-0.3, 0.3, 3)))
     mesh = trimesh.util.concatenate(parts)
@@ -226,7 +277,9 @@ def random_object(surface: Surface, seed: int) -> Callable[[Pose], list]:
     mesh.apply_scale(rng.uniform(0.2, 0.7) * surface.extent / np.linalg.norm(mesh.extents))
     middle, place = (surface.vertices.max(0) + surface.vertices.min(0)) / 2, rng.standard_normal(3)
     shift = rng.uniform(0.2, 0.7) * surface.extent * place / np.linalg.norm(place)
-    return lambda T_ac: [(_surface(mesh, "object"), Pose(Pose.identity().q, T_ac.apply(middle) + shift))]
+    return lambda T_ac: [
+        (_surface(mesh, "object"), Pose(Pose.identity().q, T_ac.apply(middle) + shift))
+    ]
 
 
 def grown(surface: Surface, factor: float) -> Surface:
@@ -237,7 +290,9 @@ def grown(surface: Surface, factor: float) -> Surface:
 Maker = Callable[[Surface, int, int], Case]
 
 
-def _plain(degrees: float | None, share: float, change: Callable[[View], Array] = lambda v: v.points) -> Maker:
+def _plain(
+    degrees: float | None, share: float, change: Callable[[View], Array] = lambda v: v.points
+) -> Maker:
     def make(surface: Surface, count: int, seed: int) -> Case:
         v = view(surface, count, seed)
         return Case(change(v), None if degrees is None else off(v, degrees, share), v.T_ac)
@@ -254,7 +309,10 @@ def _noisy(noise: float) -> Maker:
 
 
 def _close(distance: float, degrees: float) -> Maker:
-    """A camera next to the target, with a quarter of the noise; the smallest error is that of a prediction."""
+    """A camera next to the target, with a quarter of the noise.
+
+    The smallest error is that of a prediction.
+    """
 
     def make(surface: Surface, count: int, seed: int) -> Case:
         v = view(surface, count, seed, noise=NOISE / 4, distance=distance)
@@ -285,8 +343,12 @@ def _another(body: str, guessed: bool) -> Maker:
     def make(surface: Surface, count: int, seed: int) -> Case:
         other = meshes([body])[body]
         v = view(grown(other, surface.extent / other.extent), count, seed)
-        seen, sought = (0.5 * (each.vertices.max(0) + each.vertices.min(0)) for each in (v.surface, surface))
-        return Case(v.points, v.T_ac @ Pose(Pose.identity().q, seen - sought) if guessed else None, None)
+        seen, sought = (
+            0.5 * (each.vertices.max(0) + each.vertices.min(0)) for each in (v.surface, surface)
+        )
+        return Case(
+            v.points, v.T_ac @ Pose(Pose.identity().q, seen - sought) if guessed else None, None
+        )
 
     return make
 
@@ -334,14 +396,21 @@ SCENES: dict[str, Maker] = {
     "panel alone, guess": _another("panel", True),
     "panel alone, search": _another("panel", False),
 }
-QUICK = ("clean, 3 deg", "clean, 60 deg", "outliers 60 %, 3 deg", "wall 50 %, search", "noise 0.015, 3 deg")
+QUICK = (
+    "clean, 3 deg",
+    "clean, 60 deg",
+    "outliers 60 %, 3 deg",
+    "wall 50 %, search",
+    "noise 0.015, 3 deg",
+)
 
 
 def symmetries(name: str, surface: Surface) -> Callable[[Pose], Pose]:
     """Maps an error in {C} to the least one among the symmetries of the mesh.
 
-    Tested are the rotations of a cube and those by a whole fraction of a turn (down to 1/24) about an axis of {C},
-    through the centre of the box, which displace no vertex by more than 1e-3 of the extent from the surface.
+    Tested are the rotations of a cube and those by a whole fraction of a turn (down to 1/24) about
+    an axis of {C}, through the centre of the box, which displace no vertex by more than 1e-3 of the
+    extent from the surface.
     """
     if name == "cylinder":
         return _least_of_cylinder
@@ -350,7 +419,10 @@ def symmetries(name: str, surface: Surface) -> Callable[[Pose], Pose]:
     centre = 0.5 * (surface.vertices.min(0) + surface.vertices.max(0))
     turns = [Rotation.from_matrix(m) for m in Rotation.create_group("O").as_matrix()]
     turns += [
-        Rotation.from_rotvec(2 * np.pi * k / n * axis) for axis in np.eye(3) for n in range(3, 25) for k in (1, -1)
+        Rotation.from_rotvec(2 * np.pi * k / n * axis)
+        for axis in np.eye(3)
+        for n in range(3, 25)
+        for k in (1, -1)
     ]
     group = [Pose.identity()]
     for turn in turns:
@@ -367,14 +439,18 @@ def _least_of_cylinder(step: Pose) -> Pose:
     return Pose(exp([tilt, 0.0, 0.0]), step.t)
 
 
-def gap(found: Alignment, truth: Pose, extent: float, least: Callable[[Pose], Pose]) -> tuple[float, float]:
+def gap(
+    found: Alignment, truth: Pose, extent: float, least: Callable[[Pose], Pose]
+) -> tuple[float, float]:
     """Rotation [deg] and translation [share of the extent] from the true pose, in {C}."""
     step = least(truth.inverse() @ found.T_ac)
     return float(np.degrees(geometry.angle(step.q))), float(np.linalg.norm(step.t)) / extent
 
 
 def claimed(found: Alignment, truth: Pose, least: Callable[[Pose], Pose]) -> tuple[float, float]:
-    """Squared error of an accepted pose in the metric of its covariance, and its 99.99 % point for a true claim."""
+    """Squared error of an accepted pose in the metric of its covariance, and its 99.99 % point for
+    a true claim.
+    """
     step = least(truth.inverse() @ found.T_ac).inverse()
     d = np.concatenate([geometry.log(step.q), step.t])
     return float(d @ np.linalg.solve(found.covariance, d)), from_chi2(CLAIM, found.dof)
@@ -423,7 +499,9 @@ def measure(names: list[str], scenes: list[str], args: argparse.Namespace) -> No
 
 
 def _healthy(registrar: Registrar, surface: Surface, args: argparse.Namespace) -> float:
-    """Median processor time of clean scans at 3 deg [s], after what is prepared once for all searches."""
+    """Median processor time of clean scans at 3 deg [s], after what is prepared once for all
+    searches.
+    """
     registrar.acquire(SCENES["clean, search"](surface, args.points, args.seed).points)
     times = []
     for k in range(3):
@@ -435,10 +513,19 @@ def _healthy(registrar: Registrar, surface: Surface, args: argparse.Namespace) -
 
 
 def _one(
-    registrar: Registrar, case: Case, extent: float, least: Callable[[Pose], Pose], score: Score, healthy: float
+    registrar: Registrar,
+    case: Case,
+    extent: float,
+    least: Callable[[Pose], Pose],
+    score: Score,
+    healthy: float,
 ) -> None:
     begun = time.process_time()
-    found = registrar.acquire(case.points) if case.guess is None else registrar.register(case.points, case.guess)
+    found = (
+        registrar.acquire(case.points)
+        if case.guess is None
+        else registrar.register(case.points, case.guess)
+    )
     spent = time.process_time() - begun
     accepted = found.status is AlignStatus.ALIGNED
     right = False
@@ -452,7 +539,10 @@ def _one(
     score.cases += 1
     score.right += right
     score.accepted += accepted
-    said = any(text in found.message for text in ("than the model", "error of the size", "attitude is known to"))
+    said = any(
+        text in found.message
+        for text in ("than the model", "error of the size", "attitude is known to")
+    )
     score.wrong += accepted and not right and not (said and case.truth is not None)
     score.said += said
     score.statuses += " " + ("+" if right else "-") + found.status.value
@@ -461,21 +551,43 @@ def _one(
 
 
 def _add(total: Score, score: Score) -> None:
-    for field in ("cases", "right", "accepted", "wrong", "said", "beyond", "statuses", "seconds", "ratios", "squared"):
+    for field in (
+        "cases",
+        "right",
+        "accepted",
+        "wrong",
+        "said",
+        "beyond",
+        "statuses",
+        "seconds",
+        "ratios",
+        "squared",
+    ):
         setattr(total, field, getattr(total, field) + getattr(score, field))
 
 
 def _print(label: str, s: Score) -> None:
-    share = f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} wrong, {s.said:3d} stated"
-    share += f", {s.beyond:3d} beyond, NEES {np.mean(s.squared) / 6.0 if s.squared else np.nan:5.2f}"
-    times = f"{np.median(s.seconds):7.3f} s median {max(s.seconds):7.3f} s max, x {max(s.ratios):6.1f}"
+    share = (
+        f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} wrong,"
+        f" {s.said:3d} stated"
+    )
+    share += (
+        f", {s.beyond:3d} beyond, NEES {np.mean(s.squared) / 6.0 if s.squared else np.nan:5.2f}"
+    )
+    times = (
+        f"{np.median(s.seconds):7.3f} s median {max(s.seconds):7.3f} s max, x {max(s.ratios):6.1f}"
+    )
     print(f"{label:36} {share}  {times} {s.statuses if s.cases < 9 else ''}", flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--meshes", default="hst,kepler,bunny,dragon,builtin,cylinder")
-    parser.add_argument("--scenes", default="", help="parts of the names of the scenes, separated by semicolons")
+    parser.add_argument(
+        "--scenes", default="", help="parts of the names of the scenes, separated by semicolons"
+    )
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--points", type=int, default=4000)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,16 +1,20 @@
-"""Measure the structure of the source code: size, share of imports, path of one scan, duplicate names, documentation.
+"""Measure the structure of the source code: size, share of imports, path of one scan, duplicate
+names, documentation.
 
-    python tests/benchmarks/structure.py                  # this checkout
-    python tests/benchmarks/structure.py --json           # the same for machines
-    python tests/benchmarks/structure.py --root CHECKOUT  # another checkout, for example an earlier version
-    python tests/benchmarks/structure.py --list           # the functions whose docstring lacks a section, small modules
+    python tests/benchmarks/structure.py                  # this checkout python
+    tests/benchmarks/structure.py --json           # the same for machines python
+    tests/benchmarks/structure.py --root CHECKOUT  # another checkout, for example an earlier
+    version python tests/benchmarks/structure.py --list           # the functions whose docstring
+    lacks a section, small modules
 
-Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments and docstrings. The
-import share counts the lines of import statements and of ``__all__`` over all lines. The path of one scan is what runs
-in the package between two rows of a replay of ``fixtures/tumble.mcap`` (reading, step, score and row; without threads
-of their own), as seen by ``sys.setprofile``; the figures are the median and the largest value over the scans. A
-duplicate is a public class or module-level function name that two modules define. Docstring coverage counts public
-functions, methods and classes with arguments beyond ``self`` that have an ``Args`` or ``Attributes`` section.
+Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments
+and docstrings. The import share counts the lines of import statements and of ``__all__`` over all
+lines. The path of one scan is what runs in the package between two rows of a replay of
+``fixtures/tumble.mcap`` (reading, step, score and row; without threads of their own), as seen by
+``sys.setprofile``; the figures are the median and the largest value over the scans. A duplicate is
+a public class or module-level function name that two modules define. Docstring coverage counts
+public functions, methods and classes with arguments beyond ``self`` that have an ``Args`` or
+``Attributes`` section.
 """
 
 from __future__ import annotations
@@ -29,10 +33,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--root", type=Path, default=ROOT, help="the checkout to measure")
     parser.add_argument("--json", action="store_true", help="one JSON document")
-    parser.add_argument("--list", action="store_true", help="what lacks a docstring section, and modules to merge")
+    parser.add_argument(
+        "--list", action="store_true", help="what lacks a docstring section, and modules to merge"
+    )
     parser.add_argument("--scan-path", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.scan_path:
@@ -41,7 +49,12 @@ def main() -> None:
     if options.list:
         print(*lacking(options.root), *mergeable(options.root), sep="\n")
         return
-    found = sizes(options.root) | names(options.root) | docstrings(options.root) | settings(options.root)
+    found = (
+        sizes(options.root)
+        | names(options.root)
+        | docstrings(options.root)
+        | settings(options.root)
+    )
     found |= traced(options.root)
     if options.json:
         print(json.dumps(found, indent=1))
@@ -66,7 +79,11 @@ def sizes(root: Path) -> dict:
         text = path.read_text(encoding="utf-8")
         tree = ast.parse(text)
         lines = text.count("\n")
-        total, code, imports = total + lines, code + code_lines(text, tree), imports + import_lines(tree)
+        total, code, imports = (
+            total + lines,
+            code + code_lines(text, tree),
+            imports + import_lines(tree),
+        )
         longest = max(longest, (str(path.relative_to(root)), lines), key=lambda pair: pair[1])
         parts = path.relative_to(root / "avsreplay").parts
         package = packages[parts[0] if len(parts) > 1 else "root"]
@@ -116,7 +133,14 @@ def code_lines(text: str, tree: ast.Module) -> int:
                 and isinstance(first.value.value, str)
             ):
                 skipped.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    layout = (
+        tokenize.COMMENT,
+        tokenize.NL,
+        tokenize.NEWLINE,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENDMARKER,
+    )
     used: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in layout:
@@ -142,7 +166,11 @@ def names(root: Path) -> dict:
     for path in modules(root):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             kind = (
-                "class" if isinstance(node, ast.ClassDef) else "function" if isinstance(node, ast.FunctionDef) else ""
+                "class"
+                if isinstance(node, ast.ClassDef)
+                else "function"
+                if isinstance(node, ast.FunctionDef)
+                else ""
             )
             if kind and not node.name.startswith("_"):
                 defined[kind].setdefault(node.name, set()).add(module_name(root, path))
@@ -154,9 +182,15 @@ def names(root: Path) -> dict:
 
 
 def docstrings(root: Path) -> dict:
-    """Docstrings of public functions and methods: present, with Args, with Raises where they raise."""
+    """Docstrings of public functions and methods.
+
+    Present, with Args, with Raises where they raise.
+    """
     rows = list(documentation(root))
-    takes, exported = [r for r in rows if r["takes"]], [r for r in rows if r["takes"] and r["exported"]]
+    takes, exported = (
+        [r for r in rows if r["takes"]],
+        [r for r in rows if r["takes"] and r["exported"]],
+    )
     raising = [r for r in rows if r["raises"]]
     return {
         "public functions and methods": len(rows),
@@ -179,7 +213,9 @@ def documentation(root: Path):
             yield {
                 "where": f"{path.relative_to(root)}:{node.lineno} {node.name}",
                 "text": ast.get_docstring(node) or "",
-                "takes": any(a.arg not in ("self", "cls") for a in (*node.args.args, *node.args.kwonlyargs)),
+                "takes": any(
+                    a.arg not in ("self", "cls") for a in (*node.args.args, *node.args.kwonlyargs)
+                ),
                 "exported": name in api or module == "avsreplay",
                 "raises": any(isinstance(n, ast.Raise) for n in ast.walk(node)),
             }
@@ -237,27 +273,36 @@ def public_functions(tree: ast.Module):
 def settings(root: Path) -> dict:
     """Settings of a run, and those without a sentence of meaning."""
     code = (
-        "import dataclasses, json\n"
-        "from avsreplay.config import RunConfig\n"
-        "from typing import get_type_hints\n"
-        "def walk(cls, prefix=''):\n"
-        "    hints = get_type_hints(cls)\n"
-        "    for f in dataclasses.fields(cls):\n"
-        "        inner = hints[f.name]\n"
-        "        if dataclasses.is_dataclass(inner): yield from walk(inner, prefix + f.name + '.')\n"
-        "        else: yield prefix + f.name, bool('setting' in f.metadata and f.metadata['setting'].doc)\n"
-        "print(json.dumps(list(walk(RunConfig))))\n"
+        "import dataclasses, json\nfrom avsreplay.config import RunConfig\nfrom typing import"
+        " get_type_hints\ndef walk(cls, prefix=''):\n    hints = get_type_hints(cls)\n    for f in"
+        " dataclasses.fields(cls):\n        inner = hints[f.name]\n        if"
+        " dataclasses.is_dataclass(inner): yield from walk(inner, prefix + f.name + '.')\n       "
+        " else: yield prefix + f.name, bool('setting' in f.metadata and"
+        " f.metadata['setting'].doc)\nprint(json.dumps(list(walk(RunConfig))))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         return {"settings": "cannot be read: " + done.stderr.strip().splitlines()[-1]}
     table = json.loads(done.stdout)
-    return {"settings of a run": len(table), "  without a declared meaning": sum(1 for _, said in table if not said)}
+    return {
+        "settings of a run": len(table),
+        "  without a declared meaning": sum(1 for _, said in table if not said),
+    }
 
 
 def traced(root: Path) -> dict:
-    """The path of one scan, measured in a process of its own so that the right checkout is imported."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--root", str(root.resolve()), "--scan-path"]
+    """The path of one scan, measured in a process of its own so that the right checkout is
+    imported.
+    """
+    command = [
+        sys.executable,
+        str(Path(__file__).resolve()),
+        "--root",
+        str(root.resolve()),
+        "--scan-path",
+    ]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, env=None)
     if done.returncode:
         return {"path of one scan": "cannot be traced: " + done.stderr.strip().splitlines()[-1]}
@@ -282,11 +327,17 @@ def scan_path(root: Path) -> dict:
     median = [sorted(column)[len(counts) // 2] for column in zip(*counts, strict=True)]
     most = [max(column) for column in zip(*counts, strict=True)]
     labels = ("files", "functions", "calls", "depth")
-    return {f"one scan: {label} (median, most)": f"{a}, {b}" for label, a, b in zip(labels, median, most, strict=True)}
+    return {
+        f"one scan: {label} (median, most)": f"{a}, {b}"
+        for label, a, b in zip(labels, median, most, strict=True)
+    }
 
 
 def calls_of_next(rows, package: str):
-    """Files, functions, calls and depth of the package while the next row is made; None at the end."""
+    """Files, functions, calls and depth of the package while the next row is made.
+
+    None at the end.
+    """
     files: set[str] = set()
     functions: set[tuple[str, int]] = set()
     calls = depth = deepest = 0

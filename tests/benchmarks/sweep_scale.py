@@ -2,12 +2,14 @@
 
 python tests/benchmarks/sweep_scale.py [--quick] [--seconds 5] [--runs 100000] [--workers 1000]
 
-1. Measured: what the client spends on a run (unpack the outcome, note it in the journal), and what scheduler, client
-   and ten idle workers in one process spend on a run that does nothing: an upper bound of the scheduler's cost c.
-2. Simulated: Dask's own scheduler state, without network or workers, is fed the campaign event by event. It decides
-   who runs what; the clock is a made-up one on which a run takes T seconds and each run costs the scheduler c.
-3. The law: N runs on W workers take max(N T / W, N c, N j) seconds, j the client's cost; it stops scaling at
-   W = T / max(c, j).
+1. Measured: what the client spends on a run (unpack the outcome, note it in the journal), and what
+   scheduler, client and ten idle workers in one process spend on a run that does nothing: an upper
+   bound of the scheduler's cost c.
+2. Simulated: Dask's own scheduler state, without network or workers, is fed the campaign event by
+   event. It decides who runs what; the clock is a made-up one on which a run takes T seconds and
+   each run costs the scheduler c.
+3. The law: N runs on W workers take max(N T / W, N c, N j) seconds, j the client's cost; it stops
+   scaling at W = T / max(c, j).
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from pathlib import Path
 
 from sweep_speed import CAMPAIGN
 
-from avsreplay.sweep import load_campaign
+from avsreplay.sweep.campaign import load_campaign
 from avsreplay.sweep.execute import IN_FLIGHT, RunResult, run_task
 from avsreplay.sweep.expansion import expand
 from avsreplay.sweep.journal import Journal
@@ -33,7 +35,9 @@ SCANS = 600
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="2,000 runs on at most 100 workers")
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a run")
     parser.add_argument("--runs", type=int, default=100_000)
@@ -51,11 +55,14 @@ def main() -> None:
         took, cpu, held = asyncio.run(simulated(runs, workers, args.seconds, cost))
         law = max(runs * args.seconds / workers, runs * cost, runs * note)
         print(
-            f"  {workers:5d} workers: law {law:8.0f} s, simulated {took:8.0f} s, "
-            f"workers busy {runs * args.seconds / workers / took:.0%}, at most {held} tasks at the scheduler, "
-            f"its state machine {1e3 * cpu:.3f} ms a run"
+            f"  {workers:5d} workers: law {law:8.0f} s, simulated {took:8.0f} s, workers busy"
+            f" {runs * args.seconds / workers / took:.0%}, at most {held} tasks at the scheduler,"
+            f" its state machine {1e3 * cpu:.3f} ms a run"
         )
-    print(f"stops scaling at {args.seconds / max(cost, note):.0f} workers; journal {runs * line / 1e9:.1f} GB")
+    print(
+        f"stops scaling at {args.seconds / max(cost, note):.0f} workers; journal"
+        f" {runs * line / 1e9:.1f} GB"
+    )
 
 
 def client_cost() -> tuple[float, int, int]:
@@ -64,13 +71,21 @@ def client_cost() -> tuple[float, int, int]:
         folder = Path(name)
         (folder / "c.toml").write_text(CAMPAIGN.format(runs=1))
         like = run_task(next(expand(load_campaign(folder / "c.toml")).points()).task)
-        many = json.loads(json.dumps(like.scans * (SCANS // len(like.scans))))  # no number shared, as in a true run
-        data = pickle.dumps(RunResult(like.id, like.status, None, like.metrics, tuple(tuple(scan) for scan in many)))
+        many = json.loads(
+            json.dumps(like.scans * (SCANS // len(like.scans)))
+        )  # no number shared, as in a true run
+        data = pickle.dumps(
+            RunResult(like.id, like.status, None, like.metrics, tuple(tuple(scan) for scan in many))
+        )
         with Journal(folder) as journal:
             start = time.process_time()
             for k in range(200):
                 outcome = pickle.loads(data)
-                journal.add(RunResult(f"{k:024x}", outcome.status, outcome.error, outcome.metrics, outcome.scans))
+                journal.add(
+                    RunResult(
+                        f"{k:024x}", outcome.status, outcome.error, outcome.metrics, outcome.scans
+                    )
+                )
             took = (time.process_time() - start) / 200
         return took, (folder / "journal.txt").stat().st_size // 200, len(data)
 
@@ -80,7 +95,12 @@ def whole_cost(workers: int, tasks: int) -> float:
     import dask
     from distributed import Client, LocalCluster, as_completed
 
-    options = {"threads_per_worker": 1, "processes": False, "dashboard_address": ":0", "memory_limit": None}
+    options = {
+        "threads_per_worker": 1,
+        "processes": False,
+        "dashboard_address": ":0",
+        "memory_limit": None,
+    }
     with (
         dask.config.set({"distributed.worker.profile.enabled": False}),
         LocalCluster(n_workers=workers, **options) as cluster,
@@ -97,8 +117,12 @@ def whole_cost(workers: int, tasks: int) -> float:
         return (time.process_time() - start) / tasks
 
 
-async def simulated(runs: int, workers: int, seconds: float, cost: float) -> tuple[float, float, int]:
-    """Made-up seconds until all is done, processor seconds a run in the state machine, most tasks it held."""
+async def simulated(
+    runs: int, workers: int, seconds: float, cost: float
+) -> tuple[float, float, int]:
+    """Made-up seconds until all is done, processor seconds a run in the state machine, most tasks
+    it held.
+    """
     state = State(workers)
     begun, now, held, sent = time.process_time(), 0.0, 0, 0
     free = dict.fromkeys(state.addresses, 0.0)
@@ -162,7 +186,9 @@ class State:
     def finish(self, address: str, key: str, start: float, stop: float) -> None:
         done = {"nbytes": 46_000, "type": b"", "typename": "RunResult", "worker": address}
         spans = [{"action": "compute", "start": start, "stop": stop}]
-        next_, _, messages = self.scheduler._transition(key, "memory", "finish", startstops=spans, **done)
+        next_, _, messages = self.scheduler._transition(
+            key, "memory", "finish", startstops=spans, **done
+        )
         self._keep(messages)
         self.scheduler.transitions(next_, "finish")
         task = self.scheduler.tasks[key]
@@ -178,7 +204,9 @@ class State:
 
     def _keep(self, messages: dict) -> None:
         for address, notes in messages.items():
-            self._messages += [(address, note["key"]) for note in notes if note["op"] == "compute-task"]
+            self._messages += [
+                (address, note["key"]) for note in notes if note["op"] == "compute-task"
+            ]
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 python tests/benchmarks/sweep_speed.py [--runs 500] [--quick] [--pretend 0.2]
 
-With ``--pretend S`` a run only waits S seconds and hands back an outcome of the usual size: what is then lost is the
-machinery's own, whatever else the processor is doing. Overhead is the wall time of one worker beyond the runs' own.
+With ``--pretend S`` a run only waits S seconds and hands back an outcome of the usual size: what is
+then lost is the machinery's own, whatever else the processor is doing. Overhead is the wall time of
+one worker beyond the runs' own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from avsreplay.sweep import RunResult, load_campaign
+from avsreplay.sweep.campaign import RunResult, load_campaign
 from avsreplay.sweep.execute import run_task, run_tasks, write_results
 from avsreplay.sweep.expansion import expand
 from avsreplay.sweep.journal import Journal
@@ -38,7 +39,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--quick", action="store_true", help="40 runs")
-    parser.add_argument("--pretend", type=float, metavar="S", help="wait S seconds in place of a run")
+    parser.add_argument(
+        "--pretend", type=float, metavar="S", help="wait S seconds in place of a run"
+    )
     args = parser.parse_args()
     runs = 40 if args.quick else args.runs
     with tempfile.TemporaryDirectory() as name:
@@ -51,9 +54,15 @@ def main() -> None:
         print(f"one run by itself: {1e3 * direct:.1f} ms")
         took = {workers: _swept(plan, workers, folder / str(workers)) for workers in (1, 2)}
     for workers, (up, seconds, results) in took.items():
-        print(f"{workers} workers: {runs} runs in {seconds:.2f} s (start {up:.2f} s, results {results:.2f} s)")
+        print(
+            f"{workers} workers: {runs} runs in {seconds:.2f} s (start {up:.2f} s, results"
+            f" {results:.2f} s)"
+        )
     print(f"speed-up of 2 over 1: {took[1][1] / took[2][1]:.2f}")
-    print(f"overhead of the machinery at 1 worker: {took[1][1] / (runs - 1) / direct - 1.0:.1%} of run time")
+    print(
+        f"overhead of the machinery at 1 worker: {took[1][1] / (runs - 1) / direct - 1.0:.1%} of"
+        " run time"
+    )
 
 
 def _waiting(seconds: float, plan):

@@ -1,18 +1,22 @@
-"""Whole runs on nearly symmetric bodies whose one mark is small: own dynamics, ray casting by Embree, own bags.
+"""Whole runs on nearly symmetric bodies whose one mark is small: own dynamics, ray casting by
+Embree, own bags.
 
-python tests/benchmarks/symmetric_logs.py [--bodies stage,...] [--marks side15,...] [--seeds 0,1] [--seconds 80]
-                                          [--hz 2] [--rate 0.1] [--rays 80] [--away] [--keep FOLDER]
+python tests/benchmarks/symmetric_logs.py [--bodies stage,...] [--marks side15,...] [--seeds 0,1]
+                                          [--seconds 80] [--hz 2] [--rate 0.1] [--rays 80] [--away]
+                                          [--keep FOLDER]
 
-Bodies: ``stage`` (a cylinder of 1.0 m by 2.5 m), ``bell`` (the same with a nozzle and a domed end) and ``prism`` (eight
-flat sides). A mark is a place and a size in cm: ``side`` (the middle of the shell), ``end`` (the shell near the top) or
-``cap`` (the upper end, off the axis), and ``none``. A box of that size stands on the surface there. With ``--away`` the
-attitude of the first scan is chosen so that the mark is out of sight. Motion and bags are those of ``raycast_logs``.
+Bodies: ``stage`` (a cylinder of 1.0 m by 2.5 m), ``bell`` (the same with a nozzle and a domed end)
+and ``prism`` (eight flat sides). A mark is a place and a size in cm: ``side`` (the middle of the
+shell), ``end`` (the shell near the top) or ``cap`` (the upper end, off the axis), and ``none``. A
+box of that size stands on the surface there. With ``--away`` the attitude of the first scan is
+chosen so that the mark is out of sight. Motion and bags are those of ``raycast_logs``.
 
-The program runs ``avsreplay run`` on each log and prints, per log: scans in which at least ten rays hit the mark; rows
-by status; scans that were rejected (gamma 0), and how many of them before the first scan with the mark; rows of status
-aligned whose measured pose is wrong (beyond 2 deg or 0.02 of the extent), and the same of rows that were used and of
-estimates for which convergence is claimed; rms error of the estimate in the last half of the log, its least claimed
-1 sigma there, and estimates beyond 4 sigma; processor time per scan.
+The program runs ``avsreplay run`` on each log and prints, per log: scans in which at least ten rays
+hit the mark; rows by status; scans that were rejected (gamma 0), and how many of them before the
+first scan with the mark; rows of status aligned whose measured pose is wrong (beyond 2 deg or 0.02
+of the extent), and the same of rows that were used and of estimates for which convergence is
+claimed; rms error of the estimate in the last half of the log, its least claimed 1 sigma there, and
+estimates beyond 4 sigma; processor time per scan.
 """
 
 from __future__ import annotations
@@ -83,8 +87,12 @@ def body(name: str, mark: str) -> tuple[trimesh.Trimesh, int]:
     return trimesh.util.concatenate([*made, box]), len(box.faces)
 
 
-def hidden_first(turns: np.ndarray, places: np.ndarray, mesh: trimesh.Trimesh, count: int) -> np.ndarray:
-    """The rotations after a constant turn of the body about its axis that puts the mark out of sight at first."""
+def hidden_first(
+    turns: np.ndarray, places: np.ndarray, mesh: trimesh.Trimesh, count: int
+) -> np.ndarray:
+    """The rotations after a constant turn of the body about its axis that puts the mark out of
+    sight at first.
+    """
     mark = mesh.triangles_center[-count:].mean(axis=0)
     seen = turns[0].T @ -places[0]
     about = np.arctan2(seen[1], seen[0]) - np.arctan2(mark[1], mark[0]) + np.pi
@@ -92,7 +100,9 @@ def hidden_first(turns: np.ndarray, places: np.ndarray, mesh: trimesh.Trimesh, c
 
 
 def make(folder: Path, name: str, mark: str, seed: int, asked: argparse.Namespace) -> None:
-    """Write ``log`` (a ROS 2 bag), ``model.stl`` and ``seen.npy`` (points, rays on the mark) to ``folder``."""
+    """Write ``log`` (a ROS 2 bag), ``model.stl`` and ``seen.npy`` (points, rays on the mark) to
+    ``folder``.
+    """
     rng = np.random.default_rng([seed, 1313])
     mesh, count = body(name, mark)
     mesh.export(folder / "model.stl")
@@ -115,9 +125,19 @@ def make(folder: Path, name: str, mark: str, seed: int, asked: argparse.Namespac
 def examine(folder: Path, name: str, mark: str, seed: int) -> list[str]:
     """Run avsreplay on the log of ``folder`` and return the cells of its line of the table."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", "avsreplay", "run", str(folder / "log"), "--model", str(folder / "model.stl")]
+    command = [
+        sys.executable,
+        "-m",
+        "avsreplay",
+        "run",
+        str(folder / "log"),
+        "--model",
+        str(folder / "model.stl"),
+    ]
     done = subprocess.run(
-        [*command, "-o", str(folder / "result"), "--overwrite", "--json"], capture_output=True, check=False
+        [*command, "-o", str(folder / "result"), "--overwrite", "--json"],
+        capture_output=True,
+        check=False,
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
@@ -127,14 +147,24 @@ def examine(folder: Path, name: str, mark: str, seed: int) -> list[str]:
     (folder / "rows.json").write_text(json.dumps(rows))
     seen, truth = np.load(folder / "seen.npy"), np.load(folder / "truth.npz")
     mesh, _ = body(name, mark)
-    wrong = [_wrong(row, truth["turns"][row["seq"]], truth["places"][row["seq"]], mesh.scale) for row in rows]
+    wrong = [
+        _wrong(row, truth["turns"][row["seq"]], truth["places"][row["seq"]], mesh.scale)
+        for row in rows
+    ]
     marked = np.flatnonzero(seen[:, 1] >= SEEN_RAYS)
     first = marked[0] if len(marked) else len(seen)
     rejected = [row["seq"] for row in rows if row["gamma"] == 0]
     aligned = [bad for row, bad in zip(rows, wrong, strict=True) if row["status"] == "aligned"]
-    used = [bad for row, bad in zip(rows, wrong, strict=True) if row["status"] == "aligned" and row["gamma"]]
+    used = [
+        bad
+        for row, bad in zip(rows, wrong, strict=True)
+        if row["status"] == "aligned" and row["gamma"]
+    ]
     late = [row for row in rows[len(rows) // 2 :] if row["rot_err_deg"] is not None]
-    beyond = [max(row["pos_err_m"] / row["pos_1s_m"], row["rot_err_deg"] / row["rot_1s_deg"]) > SIGMAS for row in late]
+    beyond = [
+        max(row["pos_err_m"] / row["pos_1s_m"], row["rot_err_deg"] / row["rot_1s_deg"]) > SIGMAS
+        for row in late
+    ]
     converged = [row for row in rows if row["converged"]]
     share = seen[marked, 1].sum() / max(1, seen[marked, 0].sum())
     counts = Counter(row["status"] for row in rows)
@@ -170,7 +200,9 @@ def _wrong(row: dict, turn: np.ndarray, place: np.ndarray, extent: float) -> boo
 
 def main() -> None:
     """Make the logs, run avsreplay on each and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--bodies", default="stage,bell,prism")
     parser.add_argument("--marks", default="side15,side30,end15,cap15,none")
     parser.add_argument("--seeds", default="0,1")
@@ -178,8 +210,12 @@ def main() -> None:
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="mean rate of the targets [rad/s]")
     parser.add_argument("--rays", type=int, default=80, help="rays along each side of the image")
-    parser.add_argument("--away", action="store_true", help="the mark is out of sight in the first scan")
-    parser.add_argument("--keep", type=Path, help="write the logs and results to this folder and keep them")
+    parser.add_argument(
+        "--away", action="store_true", help="the mark is out of sight in the first scan"
+    )
+    parser.add_argument(
+        "--keep", type=Path, help="write the logs and results to this folder and keep them"
+    )
     asked = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS), flush=True)
     with tempfile.TemporaryDirectory() as scratch:

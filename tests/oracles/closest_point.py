@@ -1,7 +1,9 @@
-"""Closest points, the ICP loop and the normal equations in numpy and scipy: the oracle for the C++ extension.
+"""Closest points, the ICP loop and the normal equations in numpy and scipy: the oracle for the C++
+extension.
 
-Closest point on a mesh: the distance to a triangle is at least |q - centroid| - radius, so every triangle whose bound
-is below the exact distance of the triangle with the smallest bound is measured, and no other.
+Closest point on a mesh: the distance to a triangle is at least |q - centroid| - radius, so every
+triangle whose bound is below the exact distance of the triangle with the smallest bound is
+measured, and no other.
 """
 
 from __future__ import annotations
@@ -52,10 +54,17 @@ class OracleIndex:
         foot, normal = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         d2, ids = np.full(n, np.inf), np.full(n, -1, dtype=np.int32)
         good = np.flatnonzero(np.isfinite(points).all(axis=1))
-        f, d, i = self._near(points[good].astype(np.float64), None if camera_c is None else np.asarray(camera_c))
+        f, d, i = self._near(
+            points[good].astype(np.float64), None if camera_c is None else np.asarray(camera_c)
+        )
         near = np.flatnonzero(i >= 0)
         rows = good[near]
-        foot[rows], d2[rows], ids[rows], normal[rows] = f[near], d[near], self._ids[i[near]], self._normals[i[near]]
+        foot[rows], d2[rows], ids[rows], normal[rows] = (
+            f[near],
+            d[near],
+            self._ids[i[near]],
+            self._normals[i[near]],
+        )
         return Closest(foot, d2, ids, normal)
 
     def icp(self, points: NDArray[Any], T_ca: Pose, params: IcpParams | None = None) -> IcpResult:
@@ -84,7 +93,12 @@ class OracleIndex:
         return IcpResult(T, passes, done, inliers, rms, gate, turn, move, ignored, searched)
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: ArrayLike | Pose, gate_m: float | None = None, *, facing: bool = False
+        self,
+        points: NDArray[Any],
+        T_ca: ArrayLike | Pose,
+        gate_m: float | None = None,
+        *,
+        facing: bool = False,
     ) -> NormalEquations:
         """Sums of ``SurfaceIndex.normal_equations``."""
         T = T_ca.matrix if isinstance(T_ca, Pose) else np.asarray(T_ca)
@@ -93,21 +107,34 @@ class OracleIndex:
         p, foot, normal, d2 = self._matched(scan, T, gate, facing)
         J, e = np.hstack([np.cross(p, normal), normal]), np.sum((foot - p) * normal, axis=1)
         ignored = len(points) - len(scan)
-        return NormalEquations(J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), ignored)
+        return NormalEquations(
+            J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), ignored
+        )
 
     def _near(self, p: Array, camera_c: Array | None) -> tuple[Array, Array, NDArray[np.int32]]:
-        """Closest point, squared distance and index into the primitives; -1 at the reach or farther."""
+        """Closest point, squared distance and index into the primitives.
+
+        -1 at the reach or farther.
+        """
         if camera_c is None or self._corners is None:
             foot, d2, i = self._search(p)
         else:
-            seen = np.flatnonzero(np.sum((camera_c - self._corners[:, 0]) * self._normals, axis=1) > 0.0)
+            seen = np.flatnonzero(
+                np.sum((camera_c - self._corners[:, 0]) * self._normals, axis=1) > 0.0
+            )
             if not len(seen):
-                return np.zeros_like(p), np.full(len(p), np.inf), np.full(len(p), -1, dtype=np.int32)
+                return (
+                    np.zeros_like(p),
+                    np.full(len(p), np.inf),
+                    np.full(len(p), -1, dtype=np.int32),
+                )
             foot, d2, i = _MeshSearch(self._corners[seen], self._normals[seen], self._tie)(p)
             i = seen[i].astype(np.int32)
         return foot, d2, np.where(d2 < self.reach_m**2, i, -1).astype(np.int32)
 
-    def _matched(self, scan: Array, T_ca: Array, gate: float, facing: bool) -> tuple[Array, Array, Array, Array]:
+    def _matched(
+        self, scan: Array, T_ca: Array, gate: float, facing: bool
+    ) -> tuple[Array, Array, Array, Array]:
         p = scan @ T_ca[:3, :3].T + T_ca[:3, 3]
         foot, d2, i = self._near(p, T_ca[:3, 3] if facing else None)
         take = (i >= 0) & (d2 < gate**2)
@@ -160,13 +187,16 @@ class _MeshSearch:
 def foot_on_triangles(p: Array, corners: Array) -> Array:
     """Nearest point of triangle k to p[k]. (n, 3) x (n, 3, 3) -> (n, 3).
 
-    The projection onto the plane where it falls inside, else the nearest of the closest points on the three edges.
+    The projection onto the plane where it falls inside, else the nearest of the closest points on
+    the three edges.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     n = np.cross(b - a, c - a)
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
     plane = p - np.sum((p - a) * n, axis=1, keepdims=True) * n
-    sides = [np.sum(np.cross(v - u, plane - u) * n, axis=1) >= 0.0 for u, v in ((a, b), (b, c), (c, a))]
+    sides = [
+        np.sum(np.cross(v - u, plane - u) * n, axis=1) >= 0.0 for u, v in ((a, b), (b, c), (c, a))
+    ]
     feet = np.stack([_foot_on_edge(p, u, v) for u, v in ((a, b), (b, c), (c, a))])
     nearest = feet[np.argmin(np.sum((feet - p) ** 2, axis=2), axis=0), np.arange(len(p))]
     foot: Array = np.where(np.logical_and.reduce(sides)[:, None], plane, nearest)
@@ -181,7 +211,9 @@ def _foot_on_edge(p: Array, u: Array, v: Array) -> Array:
 
 
 def cloud_normals(points: Array, neighbours: int = NORMAL_NEIGHBOURS) -> Array:
-    """Direction of least scatter of the ``neighbours`` nearest points, itself included. (n, 3) -> (n, 3), any sign."""
+    """Direction of least scatter of the ``neighbours`` nearest points, itself included. (n, 3) ->
+    (n, 3), any sign.
+    """
     from scipy.spatial import cKDTree
 
     k = min(neighbours, len(points))
@@ -192,7 +224,10 @@ def cloud_normals(points: Array, neighbours: int = NORMAL_NEIGHBOURS) -> Array:
 
 
 def _horn_step(p: Array, foot: Array) -> tuple[Array, float, float]:
-    """Horn's closed form, section 6: the best D with D p = foot; its angle [rad] and the centroid's move [m]."""
+    """Horn's closed form, section 6: the best D with D p = foot.
+
+    Its angle [rad] and the centroid's move [m].
+    """
     pc, fc = p.mean(axis=0), foot.mean(axis=0)
     N = (p - pc).T @ (foot - fc) / len(p)
     M = np.empty((4, 4))  # scalar first [w x y z]

@@ -1,4 +1,5 @@
-"""The covariance of a registered pose in numpy, which the C++ of ``avsreplay.register.covariance`` is compared with.
+"""The covariance of a registered pose in numpy, which the C++ of ``avsreplay.register.covariance``
+is compared with.
 
 Also ``difference_covariance``: of the poses of two parts of one scan, for the tests of halves.
 """
@@ -24,7 +25,9 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 def _unexplained(errors: Systematic, found: Evidence) -> Array:
     """The gradients (m, 6) without what pose and amplitudes explain."""
-    return found.gradients - found.normals @ errors.fit - _coupling(found, errors) @ errors.amplitudes
+    return (
+        found.gradients - found.normals @ errors.fit - _coupling(found, errors) @ errors.amplitudes
+    )
 
 
 def _error_of_one(A: Array) -> float:
@@ -33,7 +36,10 @@ def _error_of_one(A: Array) -> float:
 
 
 def sandwich_covariance(normals: Array, gradients: Array) -> tuple[Array, float]:
-    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise; its degrees of freedom."""
+    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise.
+
+    Its degrees of freedom.
+    """
     values, vectors = np.linalg.eigh(normals.sum(axis=0))
     kept = values > len(values) * np.finfo(float).eps * values[-1]
     W = vectors[:, kept] / np.sqrt(values[kept])
@@ -71,7 +77,9 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     g = g - N @ fit
     leverage = np.trace(N @ inverse, axis1=1, axis2=2) / len(fit)
     S = g[:, :, None] * g[:, None, :] / np.maximum(1.0 - leverage, 0.5)[:, None, None]
-    block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m))
+    block, M = _block_variance(
+        N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m)
+    )
     P = inverse @ (S.sum(axis=0) + block * M) @ inverse
     strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
     smooth = np.repeat(_common_variance(fit[strains], P[strains, strains]), 7)
@@ -80,7 +88,8 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
 
 
 def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
-    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its degrees of freedom.
+    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its
+    degrees of freedom.
 
     Args:
         found: sums at the registered pose.
@@ -90,8 +99,14 @@ def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array,
     inverse = _pseudo_inverse(found.normals.sum(axis=0))
     X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
     Y = inverse @ _coupling(found, errors).sum(axis=0)
-    P = random + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
-    return np.asarray(0.5 * (P + P.T)), dof * max(42.0 / _error_of_one(np.linalg.solve(P, random)), 1.0)
+    P = (
+        random
+        + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2)))
+        + (errors.smooth_m2 * Y) @ Y.T
+    )
+    return np.asarray(0.5 * (P + P.T)), dof * max(
+        42.0 / _error_of_one(np.linalg.solve(P, random)), 1.0
+    )
 
 
 def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:
@@ -103,8 +118,8 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
         across: (k, 3) directions in {C}: the patches are split at their medians along each.
 
     Returns:
-        The largest over the directions, each chi-square with 6 degrees of freedom; None if a half does not determine a
-        pose, or without directions.
+        The largest over the directions, each chi-square with 6 degrees of freedom; None if a half
+        does not determine a pose, or without directions.
     """
     if found.counts.max(initial=1) == 1 or not len(across):
         return None
@@ -143,7 +158,11 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
     places = np.vstack([first.places, second.places])
     which = np.split(np.arange(len(places)), [len(first.places)])
     patches, blocks = (_numbers(places, size * errors.patch_m) for size in (1, BLOCK))
-    moves, X, Y = np.zeros((patches.max() + 1, 6)), np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
+    moves, X, Y = (
+        np.zeros((patches.max() + 1, 6)),
+        np.zeros((blocks.max() + 1, 6, 3)),
+        np.zeros((6, 7)),
+    )
     for (part, sign), k in zip(parts, which, strict=True):
         inverse = _pseudo_inverse(part.normals.sum(axis=0))
         left = (1.0 + ALONE) * np.eye(6) - part.normals @ inverse
@@ -151,12 +170,19 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
         moves = moves + sign * _summed(np.asarray(moved), patches[k], len(moves))
         X = X + sign * (inverse @ _summed(part.normals[:, :, 3:], blocks[k], len(X)))
         Y = Y + sign * (inverse @ _coupling(part, errors).sum(axis=0))
-    C = moves.T @ moves + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
+    C = (
+        moves.T @ moves
+        + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2)))
+        + (errors.smooth_m2 * Y) @ Y.T
+    )
     return np.asarray(0.5 * (C + C.T))
 
 
 def _pseudo_inverse(N: Array) -> Array:
-    """Pseudo-inverse of a symmetric positive semidefinite matrix; np.linalg.pinv takes eight times as long."""
+    """Pseudo-inverse of a symmetric positive semidefinite matrix.
+
+    Np.linalg.pinv takes eight times as long.
+    """
     values, vectors = np.linalg.eigh(N)
     kept = values > len(N) * np.finfo(float).eps * values[-1]
     return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
@@ -181,12 +207,20 @@ def _strains(found: Evidence, errors: Systematic) -> Array:
 
 
 def _coupling(found: Evidence, errors: Systematic) -> Array:
-    """A (m, 6, 7): sums over each patch of J times the residual per amplitude of strain and offset."""
-    return np.concatenate([found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2)
+    """A (m, 6, 7).
+
+    Sums over each patch of J times the residual per amplitude of strain and offset.
+    """
+    return np.concatenate(
+        [found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2
+    )
 
 
 def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
-    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k); their basis (7, k-6)."""
+    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k).
+
+    Their basis (7, k-6).
+    """
     T, A = _strains(found, errors), _coupling(found, errors)
     m, turned = len(T), T.transpose(0, 2, 1)
     F = np.zeros((m, 7, 7))
@@ -210,12 +244,19 @@ def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
 
 
 def _block_variance(
-    N: Array, g: Array, S: Array, inverse: Array, counts: NDArray[np.int64], blocks: NDArray[np.intp]
+    N: Array,
+    g: Array,
+    S: Array,
+    inverse: Array,
+    counts: NDArray[np.int64],
+    blocks: NDArray[np.intp],
 ) -> tuple[float, Array]:
-    """Variance of the displacements of blocks by the method of moments, and its effect M (k, k) on the gradients.
+    """Variance of the displacements of blocks by the method of moments, and its effect M (k, k) on
+    the gradients.
 
-    The products of the gradients of different patches of a block, summed, have no contribution of errors within
-    patches. S (m, k, k) are the covariances of the gradients of the patches; the fit correlates them.
+    The products of the gradients of different patches of a block, summed, have no contribution of
+    errors within patches. S (m, k, k) are the covariances of the gradients of the patches; the fit
+    correlates them.
     """
     K, B = (N @ inverse)[:, 3:6], N[:, :, 3:6]
     whole, moved = _summed(N, blocks), _summed(B, blocks)
@@ -224,23 +265,34 @@ def _block_variance(
     own, total = weight[blocks], S.sum(axis=0)
 
     def fitted(K: Array, S: Array, total: Array, weight: Array) -> float:
-        """What the fit of pose and amplitudes adds to the sum of squares of independent gradients."""
+        """What the fit of pose and amplitudes adds to the sum of squares of independent
+        gradients.
+        """
         crossed = np.einsum("cij,cij->c", K, S[:, 3:6])
         return float(weight @ (np.einsum("cij,cij->c", K @ total, K) - 2.0 * crossed))
 
-    found = weight @ np.sum(_summed(g, blocks)[:, 3:6] ** 2, axis=1) - own @ np.sum(g[:, 3:6] ** 2, axis=1)
+    found = weight @ np.sum(_summed(g, blocks)[:, 3:6] ** 2, axis=1) - own @ np.sum(
+        g[:, 3:6] ** 2, axis=1
+    )
     found -= fitted(Kb, _summed(S, blocks), total, weight) - fitted(K, S, total, own)
-    expected = weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)) - own @ np.sum(B[:, 3:6] ** 2, axis=(1, 2))
+    expected = weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)) - own @ np.sum(
+        B[:, 3:6] ** 2, axis=(1, 2)
+    )
     of_blocks = moved @ moved.transpose(0, 2, 1)
     of_patches = moved[blocks] @ B.transpose(0, 2, 1)
     of_patches = of_patches.transpose(0, 2, 1)
     expected += fitted(Kb, of_blocks.transpose(0, 2, 1), M, weight) - fitted(K, of_patches, M, own)
-    determined = expected > LEAST_DETERMINED * float(weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)))
+    determined = expected > LEAST_DETERMINED * float(
+        weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2))
+    )
     return (max(0.0, float(found / expected)) if determined else 0.0), M
 
 
 def _common_variance(values: Array, P: Array) -> float:
-    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments; 0 if not significant."""
+    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments.
+
+    0 if not significant.
+    """
     if not len(values):
         return 0.0
     variances, axes = np.linalg.eigh(P)
@@ -250,7 +302,9 @@ def _common_variance(values: Array, P: Array) -> float:
         weights = 1.0 / (variances + t) ** 2
         t = max(0.0, float(weights @ (squares - variances) / weights.sum()))
     ratio = variances / (variances + t)
-    evidence = squares / variances @ (1.0 - ratio) + np.log(ratio).sum()  # twice the gain in log likelihood
+    evidence = (
+        squares / variances @ (1.0 - ratio) + np.log(ratio).sum()
+    )  # twice the gain in log likelihood
     return t if evidence > SIGNIFICANT else 0.0
 
 

@@ -1,4 +1,7 @@
-"""A registration back end of one's own: point-to-point ICP with SciPy's solution of the rotation."""
+"""A registration back end of one's own.
+
+Point-to-point ICP with SciPy's solution of the rotation.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +25,11 @@ class OwnBackend:
     Attributes:
         name: as in the entry point; ``--backend own`` selects it.
         about: one line for ``avsreplay backends``.
-        requires: (module, distribution) of each library that it needs; avsreplay checks that they are installed.
+        requires: (module, distribution) of each library that it needs; avsreplay checks that they
+            are installed.
         get: how to install them.
-        accuracy: largest error on an exact scan that the contract test allows: angle [deg] and share of the extent.
+        accuracy: largest error on an exact scan that the contract test allows: angle [deg] and
+            share of the extent.
     """
 
     name: ClassVar[str] = "own"
@@ -37,8 +42,8 @@ class OwnBackend:
         """Keep what is needed of the target.
 
         Args:
-            target: ``surface`` (vertices (n, 3) in {C} [m], faces), ``index`` (exact closest points), ``limits``
-                (rejection distances, stopping rule) and ``visibility``.
+            target: ``surface`` (vertices (n, 3) in {C} [m], faces), ``index`` (exact closest
+                points), ``limits`` (rejection distances, stopping rule) and ``visibility``.
         """
         self._index, self._limits = target.index, target.limits
 
@@ -50,8 +55,8 @@ class OwnBackend:
             guess: T_ca to start from.
 
         Returns:
-            The pose, the number of iterations, and whether the iteration converged: a pose that did not converge must
-            say so. Without correspondences: the guess and False.
+            The pose, the number of iterations, and whether the iteration converged: a pose that did
+            not converge must say so. Without correspondences: the guess and False.
         """
         scan, T_ca, gate = np.asarray(points, dtype=np.float64), guess, self._limits.reach_m
         for count in range(1, self._limits.n_max + 1):

@@ -1,0 +1,377 @@
+"""The group of the commands, and the entry point that turns every error into one line and an exit
+code.
+
+A command is the object ``<name>_command`` in ``avsreplay/cli/<name>.py``, or in the module that
+``HOMES`` names; it is imported when it is called, so that ``avsreplay --help`` is fast.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from avsreplay import __version__, arithmetic
+from avsreplay.errors import AvsError, UsageError
+
+__all__ = ["entry_point"]
+
+SUMMARIES = {
+    "record": "Write a log: simulate a scenario, or convert recorded scans.",
+    "run": "Replay a log and print verdict and tables.",
+    "model": "Build a model of an unknown target from the scans of a log.",
+    "odometry": "Track an unknown target through the scans of a log, without a model.",
+    "info": "Show the content of a log and the options that a run needs.",
+    "doctor": "Check a log for damage and repair it.",
+    "backends": "List the registration back ends; run the contract tests on one.",
+    "bench": "Compare the speed and error of back ends on a log.",
+    "observability": "Show which states the measurements of a log determine.",
+    "plan": "Plan the capture again from a saved result.",
+    "report": "Build the HTML report of a saved result.",
+    "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
+    "compare": "Compare saved results; gate one against a baseline.",
+    "sweep": "Run a campaign of many runs and summarise it.",
+    "config": "Print the effective settings of a run.",
+    "completion": "Print the completion script of a shell.",
+}
+
+# The modules of the commands that share one.
+HOMES = {
+    "doctor": "info",
+    "bench": "backends",
+    "odometry": "model",
+    "export": "record",
+    "report": "record",
+    "completion": "main",
+}
+
+EPILOG = """\b
+Examples:
+  avsreplay record -o tumble.mcap          the built-in scenario, simulated
+  avsreplay run tumble.mcap                replay it and print tables
+  avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
+
+\b
+Exit codes: 0 ok, 1 the requested check failed, 2 usage, 3 a file cannot
+            be read or written, 4 finished but data was lost, 70 internal
+            error, 130 interrupted (129 and 143 by SIGHUP and SIGTERM), 141
+            standard output was closed."""
+
+
+class _Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click names it)
+        return list(SUMMARIES)
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run a command; an environment variable that belongs to no command is an error."""
+        _check_arithmetic()
+        unknown = sorted(
+            name
+            for name in os.environ
+            if name.startswith("AVSREPLAY_") and name != arithmetic.VARIABLE
+        )
+        if unknown:
+            known = list(self._variables(ctx))
+            unknown = [name for name in unknown if name not in known]
+        if unknown:
+            import difflib
+
+            near = difflib.get_close_matches(unknown[0], known, 1)
+            hint = (
+                f"did you mean {near[0]}?"
+                if near
+                else "unset it, or see 'avsreplay COMMAND --help'"
+            )
+            raise UsageError(
+                "no command has an option of this name",
+                where=f"environment {unknown[0]}",
+                hint=hint,
+            )
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:  # a log on standard output; click exits with 1
+            return 141
+
+    def _variables(self, ctx: click.Context) -> Iterator[str]:
+        """Every environment variable that stands for an option."""
+        for name in SUMMARIES:
+            command = self.get_command(ctx, name)
+            for param in command.params if command else ():
+                automatic = (
+                    f"AVSREPLAY_{name}_{param.name}".upper()
+                    if isinstance(param, click.Option)
+                    else ()
+                )
+                given = param.envvar or automatic
+                yield from [given] if isinstance(given, str) else given
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 (click names it)
+        if name not in SUMMARIES:
+            return None
+        home = importlib.import_module(f"avsreplay.cli.{HOMES.get(name, name)}")
+        command: click.Command = getattr(home, f"{name}_command")
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 (click names it)
+        with formatter.section("Commands"):
+            formatter.write_dl(list(SUMMARIES.items()))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            raise click.UsageError(f"{error.message} Known: {', '.join(SUMMARIES)}.", ctx) from None
+
+
+PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "click", "rich")
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, Python and its dependencies.
+
+    "missing" where one is not installed.
+    """
+    import platform
+    from importlib import metadata
+
+    found = {"avsreplay": __version__, "python": platform.python_version()}
+    for part in PARTS:
+        try:
+            found[part] = metadata.version(part)
+        except metadata.PackageNotFoundError:
+            found[part] = "missing"
+    return found
+
+
+def version_text() -> str:
+    """Return one line for the package and one for its dependencies."""
+    own, *rest = versions().items()
+    return f"{own[0]} {own[1]}\n" + ", ".join(f"{name} {version}" for name, version in rest)
+
+
+def _print_version(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if not wanted or ctx.resilient_parsing:
+        return
+    click.echo(version_text())
+    ctx.exit()
+
+
+@click.group(cls=_Commands, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_print_version,
+    help="Show the versions of avsreplay and of its dependencies.",
+)
+def group() -> None:
+    """Record, replay and test the processing chain of vision-guided capture of a tumbling object.
+
+    Input: point clouds of a log. Output: poses and their errors, fault flags, observability,
+    planned capture time. The same input gives the same bytes.
+    """
+
+
+COMPLETION_EPILOG = """\b
+Examples:
+  eval "$(avsreplay completion bash)"                              in ~/.bashrc
+  eval "$(avsreplay completion zsh)"                               in ~/.zshrc
+  avsreplay completion fish > ~/.config/fish/completions/avsreplay.fish"""
+
+
+@click.command("completion", epilog=COMPLETION_EPILOG)
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion_command(shell: str) -> None:
+    """Print the completion script for SHELL.
+
+    \f
+    Raises:
+        UsageError: the shell is not supported.
+    """  # noqa: D301
+    from click.shell_completion import get_completion_class
+
+    found = get_completion_class(shell)
+    if found is None:
+        raise UsageError(
+            f"no completion for {shell}", where="completion", hint="use bash, zsh or fish"
+        )
+    click.echo(found(group, {}, "avsreplay", "_AVSREPLAY_COMPLETE").source())
+
+
+def _check_arithmetic() -> None:
+    """Raise UsageError if the variable that chooses the arithmetic has another value than those
+    known.
+    """
+    value = os.environ.get(arithmetic.VARIABLE, "pinned")
+    if value not in arithmetic.CHOICES:
+        known = " or ".join(arithmetic.CHOICES)
+        raise UsageError(
+            f"{value[:40]!r} is unknown",
+            where=f"environment {arithmetic.VARIABLE}",
+            hint=f"use {known}",
+        )
+
+
+class _Discarding(io.FileIO):
+    """Standard output that takes what can no longer be written, so that a command completes its
+    other outputs.
+
+    Attributes:
+        failure: why the first write failed; None while standard output can be written.
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int | None:  # type: ignore[override]
+        """Write the data, or discard them after a failed write.
+
+        In both cases their number of bytes is returned.
+        """
+        if self.failure is None:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self.failure = error
+        return len(memoryview(data).cast("B"))
+
+
+def entry_point() -> None:
+    """Run a command of the arguments of this process and exit with its code.
+
+    Every error is one line on stderr.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
+    output, received = _standard_output(), _end_as_interrupt()
+    try:
+        code = group.main(
+            standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY"
+        )
+    except AvsError as error:
+        code = _fail(str(error), error.exit_code)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        code = error.exit_code
+    except click.ClickException as error:
+        code = _fail(_with_help(error), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        code = _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
+    except OSError as error:
+        code = _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
+    except Exception as error:
+        code = _crash(error)
+    code = code if isinstance(code, int) else 0
+    sys.stdout.flush()
+    if output and output.failure and not code:
+        closed = isinstance(output.failure, BrokenPipeError)
+        code = (
+            141
+            if closed
+            else _fail(f"standard output: {output.failure.strerror or output.failure}", 3)
+        )
+    sys.exit(code)
+
+
+def _end_as_interrupt() -> list[int]:
+    """Let SIGTERM and SIGHUP, unless they are ignored, act as Ctrl-C.
+
+    The returned list receives their numbers.
+    """
+    received: list[int] = []
+
+    def interrupt(number: int, _frame: object) -> None:
+        received.append(number)
+        signal.raise_signal(signal.SIGINT)
+
+    for name in (
+        "SIGTERM",
+        "SIGHUP",
+    ):  # Windows has no SIGHUP; a thread other than the main one sets no handler
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            with contextlib.suppress(ValueError):
+                signal.signal(number, interrupt)
+    return received
+
+
+def _with_help(error: click.ClickException) -> str:
+    """The message of an error, with the command that describes the arguments where it states no
+    allowed values.
+    """
+    message = error.format_message().replace("\n\t", " ")
+    invalid = isinstance(error, click.BadParameter) and not isinstance(
+        error, click.MissingParameter
+    )
+    if invalid or not isinstance(error, click.UsageError) or error.ctx is None:
+        return message
+    return f"{message.removesuffix('.')}; see '{error.ctx.command_path} --help'"
+
+
+def _standard_output() -> _Discarding | None:
+    """Replace standard output by one whose failure does not end the command; None where it is not a
+    file.
+
+    A character that the encoding of standard output or standard error does not have is written as
+    an escape.
+    """
+    if sys.stdout is None:  # closed by the shell
+        sys.stdout = io.StringIO()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+    try:
+        output = _Discarding(sys.stdout.fileno(), "wb", closefd=False)
+    except (OSError, ValueError):  # one that a test has put in its place
+        return None
+    encoding, lines = sys.stdout.encoding, bool(sys.stdout.line_buffering)
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(output), encoding, "backslashreplace", line_buffering=lines
+    )
+    return output
+
+
+def _crash(error: Exception) -> int:
+    """Report an unexpected error in one line and write its traceback to a file.
+
+    Return exit code 70.
+    """
+    import hashlib
+    import tempfile
+    import traceback
+
+    text = "".join(traceback.format_exception(error))
+    name = f"avsreplay-crash-{hashlib.sha256(text.encode('utf-8', 'replace')).hexdigest()[:12]}.txt"
+    report, where = Path(tempfile.gettempdir()) / name, "no report could be written"
+    with contextlib.suppress(OSError):
+        arguments = " ".join(map(ascii, sys.argv[1:]))
+        report.write_text(
+            f"avsreplay {arguments}\n{sys.version}\n{text}",
+            encoding="utf-8",
+            errors="backslashreplace",
+        )
+        where = f"please report it with {report}"
+    reason = str(error) or "no message"
+    return _fail(f"internal error: {type(error).__name__}: {reason[:200]}; {where}", 70)
+
+
+def _fail(message: str, code: int) -> int:
+    printable = "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in message
+    )
+    with contextlib.suppress(OSError):
+        click.echo(f"avsreplay: {printable}", err=True)
+    return code

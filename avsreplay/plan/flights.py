@@ -1,0 +1,435 @@
+"""Evaluation of flights against the true motion of the target.
+
+Plans and whole flights in a closed loop (replanning, thrust errors, delay) are compared with ground
+truth. ``Motion`` is the ground truth, or a reference fitted to the whole log, as a function of
+time. Guidance has no access to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array
+from avsreplay.plan import _cone
+from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn, without_turn
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
+from avsreplay.plan.limits import (
+    CONSTRAINTS,
+    Scene,
+    TargetGeometry,
+    hull_vertices,
+    in_fixture_axes,
+    margins,
+)
+from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.plan.supervisor import (
+    RULES,
+    Action,
+    Decision,
+    Facts,
+    Supervisor,
+    SupervisorMemory,
+    SupervisorParams,
+)
+from avsreplay.plan.uncertainty import (
+    Disturbance,
+    Spread,
+    Tolerance,
+    draws,
+    spread,
+    touches,
+    wilson,
+)
+
+__all__ = [
+    "CONSTRAINTS",
+    "RULES",
+    "Action",
+    "CostatePath",
+    "Decision",
+    "Disturbance",
+    "Execution",
+    "Facts",
+    "Flights",
+    "Guidance",
+    "GuidanceState",
+    "Limits",
+    "Miss",
+    "Motion",
+    "PlanParams",
+    "PlannerInput",
+    "RobotParams",
+    "RobotPath",
+    "Scene",
+    "Segment",
+    "Spread",
+    "StepPath",
+    "Supervisor",
+    "SupervisorMemory",
+    "SupervisorParams",
+    "TargetGeometry",
+    "Tolerance",
+    "Turn",
+    "closed_loop",
+    "constrained",
+    "draws",
+    "execute",
+    "hull_vertices",
+    "in_fixture_axes",
+    "interpolated",
+    "margins",
+    "miss",
+    "path_of",
+    "rendezvous",
+    "spread",
+    "turn_time",
+    "turn_to",
+    "with_turn",
+    "without_turn",
+]
+
+Motion = Callable[[Array], tuple[Array, Array, Array]]
+"""Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4) of {C} in {A}."""
+
+
+@value_class(eq=True)
+class Miss:
+    """Error of a plan at its planned end against ground truth.
+
+    Attributes:
+        lead_s: Time between planning and the planned end [s].
+        at_s: Planned end [s].
+        distance_m, speed_mps: Distance and relative speed between robot and true grasp point.
+        angle_deg: Angle between predicted and true attitude of the fixture, NaN where unknown.
+    """
+
+    lead_s: float
+    at_s: float
+    distance_m: float
+    speed_mps: float
+    angle_deg: float
+
+    def inside(self, tolerance: Tolerance) -> bool:
+        """Return whether the errors are within the tolerance; an unknown angle is accepted.
+
+        Args:
+            tolerance: Largest errors of a successful capture.
+        """
+        angle = math.isnan(self.angle_deg) or self.angle_deg <= tolerance.angle_deg
+        return (
+            self.distance_m <= tolerance.position_m
+            and self.speed_mps <= tolerance.speed_mps
+            and angle
+        )
+
+
+@value_class
+class Execution:
+    """Result of a simulated approach.
+
+    Attributes:
+        captured: Whether the gripper closed.
+        miss: Error against ground truth when it closed.
+        actions: (t_s, action, rule) at every change.
+        ended: Last action.
+    """
+
+    captured: bool
+    miss: Miss | None
+    actions: tuple[tuple[float, str, str], ...]
+    ended: Action
+
+    def outcome(self, tolerance: Tolerance) -> str:
+        """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action.
+
+        Args:
+            tolerance: Largest errors of a successful capture.
+        """
+        if self.captured and self.miss is not None:
+            return "captured" if self.miss.inside(tolerance) else "outside"
+        return self.ended.value
+
+
+def miss(path: RobotPath, t_s: float, truth: Motion, attitude: Array | None = None) -> Miss:
+    """Compare the end of a path with ground truth.
+
+    Args:
+        path: Path of the robot.
+        t_s: Begin of the path on the clock of ``truth`` [s].
+        truth: True motion of the fixture.
+        attitude: (4,) predicted q_ac at the end, None where unknown.
+    """
+    position, velocity = path.at(np.array([path.t_go_s]))
+    return _miss_at(t_s + path.t_go_s, path.t_go_s, position[0], velocity[0], truth, attitude)
+
+
+def _miss_at(
+    at_s: float, lead_s: float, r: Array, v: Array, truth: Motion, attitude: Array | None
+) -> Miss:
+    rho, rate, q = truth(np.array([at_s]))
+    turn = math.nan
+    if attitude is not None:
+        turn = math.degrees(
+            float(geometry.angle(geometry.multiply(geometry.conjugate(q[0]), attitude)))
+        )
+    return Miss(
+        lead_s, at_s, float(np.linalg.norm(rho[0] - r)), float(np.linalg.norm(rate[0] - v)), turn
+    )
+
+
+def closed_miss(
+    state: GuidanceState, since_ns: int, truth: Motion, attitude: Array | None = None
+) -> Miss:
+    """Return the error when the gripper closes, at the end of the current segment.
+
+    Args:
+        state: State of a guidance whose action is ``capture``.
+        since_ns: Instant from which ``truth`` counts its seconds.
+        truth: True motion of the fixture.
+        attitude: (4,) q_ac of the gripper.
+    """
+    end_ns = state.segment.end_ns
+    made_ns = end_ns if state.plan is None else state.plan.t_ns
+    r, v = state.segment.at(end_ns)
+    return _miss_at((end_ns - since_ns) * 1e-9, (end_ns - made_ns) * 1e-9, r, v, truth, attitude)
+
+
+def execute(
+    guidance: Guidance,
+    inputs: Iterable[PlannerInput],
+    truth: Motion,
+    attitude: Callable[[PlannerInput, float], Array] | None = None,
+    since_ns: int = 0,
+) -> Execution:
+    """Simulate an approach: guidance receives one input after the other, ground truth decides the
+    result.
+
+    Args:
+        guidance: Guidance of the robot.
+        inputs: What was known after each scan.
+        truth: True motion of the fixture.
+        attitude: Returns the q_ac (4,) that an input predicts for a time after it [s], the attitude
+            of the gripper.
+        since_ns: Instant from which ``truth`` counts its seconds.
+
+    Raises:
+        ValueError: There is no input.
+    """
+    changes: list[tuple[float, str, str]] = []
+    state: GuidanceState | None = None
+    committed: PlannerInput | None = None
+    for known, state in guidance.fly(inputs):
+        decided = (state.decision.action.value, state.decision.rule)
+        if not changes or changes[-1][1:] != decided:
+            changes.append(((known.t_ns - since_ns) * 1e-9, *decided))
+        if state.decision.action is Action.CAPTURE and committed is None:
+            committed = known
+        if state.captured_ns is not None:
+            break
+    if state is None:
+        raise ValueError("the log contains no scan")
+    action = state.decision.action
+    if committed is None or action is not Action.CAPTURE:
+        return Execution(False, None, tuple(changes), action)
+    turned = (
+        attitude(committed, (state.segment.end_ns - committed.t_ns) * 1e-9) if attitude else None
+    )
+    return Execution(True, closed_miss(state, since_ns, truth, turned), tuple(changes), action)
+
+
+def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
+    """Interpolate recorded poses: cubic spline for the position, constant angular rate between
+    attitudes.
+
+    Args:
+        times_s: (n,) ascending times [s], n >= 4.
+        poses: n poses T_ac.
+
+    Returns:
+        A motion that is NaN outside the recorded times.
+
+    Raises:
+        ValueError: There are too few poses, or the times do not ascend.
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    if len(times) < 4 or len(times) != len(poses) or np.any(np.diff(times) <= 0.0):
+        raise ValueError(
+            f"{len(poses)} poses at {len(times)} instants, must be at least 4 at ascending instants"
+        )
+    line, q = _cone.spline(times, np.array([p.t for p in poses])), np.array([p.q for p in poses])
+    turns = geometry.log(
+        geometry.multiply(geometry.conjugate(q[:-1]), q[1:])
+    )  # (n - 1, 3) between the poses
+
+    def at(instants: Array) -> tuple[Array, Array, Array]:
+        inside = (instants >= times[0]) & (instants <= times[-1])
+        position, velocity = (_cone.values(line, times, instants, order) for order in (0, 1))
+        k = np.clip(np.searchsorted(times, instants, "right") - 1, 0, len(turns) - 1)
+        share = np.clip((instants - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
+        attitude = geometry.multiply(q[k], geometry.exp(share[:, None] * turns[k]))
+        for values in (position, velocity, attitude):
+            values[~inside] = np.nan
+        return position, velocity, attitude
+
+    return at
+
+
+@value_class(eq=True)
+class Flights:
+    """Results of whole flights with replanning.
+
+    Attributes:
+        count: Number of flights.
+        captured, outside: Number of captures inside and outside the tolerance.
+        aborted: Number of flights that ended in an abort.
+        touched: Number of flights in which the end-effector touched the body outside the corridor.
+    """
+
+    count: int
+    captured: int
+    outside: int
+    aborted: int
+    touched: int
+
+    def share(self, name: str) -> tuple[float, float, float]:
+        """Return a fraction of the flights and its Wilson 95 % interval.
+
+        Args:
+            name: Name of one of the numbers.
+        """
+        number = int(getattr(self, name))
+        return (number / self.count, *wilson(number, self.count))
+
+    def described(self) -> list[tuple[str, str]]:
+        """Return the figures as a name and a text."""
+        parts = []
+        for name in ("captured", "outside", "aborted", "touched"):
+            share, low, high = self.share(name)
+            parts.append(f"{name} {share:.3f} (95 % {low:.3f} to {high:.3f})")
+        return [(f"{self.count} whole flights", "; ".join(parts))]
+
+
+def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
+    """Return the segment of a robot that has left its path: from t_ns on it flies the same thrust
+    from its own state.
+
+    Args:
+        segment: What the robot flies.
+        t_ns: Instant of the deviation.
+        dr: (3,) deviation of the position [m].
+        dv: (3,) deviation of the velocity [m/s].
+    """
+    since_s = (t_ns - segment.t_ns) * 1e-9
+    r0, v0 = segment.r0 + dr - since_s * dv, segment.v0 + dv
+    path = segment.path
+    if isinstance(path, (CostatePath, StepPath)):
+        path = replace(path, r0=r0, v0=v0)
+    previous = None if segment.previous is None else pushed(segment.previous, t_ns, dr, dv)
+    return replace(segment, r0=r0, v0=v0, path=path, previous=previous)
+
+
+def with_thrust_error(
+    segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator
+) -> Segment:
+    """Return the segment of a robot whose thrust was wrong since the last scan; a coasting robot
+    has no error.
+
+    Args:
+        segment: What the robot flies.
+        t_ns: Instant of the present scan.
+        span_s: Time since the last one [s], during which the error was constant.
+        sigma_mps2: 1 sigma of the error of each axis, as its mean over 1 s [m/s2].
+        rng: Random generator.
+    """
+    if segment.path is None or sigma_mps2 == 0.0 or span_s <= 0.0:
+        return segment
+    u = sigma_mps2 / math.sqrt(span_s) * rng.standard_normal(3)
+    return pushed(segment, t_ns, 0.5 * span_s * span_s * u, span_s * u)
+
+
+def closed_loop(
+    guidance: Guidance,
+    inputs: Iterable[PlannerInput],
+    target: Scene,
+    start_ns: int,
+    tolerance: Tolerance,
+    noise_mps2: float = 0.0,
+    rng: np.random.Generator | None = None,
+    body: Limits | None = None,
+) -> tuple[str, bool]:
+    """Fly one approach with replanning, errors of the thrust and the delay of the planner.
+
+    Args:
+        guidance: Guidance of the robot.
+        inputs: What is known after each scan, in the order of the scans.
+        target: The true target.
+        start_ns: Instant from which its times count.
+        tolerance: Largest errors of a capture.
+        noise_mps2: 1 sigma of the acceleration error of each axis, as its mean over 1 s [m/s2]; it
+            is constant between two scans and independent from one interval to the next.
+        rng: Random generator of these errors; needed where they are not zero.
+        body: Limits whose clearance is the radius of the end-effector; None: contact is not
+            checked.
+
+    Returns:
+        ``captured``, ``outside`` or the last action, and whether the end-effector touched the body.
+
+    Raises:
+        ValueError: There is no scan.
+    """
+    state: GuidanceState | None = None
+    aimed: Array | None = None
+    last_ns, touched = start_ns, False
+    for known in inputs:
+        if state is None:
+            state, last_ns = guidance.initial(known.t_ns), known.t_ns
+        span = (known.t_ns - last_ns) * 1e-9
+        touched |= body is not None and _touched(
+            target, body, state.segment, start_ns, last_ns, known.t_ns
+        )
+        if rng is not None:
+            state = replace(
+                state, segment=with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
+            )
+        state, last_ns = guidance.step(state, known), known.t_ns
+        if (
+            state.decision.action is Action.CAPTURE
+            and aimed is None
+            and known.scene.attitude is not None
+        ):
+            aimed = known.scene.attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
+        if state.captured_ns is not None or state.decision.action is Action.ABORT:
+            break
+    if state is None:
+        raise ValueError("there is no scan")
+    if state.captured_ns is None:
+        return state.decision.action.value, touched
+    end_s = (state.segment.end_ns - start_ns) * 1e-9
+    r, v = state.segment.at(state.segment.end_ns)
+    attitude = target.attitude
+    if attitude is None:
+        attitude, aimed = (lambda times: np.full((len(times), 4), np.nan)), None
+    found = _miss_at(end_s, 0.0, r, v, lambda times: (*target.goal(times), attitude(times)), aimed)
+    return ("captured" if found.inside(tolerance) else "outside"), touched
+
+
+def _touched(
+    scene: Scene, body: Limits, segment: Segment, start_ns: int, begin_ns: int, end_ns: int
+) -> bool:
+    """Return whether the end-effector touches the body between two scans, at ten instants."""
+    instants = np.linspace(begin_ns, end_ns, 10, endpoint=False).astype(np.int64)
+    r = np.array(
+        [segment.at(int(t))[0] for t in instants if segment.path is None or t <= segment.end_ns]
+    )
+    return touches(
+        scene, body, np.asarray((instants[: len(r)] - start_ns) * 1e-9, dtype=np.float64), r
+    )

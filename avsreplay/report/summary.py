@@ -1,0 +1,345 @@
+"""The summary of a run, one fold over its rows.
+
+Terms: a scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are against the
+log's truth. Sums are correctly rounded, so the summary does not depend on their order. The speed in
+scans per second is not part of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field
+from itertools import compress, pairwise
+from operator import not_
+from typing import Any
+
+import numpy as np
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array
+from avsreplay.records import BLOCKS, Label, State
+from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
+from avsreplay.report.parameters import Parameter, parameters
+from avsreplay.report.summary_parts import (
+    Capture,
+    Drifting,
+    Statistics,
+    VelocityChange,
+    add_rows,
+    median,
+)
+from avsreplay.rows import Row
+
+NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
+# 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
+NIS_LIMIT = 27.8563
+BLOCK_BANDS = {
+    2: (0.05064, 7.3778),
+    3: (0.2158, 9.3484),
+}  # the same points with 2 and 3 degrees of freedom
+NEES_BAND = (9.5908, 34.1696)  # the same points with 20 degrees of freedom
+_BY_STATE = (
+    "pos_err_m",
+    "rot_err_deg",
+    "reg_pos_err_m",
+    "reg_rot_err_deg",
+    "nis",
+    "rms_m",
+    "iterations",
+)
+_OF_ALL = ("nees", *(f"nees_{name}" for name in BLOCKS))
+_STATES = (
+    "t_ns",
+    "t_s",
+    "gamma",
+    "fault",
+    "status",
+    "reason",
+    "cauchy_weight",
+    "reference",
+    "ogm_rank",
+    "converged",
+)
+_TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL, *Capture.COLUMNS, *VelocityChange.COLUMNS)
+
+
+@value_class(eq=True)
+class Errors:
+    """Position [m] and rotation [deg] errors over the same scans; None without truth."""
+
+    position_m: Statistics | None
+    rotation_deg: Statistics | None
+
+
+@value_class(eq=True)
+class Share:
+    """A chi-square statistic.
+
+    Its median and the shares of scans inside and above the two-sided 95 % band.
+    """
+
+    count: int
+    median: float
+    inside: float
+    above: float
+    low: float
+    high: float
+
+
+@value_class(eq=True)
+class ObservabilitySummary:
+    """The Gramian at the last scan, and the time of the first scan at which its rank was 20 (None.
+
+    Never).
+    """
+
+    log10_cond: float | None
+    log10_cond_scaled: float | None
+    rank: int | None
+    full_rank_s: float | None
+
+
+@value_class(eq=True)
+class ConvergenceSummary:
+    """t_1: time of the first scan whose estimate the planner may use; whether it holds at the end.
+
+    Times withdrawn.
+    """
+
+    t1_s: float | None
+    at_end: bool
+    withdrawn: int
+
+
+@value_class(eq=True)
+class Summary:
+    """The results of a run as a whole.
+
+    Attributes:
+        pose_all, pose_healthy, pose_coasting: errors of the estimate.
+        registration_healthy, registration_flagged: errors of the measured poses.
+        reasons: why scans were flagged.
+        status: scans by the status of their registration.
+        counts: losses and clock problems.
+        acceleration: of the target, in words.  Both are given by the caller.
+        manoeuvres: number of those of the target.
+        velocity_changes: each of them.
+        violations: consistency checks that the estimate failed.
+        drift: a constant torque or force on the target, None where none was found.
+        weighed_down: healthy poses with a Cauchy weight below 1.
+        reinitialised: reinitialisations of the estimate.
+        coasts: intervals of prediction without measurement.
+        interval_s: median between scans.
+        gaps: intervals between scans longer than 1.5 times the median.
+    """
+
+    scans: int
+    duration_s: float
+    interval_s: float | None
+    healthy: int
+    coasting: int
+    gaps: int
+    status: Mapping[str, int]
+    reasons: Mapping[str, int]
+    pose_all: Errors
+    pose_healthy: Errors
+    pose_coasting: Errors
+    registration_healthy: Errors
+    registration_flagged: Errors
+    fit_error_m: Statistics | None
+    iterations: Statistics | None
+    faults: FaultAccount
+    coasts: tuple[Coast, ...]
+    parameters: tuple[Parameter, ...]
+    sigma_hits: int | None
+    r_floors: int | None
+    weighed_down: int
+    reinitialised: int | None
+    manoeuvres: int | None
+    velocity_changes: tuple[VelocityChange, ...]
+    drift: Drifting | None
+    violations: int | None
+    nis: Share | None
+    nees: Share | None
+    nees_blocks: Mapping[str, Share]
+    reference: str | None
+    observability: ObservabilitySummary
+    convergence: ConvergenceSummary
+    capture: Capture
+    counts: Mapping[str, int] = field(default_factory=dict)
+    acceleration: str | None = None
+
+    @classmethod
+    def fold(
+        cls,
+        rows: Iterable[Row],
+        *,
+        labels: Sequence[Label] | None = None,
+        truth: State | None = None,
+        counts: Mapping[str, int] | None = None,
+    ) -> Summary:
+        """Summarise rows in their order; the arguments are those of SummaryFold."""
+        fold = SummaryFold(labels=labels, truth=truth, counts=counts)
+        fold.extend(list(rows))
+        return fold.result()
+
+    @property
+    def longest_coast(self) -> Coast | None:
+        """The longest interval without a measurement (the first of equals)."""
+        return max(self.coasts, key=lambda c: c.duration_s, default=None)
+
+
+class SummaryFold:
+    """Takes rows one by one and keeps a few numbers of each.
+
+    Args:
+        labels: injected faults; None where the log does not state them.
+        truth: the true state, with the principal axes in the order of the estimate's.
+        counts: losses and clock problems by name.
+    """
+
+    def __init__(
+        self,
+        *,
+        labels: Sequence[Label] | None = None,
+        truth: State | None = None,
+        counts: Mapping[str, int] | None = None,
+    ) -> None:
+        self._labels, self._truth, self._counts = labels, truth, dict(counts or {})
+        self._taken: dict[str, list[Any]] = {name: [] for name in _TAKEN}
+        self._last: Row | None = None
+
+    def anew(self, rows: Sequence[Row]) -> SummaryFold:
+        """A fold with the same labels and truth over other rows."""
+        fold = SummaryFold(labels=self._labels, truth=self._truth, counts=self._counts)
+        fold.extend(rows)
+        return fold
+
+    def add(self, row: Row) -> None:
+        """Take the next row."""
+        for name, column in self._taken.items():
+            column.append(getattr(row, name))
+        self._last = row
+
+    def extend(self, rows: Sequence[Row]) -> None:
+        """Take the next rows."""
+        add_rows(self._taken, rows)
+        self._last = rows[-1] if rows else self._last
+
+    def result(self, truth: State | None = None) -> Summary:
+        """The summary of all rows so far; ``truth`` in place of the one given at the start."""
+        taken = self._taken
+        marks = list(
+            map(
+                Mark,
+                *(taken[name] for name in ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg")),
+            )
+        )
+        stamps, times_s, flagged = (
+            taken["t_ns"],
+            taken["t_s"],
+            [gamma == 0 for gamma in taken["gamma"]],
+        )
+        steps = [b - a for a, b in pairwise(stamps) if b > a]
+        full = [rank == 20 for rank in taken["ogm_rank"]]
+        last = self._last
+        healthy = taken["gamma"].count(1)
+        figures = _figures(taken)
+        return Summary(
+            scans=len(stamps),
+            duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0,
+            interval_s=median(steps) * 1e-9 if steps else None,
+            healthy=healthy,
+            coasting=len(stamps) - healthy,
+            gaps=len(gaps(stamps)),
+            status=dict(sorted(Counter(taken["status"]).items())),
+            reasons=dict(sorted(Counter(compress(taken["reason"], flagged)).items())),
+            pose_all=_errors(figures, "", "healthy", "coasting"),
+            pose_healthy=_errors(figures, "", "healthy"),
+            pose_coasting=_errors(figures, "", "coasting"),
+            registration_healthy=_errors(figures, "reg_", "healthy"),
+            registration_flagged=_errors(figures, "reg_", "coasting"),
+            fit_error_m=Statistics.of(figures["rms_m/healthy"]),
+            iterations=Statistics.of(figures["iterations/healthy"]),
+            faults=account(marks, self._labels),
+            coasts=tuple(coasts(marks)),
+            parameters=parameters(last, truth or self._truth) if last else (),
+            sigma_hits=last.sigma_hits if last else None,
+            r_floors=last.r_floors if last else None,
+            weighed_down=sum(
+                w is not None and w < 1.0
+                for w in compress(taken["cauchy_weight"], map(not_, flagged))
+            ),
+            reinitialised=last.reinitialised if last else None,
+            manoeuvres=last.manoeuvres if last else None,
+            velocity_changes=VelocityChange.of(taken),
+            drift=Drifting.of(last) if last else None,
+            violations=last.violations if last else None,
+            nis=_share(figures["nis/healthy"], NIS_BAND),
+            nees=_share(figures["nees"], NEES_BAND),
+            nees_blocks=_blocks(figures),
+            reference=next(filter(None, reversed(taken["reference"])), None),
+            observability=_observability(last, next(compress(times_s, full), None)),
+            convergence=ConvergenceSummary(
+                t1_s=next(compress(times_s, taken["converged"]), None),
+                at_end=bool(last and last.converged),
+                withdrawn=sum(a and not b for a, b in pairwise(taken["converged"])),
+            ),
+            capture=Capture.of(taken),
+            counts=self._counts,
+        )
+
+
+def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
+    """The finite values of each figure, of those in ``_BY_STATE`` apart for healthy and coasting
+    scans.
+    """
+    healthy, out = np.equal(taken["gamma"], 1), {}
+    for name in (*_BY_STATE, *_OF_ALL):
+        column = np.array(taken[name], dtype=np.float64)
+        known = np.isfinite(column)
+        if name in _BY_STATE:
+            out[f"{name}/healthy"], out[f"{name}/coasting"] = (
+                column[known & healthy],
+                column[known & ~healthy],
+            )
+        else:
+            out[name] = column[known]
+    return out
+
+
+def _observability(last: Row | None, full_rank_s: float | None) -> ObservabilitySummary:
+    if last is None:
+        return ObservabilitySummary(None, None, None, None)
+    return ObservabilitySummary(
+        last.ogm_log10_cond, last.ogm_log10_cond_scaled, last.ogm_rank, full_rank_s
+    )
+
+
+def _errors(figures: Mapping[str, Array], prefix: str, *states: str) -> Errors:
+    position, rotation = (
+        np.concatenate([figures[f"{prefix}{name}/{state}"] for state in states])
+        for name in ("pos_err_m", "rot_err_deg")
+    )
+    return Errors(Statistics.of(position), Statistics.of(rotation))
+
+
+def _blocks(figures: Mapping[str, Array]) -> dict[str, Share]:
+    """NEES of each block of the state and its band, per degree of freedom."""
+    out: dict[str, Share] = {}
+    for name, block in BLOCKS.items():
+        size = block.stop - block.start
+        low, high = (bound / size for bound in BLOCK_BANDS[size])
+        share = _share(figures[f"nees_{name}"] / size, (low, high))
+        if share is not None:
+            out[name] = share
+    return out
+
+
+def _share(values: Array, band: tuple[float, float]) -> Share | None:
+    if not len(values):
+        return None
+    above = int(np.count_nonzero(values > band[1])) / len(values)
+    inside = int(np.count_nonzero((band[0] <= values) & (values <= band[1]))) / len(values)
+    return Share(len(values), median(values), inside, above, *band)

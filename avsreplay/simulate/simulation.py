@@ -1,0 +1,271 @@
+"""One simulated recording: scans and their truth, one after the other. The same seed gives the same
+bits.
+
+Every scan has its own random streams, one per purpose, so that a fault added to a scenario does not
+change other scans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field, replace
+from itertools import repeat
+from typing import TypeVar
+
+import numpy as np
+
+from avsreplay.errors import value_class
+from avsreplay.geometry import Pose
+from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.simulate import faults
+from avsreplay.simulate.faults import InjectedFault, Kind
+from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.rays import Engine, Pattern
+from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
+from avsreplay.simulate.scanner import Returns, Scanner
+from avsreplay.simulate.scenario import Scenario, belief, load_scenario, scenario_of
+from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
+from avsreplay.simulate.target import Shape, body, builtin_surface
+
+__all__ = [
+    "EPOCH_NS",
+    "Engine",
+    "RecordedFault",
+    "Scenario",
+    "Shape",
+    "Simulation",
+    "builtin_surface",
+    "disturbed",
+    "load_scenario",
+    "scenario_of",
+    "simulate",
+]
+
+
+# time of the first scan of every simulated log, fixed so that logs are reproducible
+EPOCH_NS = 1_700_000_000_000_000_000
+NS = 1_000_000_000
+T = TypeVar("T")
+_NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", "plume", "limb"
+_STREAMS = {name: k for k, name in enumerate(_NAMES)}
+
+
+@value_class
+class Simulation:
+    """A simulated log.
+
+    Attributes:
+        header: Header of the log.
+        count: Number of scans, dropped ones included.
+    """
+
+    header: LogHeader
+    count: int
+    _scenario: Scenario = field(repr=False)
+    _motion: Motion = field(repr=False)
+    _scanner: Scanner = field(repr=False)
+    _bodies: Sequence[SceneBody] = field(repr=False, default=())
+    _camera: MovingCamera | None = field(repr=False, default=None)
+
+    @property
+    def engine(self) -> Engine:
+        """The engine that casts the rays."""
+        return self._scanner.engine
+
+    def truth(self, log_ns: int) -> State:
+        """Return the true state.
+
+        Args:
+            log_ns: Instant on the clock of the log [ns].
+        """
+        return self._motion.state((log_ns - EPOCH_NS) / NS)
+
+    def truth_of(self, scan: Scan) -> Truth:
+        """Return the ground truth at one of this simulation's scans: pose, full state and injected
+        fault.
+
+        Args:
+            scan: A scan of ``scans``.
+        """
+        state = self.truth(scan.log_ns)
+        kinds = [kind.value for kind in self._faults(scan.log_ns)]
+        t_s, params = (scan.log_ns - EPOCH_NS) / NS, self._scenario.params
+        others = [
+            each for each in (*params.object, *params.plume, *params.limb) if each.present(t_s)
+        ]
+        kinds += [each.name for each in others if each.duration_s is not None]
+        return Truth(state.T_ac, state, next(iter(kinds), None))
+
+    def camera_poses(self, scan: Scan) -> list[tuple[int, Pose]]:
+        """Return the poses of a moving camera in the fixed frame as its topic reports them; none
+        for one at rest.
+
+        Args:
+            scan: A scan of ``scans``.
+
+        Returns:
+            Each pose with its time after the stamp [ns]: one at the stamp, and eight more during a
+            scan that lasts.
+        """
+        if self._camera is None:
+            return []
+        rng, scanner = self._rng("camera_pose", scan.seq), self._scenario.params.scanner
+        last = 0.0 if scanner.pattern is Pattern.FLASH else scanner.scan_s
+        after = sorted({round(part * last * NS / 8) for part in range(9)})
+        return [
+            (ns, self._camera.reported((scan.log_ns + ns - EPOCH_NS) / NS, rng)) for ns in after
+        ]
+
+    def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
+        return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+
+    def scans(self) -> Iterator[Scan]:
+        """The scans in the order of recording; a dropped one leaves a gap in ``seq``."""
+        last: Scan | None = None
+        for k in range(self.count):
+            scan = self._scan(k, last)
+            if scan is not None:
+                if next(iter(self._faults(scan.log_ns)), None) is not Kind.FROZEN:
+                    last = scan
+                yield scan
+
+    def _scan(self, k: int, last: Scan | None) -> Scan | None:
+        log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
+        now = self._faults(log_ns)
+        if Kind.DROPPED in now:
+            return None
+        returns = self._returns(k, log_ns, now)
+        timed = self._scenario.params.scanner.pattern is not Pattern.FLASH
+        jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
+        scan = Scan(
+            seq=k,
+            t_ns=log_ns + round(jump * NS),
+            log_ns=log_ns,
+            points=returns.points,
+            times_s=returns.times_s.astype(np.float32) if timed else None,
+            status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
+            intensities=(
+                returns.intensities.astype(np.float32)
+                if self._scenario.params.scanner.intensity
+                else None
+            ),
+        )
+        if Kind.FROZEN in now and last is not None:
+            scan = replace(
+                scan,
+                points=last.points,
+                times_s=last.times_s,
+                intensities=last.intensities,
+                status=last.status,
+            )
+        return scan
+
+    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault]) -> Returns:
+        """Ray casting, occlusion, noise, bias, clutter.
+
+        In the order in which they act on the light.
+        """
+        noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
+        bodies = [body for body in self._bodies if body.params.present(t_s)]
+        plumes = [each for each in params.plume if each.present(t_s)]
+        limbs = [each for each in params.limb if each.present(t_s)]
+        lights = self._with_rng("plume", k, plumes), self._with_rng("limb", k, limbs)
+        returns = self._scanner.cast(t_s, bodies, *lights)
+        wrong = (
+            self._rng("fault", k) if now else noise
+        )  # not used without a fault; to create it takes 25 us
+        for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
+            if kind in now:
+                returns = faults.occlude(
+                    returns, faults.strength(now[kind]), self._side(now[kind]), wrong
+                )
+        factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
+        factor *= self._scanner.glare(t_s, limbs)
+        returns = self._scanner.disturb(returns, noise, factor)
+        if Kind.RANGE_BIAS in now:
+            returns = replace(
+                returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS])
+            )
+        if Kind.CLUTTER in now:
+            ratio, centre = (
+                faults.strength(now[Kind.CLUTTER]),
+                self.truth(log_ns).T_ac.apply(self._scanner.centre_c),
+            )
+            if self._camera is not None:
+                centre = self._camera.pose(t_s).inverse().apply(centre)
+            returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
+        return (
+            returns.keep(np.zeros(len(returns.ranges), dtype=bool))
+            if Kind.EMPTY in now
+            else returns.in_order()
+        )
+
+    def _side(self, fault: InjectedFault) -> float:
+        """Direction in the image from which the plate of a fault enters, the same for all its scans
+        [rad].
+        """
+        return float(
+            self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi)
+        )
+
+    def _with_rng(
+        self, stream: str, k: int, present: list[T]
+    ) -> list[tuple[T, np.random.Generator]]:
+        """Each of what is present with the generator of their stream, which is created if there is
+        any.
+        """
+        return list(zip(present, repeat(self._rng(stream, k)), strict=False)) if present else []
+
+    def _rng(self, stream: str, k: int) -> np.random.Generator:
+        return _generator(self._scenario.params.seed, stream, k)
+
+
+def simulate(
+    scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface] | None = None
+) -> Simulation:
+    """The simulation of a scenario.
+
+    Args:
+        scenario: The scenario.
+        surface: The model in {C}.
+        meshes: Surface of every mesh that an object of the scenario names.
+
+    Raises:
+        UsageError: The model has no mass properties.
+        MissingBackend: The ray engine is not installed.
+    """
+    params = scenario.params
+    span_s = params.duration_s + params.scanner.scan_s
+    motion = Motion(
+        body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0)
+    )
+    phases = _generator(params.seed, "camera", 0).uniform(0.0, 2.0 * math.pi, 6)
+    camera = None if params.camera is None else MovingCamera(params.camera, phases)
+    scanner = Scanner(params.scanner, surface, motion, params.material, params.appendage, camera)
+    first = motion.state(0.0)
+    start = None
+    if params.start is not None:
+        start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
+    others = [each.label(EPOCH_NS) for each in (*params.object, *params.plume, *params.limb)]
+    header = LogHeader(
+        surface=surface,
+        scenario=scenario.text,
+        seed=params.seed,
+        labels=(
+            *(faults.label(f, EPOCH_NS) for f in params.fault),
+            *(label for label in others if label),
+        ),
+        start=start,
+        truth=first,
+        notes={"source": "simulated", "name": params.name, "ray_engine": scanner.engine.value},
+    )
+    count = int(params.duration_s * params.rate_hz + 1e-9)
+    bodies = scene_bodies(params.object, dict(meshes or {}), params.scanner.engine)
+    return Simulation(header, count, scenario, motion, scanner, bodies, camera)
+
+
+def _generator(seed: int, stream: str, k: int) -> np.random.Generator:
+    return np.random.Generator(
+        np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(_STREAMS[stream], k)))
+    )
