@@ -38,9 +38,8 @@ THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def has_variants() -> bool:
-    """Return whether this system has the variants that ``PINS`` names.
-
-    Linux with glibc on x86-64.
+    """Return whether this system has the variants that ``PINS`` names: Linux with glibc on
+    x86-64.
     """
     if not sys.platform.startswith("linux") or os.uname().machine != "x86_64":
         return False
@@ -87,9 +86,8 @@ def pin() -> None:
 
 
 def _numpy_variants() -> bool:
-    """Return whether numpy uses a variant that not every processor has.
-
-    It may have been imported before the pin.
+    """Return whether numpy uses a variant that not every processor has: it may have been
+    imported before the pin.
     """
     core = importlib.import_module(
         "numpy._core._multiarray_umath"

@@ -255,9 +255,8 @@ def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
 
 
 def _check_alike(found: Any, like: Any) -> None:
-    """Raise ValueError where the types or the attributes of two values differ.
-
-    None is like everything.
+    """Raise ValueError where the types or the attributes of two values differ; None is like
+    everything.
     """
     if like is None:
         return

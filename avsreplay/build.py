@@ -1,6 +1,5 @@
-"""Creates the stages from configuration and log header.
-
-The only place where names become objects.
+"""Creates the stages from configuration and log header: the only place where names become
+objects.
 """
 
 from __future__ import annotations
@@ -121,9 +120,8 @@ def first_state(ready: Stages) -> PipelineState:
 def _initialise(
     config: RunConfig, header: LogHeader, truth_of: Callable[[Scan], Truth]
 ) -> Callable[[Scan], tuple[Pose | None, str]]:
-    """Where the first pose comes from: first scan -> T_ac (None.
-
-    Search without a guess) and the name of its source.
+    """Where the first pose comes from: first scan -> T_ac (None: search without a guess) and
+    the name of its source.
     """
     start = header.start
     if config.init == "truth":

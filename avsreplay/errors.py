@@ -44,9 +44,8 @@ def value_class(
 
 
 def _described(self: Any) -> str:
-    """Name and fields of a value.
-
-    One function for all classes, because each would take 0.1 ms to make.
+    """Name and fields of a value; one function for all classes, because each would take 0.1
+    ms to make.
     """
     shown = (f"{each.name}={getattr(self, each.name)!r}" for each in fields(self) if each.repr)
     return f"{type(self).__qualname__}({', '.join(shown)})"
@@ -77,9 +76,8 @@ def counted(count: int, noun: str) -> str:
 
 
 class AvsError(Exception):
-    """An error that the user can correct; its text is one line.
-
-    Where, what is wrong, what to do.
+    """An error that the user can correct; its text is one line: where, what is wrong, what to
+    do.
     """
 
     exit_code = 2

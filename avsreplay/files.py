@@ -29,9 +29,8 @@ _CLEANED, _COUNTER = set[Path](), itertools.count()
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether an output is written directly.
-
-    ``-``, a device or a FIFO, also behind a symbolic link.
+    """Return whether an output is written directly: ``-``, a device or a FIFO, also behind a
+    symbolic link.
     """
     if path == STDOUT:
         return True

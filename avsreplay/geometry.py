@@ -117,9 +117,8 @@ def _product(
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
-    """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4).
-
-    The inverse rotations of unit quaternions.
+    """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4): the inverse rotations
+    of unit quaternions.
     """
     return np.asarray(q_ab, dtype=np.float64) * _CONJUGATE
 
@@ -244,9 +243,8 @@ def log(q: ArrayLike) -> Array:
 
 
 def angle(q: ArrayLike) -> Array:
-    """Return the rotation angles (...) in [0, pi] [rad] of quaternions (..., 4).
-
-    Their length does not matter.
+    """Return the rotation angles (...) in [0, pi] [rad] of quaternions (..., 4); their length
+    does not matter.
     """
     a: Array = np.asarray(q, dtype=np.float64)
     if a.ndim == 1:
@@ -270,9 +268,8 @@ def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array)
 
 
 def across(axis: Array) -> Array:
-    """Return a unit vector (3,) at right angles to a unit vector (3,).
-
-    The part of a coordinate axis across it.
+    """Return a unit vector (3,) at right angles to a unit vector (3,): the part of a
+    coordinate axis across it.
     """
     side = np.eye(3)[int(np.abs(axis).argmin())]
     side = side - (side @ axis) * axis
@@ -308,9 +305,8 @@ class Pose:
 
     @classmethod
     def _of(cls, q: tuple[float, ...], t: list[float]) -> Pose:
-        """The pose of a quaternion that is not zero and of a position.
-
-        As the constructor, in half the time.
+        """The pose of a quaternion that is not zero and of a position: as the constructor, in
+        half the time.
         """
         pose, pose_q, pose_t = cls.__new__(cls), np.array(_unit(*q)), np.array(t)
         pose_q.flags.writeable = pose_t.flags.writeable = False

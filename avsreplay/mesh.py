@@ -216,9 +216,8 @@ def _openings(
     paired: NDArray[np.bool_],
     of: NDArray[np.int64],
 ) -> Array:
-    """Area of the circles that are as long as the rims of each part; ``corners``.
-
-    Faces with equal vertices as one.
+    """Area of the circles that are as long as the rims of each part; ``corners``: faces with
+    equal vertices as one.
     """
     rim = np.flatnonzero(~paired)
     face, side = rim // 3, rim % 3
@@ -254,9 +253,8 @@ class _Edges:
 
 @value_class
 class _Parts:
-    """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding.
-
-    Which parts are closed.
+    """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding;
+    which parts are closed.
     """
 
     of: NDArray[np.int64]
@@ -281,9 +279,8 @@ def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
 def _distinct(
     corners: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Faces that differ.
-
-    Indices (k,), which of them (m,) each face equals, and whether its winding is the other.
+    """Faces that differ: indices (k,), which of them (m,) each face equals, and whether its
+    winding is the other.
     """
     order = np.argsort(corners, axis=1, kind="stable")
     even = (order[:, 1] - order[:, 0]) % 3 == 1
@@ -355,9 +352,8 @@ def _share(paired: NDArray[np.bool_], of: NDArray[np.int64]) -> Array:
 
 
 def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Six times the signed volume and the area of each part.
-
-    Tetrahedra from the centroid of its faces.
+    """Six times the signed volume and the area of each part; tetrahedra from the centroid of
+    its faces.
     """
     corners = vertices[faces]
     middles = corners.mean(axis=1)

@@ -268,9 +268,8 @@ def _unit_option(scale: float, given: float) -> str:
 
 
 def _units(ratio: float, given: float) -> list[float]:
-    """Units in which the model has the size of the scans, best first.
-
-    ``ratio`` is that with the ``given`` unit.
+    """Units in which the model has the size of the scans, best first; ``ratio`` is that with
+    the ``given`` unit.
     """
     low, high = _ONE_SIDE
     fitting = [scale for scale in _UNITS if scale != given and low <= ratio * given / scale <= high]
@@ -373,9 +372,8 @@ def _located(
 def _crop_advice(
     clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str
 ) -> Advice | None:
-    """The crop that keeps the target in all examined scans.
-
-    None if hardly any point lies outside it.
+    """The crop that keeps the target in all examined scans; None if hardly any point lies
+    outside it.
     """
     margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
     ranges = [np.linalg.norm(points, axis=1) for points in targets]

@@ -207,9 +207,8 @@ class Outcome:
 
 @value_class(eq=True)
 class PoseError:
-    """Difference of two poses.
-
-    Distance of their origins [m] and angle between their attitudes [deg].
+    """Difference of two poses: distance of their origins [m] and angle between their
+    attitudes [deg].
     """
 
     distance_m: float
@@ -218,9 +217,8 @@ class PoseError:
 
 @value_class(eq=True)
 class CaptureError:
-    """Gripper against true grasp point at the planned instant.
-
-    NaN where the truth is not known at that instant.
+    """Gripper against true grasp point at the planned instant; NaN where the truth is not
+    known at that instant.
     """
 
     distance_m: float

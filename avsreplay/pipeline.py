@@ -64,9 +64,8 @@ class Measurement:
 
 @value_class
 class MonitorState:
-    """What the monitors carry from scan to scan; ``motion``.
-
-    Trajectory of the last fit, which the Gramian follows.
+    """What the monitors carry from scan to scan; ``motion``: trajectory of the last fit,
+    which the Gramian follows.
     """
 
     gramian: Gramian
@@ -373,9 +372,8 @@ def _measurement(
 def _judge(
     stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
 ) -> tuple[Prediction, Innovation | None, Verdict]:
-    """The prior at the instant of the measurement, the innovation (None.
-
-    Nothing measured) and the verdict.
+    """The prior at the instant of the measurement, the innovation (None: nothing measured)
+    and the verdict.
     """
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
@@ -409,9 +407,8 @@ def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
 def _deskewed(
     stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction
 ) -> NDArray[Any]:
-    """The points at the scan's instant.
-
-    Moved by the predicted motion where they have times and a motion is known.
+    """The points at the scan's instant: moved by the predicted motion where they have times
+    and a motion is known.
     """
     if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
@@ -427,9 +424,8 @@ Forecaster = Callable[[Array], Forecast]
 def target_scene(
     estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
 ) -> Scene:
-    """Return the predicted target after a belief, as the planner uses it.
-
-    Estimate and forecast, never the truth.
+    """Return the predicted target after a belief, as the planner uses it: estimate and
+    forecast, never the truth.
     """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:

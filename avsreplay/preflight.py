@@ -1,6 +1,5 @@
-"""Checks before a run.
-
-Model, scans, truth, transforms and time stamps, each with the option to add.
+"""Checks before a run: model, scans, truth, transforms and time stamps, each with the option
+to add.
 """
 
 from __future__ import annotations
@@ -134,9 +133,8 @@ def _contents(
 
 
 def _poses(source: Source, surface: Surface | None) -> list[Advice]:
-    """Measured poses.
-
-    How many of a sample are valid, where their covariance comes from, and the size of the target.
+    """Measured poses: how many of a sample are valid, where their covariance comes from, and
+    the size of the target.
     """
     found = [source.scan_at(seq) for seq in _spread(len(source), _POSES)]
     bad = [scan for scan in found if scan.pose is None]
@@ -192,9 +190,8 @@ def _step(source: Source, surface: Surface | None) -> list[Advice]:
 
 
 def _share_on_model(source: Source, registrar: Registrar) -> float | None:
-    """Share of the first scan's points on the model, registered from its known pose.
-
-    None without either.
+    """Share of the first scan's points on the model, registered from its known pose; None
+    without either.
     """
     if not len(source) or len((scan := source.scan_at(0)).points) < 10:
         return None

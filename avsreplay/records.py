@@ -161,9 +161,8 @@ class State:
 
     @property
     def T_ac(self) -> Pose:
-        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho.
-
-        It is computed once.
+        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho; it
+        is computed once.
         """
         pose = self._T_ac or Pose.composed(self.q_ab, self.r_a, self.q_bc, self.c_b)
         object.__setattr__(self, "_T_ac", pose)
@@ -221,9 +220,8 @@ class Scan:
 
 @value_class
 class Truth:
-    """Ground truth at a scan, for scoring only.
-
-    T_ac, full state and label of the injected fault, None if unknown.
+    """Ground truth at a scan, for scoring only: T_ac, full state and label of the injected
+    fault, None if unknown.
     """
 
     pose: Pose | None = None
@@ -324,9 +322,8 @@ class Alignment:
 
 @value_class
 class Belief:
-    """Mean x and covariance P (20, 20) of the error states at an instant.
-
-    Dq_v and dmu_v are HALF-angle vectors.
+    """Mean x and covariance P (20, 20) of the error states at an instant; dq_v and dmu_v are
+    HALF-angle vectors.
     """
 
     t_ns: int
@@ -398,9 +395,8 @@ class Manoeuvre:
 
 
 class Drift(Manoeuvre):
-    """A constant acceleration since ``t_ns``.
-
-    ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force.
+    """A constant acceleration since ``t_ns``: ``rate`` in {C} [rad/s2] by a torque,
+    ``velocity`` [m/s2] by a force.
     """
 
 

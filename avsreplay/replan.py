@@ -1,6 +1,5 @@
-"""Planning from the saved beliefs of a result.
-
-One plan, its distribution over the belief, its errors, the approach.
+"""Planning from the saved beliefs of a result: one plan, its distribution over the belief,
+its errors, the approach.
 """
 
 from __future__ import annotations
@@ -236,9 +235,8 @@ class Replanning:
 
     @property
     def _body(self) -> Limits | None:
-        """The limits for contact.
-
-        That of the end-effector itself, without the margin of the plan.
+        """The limits for contact: that of the end-effector itself, without the margin of the
+        plan.
         """
         return (
             None
@@ -247,9 +245,8 @@ class Replanning:
         )
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
-        """Return the error of a plan made at scan ``index`` against the truth.
-
-        None without truth or after the log.
+        """Return the error of a plan made at scan ``index`` against the truth; None without
+        truth or after the log.
         """
         if self.saved.truth is None or not made.found:
             return None
@@ -299,9 +296,8 @@ class Replanning:
     def _measured(
         self, belief: Belief, drawn: Belief, rng: np.random.Generator
     ) -> Iterator[PlannerInput]:
-        """Inputs of guidance for a drawn target after each scan.
-
-        The filter with poses that have its own noise.
+        """Inputs of guidance for a drawn target after each scan: the filter with poses that
+        have its own noise.
         """
         params = replace(
             self.saved.estimator.params, noise=NoiseSource.R0
@@ -353,9 +349,8 @@ class Replanning:
 
 
 def _draws(belief: Belief, count: int, rng: np.random.Generator) -> list[Belief]:
-    """Draws from a belief.
-
-    Those of one with a constant acceleration have different accelerations.
+    """Draws from a belief; those of one with a constant acceleration have different
+    accelerations.
     """
     if not isinstance(belief, DrivenBelief):
         return [

@@ -200,9 +200,8 @@ class ViewWriter:
 
 
 class ResultDirectory:
-    """The folder of a result.
-
-    It appears when the ``with`` block ends without an error, and not otherwise.
+    """The folder of a result; it appears when the ``with`` block ends without an error, and
+    not otherwise.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False, inputs: Iterable[Path] = ()) -> None:

@@ -174,9 +174,8 @@ def _nees(block: str) -> float | None:
 
 @value_class(eq=True)
 class Row:
-    """The result of one scan. None.
-
-    Does not apply (no truth, no measurement, no plan, no fault).
+    """The result of one scan. None: does not apply (no truth, no measurement, no plan, no
+    fault).
     """
 
     seq: int = _exact(lambda o, s: o.scan.seq, table=True)

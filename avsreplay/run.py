@@ -1,6 +1,5 @@
-"""One run, for command line, API and sweeps.
-
-Opens the log, builds the stages, folds the scans and scores them.
+"""One run, for command line, API and sweeps: opens the log, builds the stages, folds the
+scans and scores them.
 """
 
 from __future__ import annotations
@@ -280,9 +279,8 @@ class Run:
         return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
-        """Objects that a checkpoint refers to by name.
-
-        The interpolation of the truth is made again.
+        """Objects that a checkpoint refers to by name; the interpolation of the truth is made
+        again.
         """
         return {
             "surface": self.surface,
@@ -316,9 +314,8 @@ class Run:
         return replace(self._fold.result(self.truth), counts=counts, acceleration=text)
 
     def facts(self) -> dict[str, Any]:
-        """Return what ``run.json`` holds besides versions.
-
-        Effective configuration and hashes of what was read.
+        """Return what ``run.json`` holds besides versions: effective configuration and hashes
+        of what was read.
         """
         surface, losses = self.surface, self.source.losses
         return {
@@ -408,9 +405,8 @@ class Run:
         return poses
 
     def _truth_of(self, scan: Scan) -> Truth:
-        """Return the truth at a scan.
-
-        The pose is that of the reference motion if one was fitted.
+        """Return the truth at a scan; the pose is that of the reference motion if one was
+        fitted.
         """
         truth, fitted = self._true(scan), self._reference
         if fitted is None:
@@ -421,9 +417,8 @@ class Run:
         return replace(truth, pose=fitted.at(scan.t_ns).T_ac if inside else None, state=None)
 
     def _without_model(self) -> LogHeader:
-        """Reconstruct the model.
-
-        Start and true state of the log refer to another frame {C} and are dropped.
+        """Reconstruct the model; start and true state of the log refer to another frame {C}
+        and are dropped.
         """
         from avsreplay.reconstruct.model import at_grasp, surface_of
         from avsreplay.reconstruct.reconstruction import reconstruct, true_frame
@@ -434,9 +429,8 @@ class Run:
         return replace(self.source.header, surface=surface_of(self._made), start=None, truth=None)
 
     def _true(self, scan: Scan) -> Truth:
-        """The truth of the log.
-
-        With a reconstructed model its pose, as that of the reconstructed frame.
+        """The truth of the log; with a reconstructed model its pose, as that of the
+        reconstructed frame.
         """
         truth = self.source.truth_of(scan)
         if self._made is None:

@@ -1,6 +1,5 @@
-"""The part of a saved result from which planning starts again.
-
-Rows, beliefs, ground truth and settings.
+"""The part of a saved result from which planning starts again: rows, beliefs, ground truth
+and settings.
 """
 
 from __future__ import annotations

@@ -208,9 +208,8 @@ def matched_truth(belief: Belief, truth: State) -> State:
 
 
 def _nees(outcome: Outcome, truth: State | None) -> tuple[float | None, Mapping[str, float]]:
-    """NEES of all states and of each block. A cold start's first poses have none.
-
-    Their belief is not normal.
+    """NEES of all states and of each block. A cold start's first poses have none: their
+    belief is not normal.
     """
     if truth is None or outcome.estimator == "start":
         return None, {}

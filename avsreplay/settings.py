@@ -161,9 +161,8 @@ def setting(default: Any = dataclasses.MISSING, doc: str = "", **declared: Any) 
 
 
 class Settings:
-    """Base of every parameter class. Creating one checks every range.
-
-    It raises ValueError naming the field.
+    """Base of every parameter class. Creating one checks every range; it raises ValueError
+    naming the field.
     """
 
     __slots__ = ()
@@ -174,9 +173,8 @@ class Settings:
         self.check()
 
     def check(self) -> None:
-        """Raise ValueError where values do not fit together.
-
-        A class with such conditions overrides this.
+        """Raise ValueError where values do not fit together; a class with such conditions
+        overrides this.
         """
 
     def resolved(self, extent_m: float) -> Self:
@@ -226,9 +224,8 @@ def given(value: float | None) -> float:
 
 @value_class(eq=True)
 class Entry:
-    """One setting of a tree of tables: full dotted key, declaration, type and default (MISSING.
-
-    Must be given).
+    """One setting of a tree of tables: full dotted key, declaration, type and default
+    (MISSING: must be given).
     """
 
     key: str

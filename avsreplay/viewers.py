@@ -1,6 +1,5 @@
-"""Listeners that show a run in viewers.
-
-``result.mcap`` for Foxglove, Lichtblick and rosbags, and Rerun.
+"""Listeners that show a run in viewers: ``result.mcap`` for Foxglove, Lichtblick and rosbags,
+and Rerun.
 """
 
 from __future__ import annotations

@@ -78,9 +78,8 @@ def package_diagram() -> str:
 
 
 def scan_diagram() -> str:
-    """A Mermaid sequence diagram.
-
-    The calls from ``step`` to the stages, in the order of the source.
+    """A Mermaid sequence diagram: the calls from ``step`` to the stages, in the order of the
+    source.
     """
     tree = ast.parse((ROOT / "avsreplay" / "pipeline.py").read_text(encoding="utf-8"))
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}

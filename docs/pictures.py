@@ -97,9 +97,8 @@ def shot(page: Path, to: Path, width: int, height: int) -> None:
 
 
 def phone(page: Path, to: Path, folder: Path) -> None:
-    """A screenshot at 390 pixels.
-
-    Chromium's window is at least 500 wide, so the page is shown in a frame.
+    """A screenshot at 390 pixels: Chromium's window is at least 500 wide, so the page is
+    shown in a frame.
     """
     frame = folder / "phone.html"
     inner = (
@@ -141,9 +140,8 @@ def animation(frames: list[Path], to: Path) -> None:
 
 
 def main(log: Path, full: Path | None = None) -> None:
-    """Make all pictures.
-
-    ``full`` is the recording of the built-in scenario, for the page of results.
+    """Make all pictures; ``full`` is the recording of the built-in scenario, for the page of
+    results.
     """
     IMAGES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:

@@ -63,9 +63,8 @@ class CommandServer:
         self._environment = fixed(os.environ)
 
     def run(self, args, cwd, environment, timeout):
-        """Run a command.
-
-        Exit code, standard output and error, or None where it needs a process of its own.
+        """Run a command; exit code, standard output and error, or None where it needs a
+        process of its own.
         """
         if not hasattr(os, "fork") or fixed(environment) != self._environment:
             return None
@@ -137,9 +136,8 @@ def serve():
 
 
 def exit_code(args):
-    """Run a command in this process, which must be a fork that ends after it.
-
-    Other exceptions are not caught.
+    """Run a command in this process, which must be a fork that ends after it; other
+    exceptions are not caught.
     """
     sys.argv = ["avsreplay", *args]
     from avsreplay.__main__ import main

@@ -1,6 +1,5 @@
-"""Shared fixtures.
-
-The command line, built-in cases, real data if it is available, constructed rows.
+"""Shared fixtures: the command line, built-in cases, real data if it is available,
+constructed rows.
 """
 
 from __future__ import annotations
@@ -41,9 +40,8 @@ class Done:
 
 
 def avsreplay(*args, cwd=None, env=None, timeout=300):
-    """Run the command line as a user does.
-
-    In a fork of a process that has imported it, or in one of its own.
+    """Run the command line as a user does: in a fork of a process that has imported it, or in
+    one of its own.
     """
     words, environment = [*map(str, args)], {**os.environ, **(env or {})}
     done = SERVER.run(words, cwd, environment, timeout)
@@ -173,9 +171,8 @@ START_NS = 1_700_000_000_123_456_789
 
 @pytest.fixture(scope="session")
 def make_rows() -> Callable[..., list[Row]]:
-    """``make_rows(n, seed=0, blackout=range(...), **columns)``.
-
-    A seeded run whose blackout has no scan to use.
+    """``make_rows(n, seed=0, blackout=range(...), **columns)``: a seeded run whose blackout
+    has no scan to use.
     """
 
     def build(

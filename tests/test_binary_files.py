@@ -1,6 +1,5 @@
-"""A continued run gives the bytes of an uninterrupted run.
-
-A checkpoint of unknown origin executes no code.
+"""A continued run gives the bytes of an uninterrupted run; a checkpoint of unknown origin
+executes no code.
 """
 
 from __future__ import annotations
@@ -28,9 +27,8 @@ def job(log, *assignments, **options):
 
 
 def replay(work, folder, count=None, resume=False):
-    """Replay ``count`` scans (None: all that are left) into a result directory.
-
-    Return the number of rows in it.
+    """Replay ``count`` scans (None: all that are left) into a result directory; return the
+    number of rows in it.
     """
     with Run(work) as run, ResultWriter(ResultDirectory(folder, overwrite=resume), run) as writer:
         rows = writer.resume({"config": run.facts()["config"]}) if resume else []

@@ -1,6 +1,5 @@
-"""The source of the first pose of a replay.
-
-Not the ground truth, unless the configuration names it.
+"""The source of the first pose of a replay: not the ground truth, unless the configuration
+names it.
 """
 
 from __future__ import annotations
@@ -45,9 +44,8 @@ def test_a_given_pose_begins_the_replay():
 
 
 def test_a_log_without_a_start_is_searched_and_the_rows_say_so():
-    """The fixture without its initial state, with its true poses.
-
-    The same as a search without a guess.
+    """The fixture without its initial state, with its true poses: the same as a search
+    without a guess.
     """
     rows = {}
     for init in ("log", "auto"):

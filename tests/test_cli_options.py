@@ -1,6 +1,5 @@
-"""Shared parts of the commands.
-
-Options, progress without a terminal, interruption, a reader that stops reading.
+"""Shared parts of the commands: options, progress without a terminal, interruption, a reader
+that stops reading.
 """
 
 from __future__ import annotations

@@ -53,9 +53,8 @@ def states():
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    """A run whose estimate is the truth, with small and honest covariances.
-
-    Converged from 5 s on.
+    """A run whose estimate is the truth, with small and honest covariances; converged from 5
+    s on.
     """
     folder = tmp_path_factory.mktemp("made") / "result"
     folder.mkdir()

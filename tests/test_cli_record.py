@@ -21,9 +21,8 @@ FIRST = 10
 
 
 def converted(source: Path, to: Path, storage: str) -> Path:
-    """By rosbags' own converter.
-
-    ``/faults`` and ``/tf_static`` have no like in ROS 1 and stay behind.
+    """By rosbags' own converter; ``/faults`` and ``/tf_static`` have no like in ROS 1 and
+    stay behind.
     """
     ros2 = get_typestore(Stores.ROS2_HUMBLE)
     target = get_typestore(Stores.ROS1_NOETIC) if to.suffix == ".bag" else ros2

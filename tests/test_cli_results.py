@@ -1,6 +1,5 @@
-"""Saved results read by the commands.
-
-They are verified, and no defect gives an internal error or passes unnoticed.
+"""Saved results read by the commands: they are verified, and no defect gives an internal
+error or passes unnoticed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""A scan that cannot be decoded.
-
-The same rule in every command that reads scans (docs/conventions.md).
+"""A scan that cannot be decoded: the same rule in every command that reads scans
+(docs/conventions.md).
 """
 
 from __future__ import annotations

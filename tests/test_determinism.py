@@ -1,6 +1,5 @@
-"""The same input gives the same bytes.
-
-In repeated runs, for any hash seed and any number of threads.
+"""The same input gives the same bytes: in repeated runs, for any hash seed and any number of
+threads.
 """
 
 import filecmp

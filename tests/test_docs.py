@@ -1,6 +1,5 @@
-"""Documentation.
-
-Marked blocks run, command lines parse, links lead somewhere, sentences are short, the site builds.
+"""Documentation: marked blocks run, command lines parse, links lead somewhere, sentences are
+short, the site builds.
 """
 
 from __future__ import annotations
@@ -378,9 +377,8 @@ HISTORY = re.compile(
 
 
 def _sentences(text):
-    """Sentences outside of code, as words.
-
-    A heading, an entry of a list and a cell of a table are sentences.
+    """Sentences outside of code, as words; a heading, an entry of a list and a cell of a
+    table are sentences.
     """
     for part in re.split(r"\n\s*\n|\||\n(?=\s*(?:[-*#]|\d+\. ))|^#+ [^\n]*\n", text, flags=re.M):
         joined = " ".join(re.sub(r"`[^`]*`", "code", part).split())
@@ -442,9 +440,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 
 def test_the_campaign_of_removed_guards_covers_every_line_of_the_table_of_defects(monkeypatch):
-    """``tests/benchmarks/guards.py`` removes each guard.
-
-    Here only that its texts are in the code, once each.
+    """``tests/benchmarks/guards.py`` removes each guard; here only that its texts are in the
+    code, once each.
     """
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     from guards import ALL

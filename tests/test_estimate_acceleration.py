@@ -1,6 +1,5 @@
-"""A constant acceleration: the falling frame changes no statistic.
-
-The fit is unbiased and its 1 sigma correct.
+"""A constant acceleration: the falling frame changes no statistic; the fit is unbiased and
+its 1 sigma correct.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Large innovations.
-
-Manoeuvres, sensor biases and bad scans are distinguished, and clean logs give none of them.
+"""Large innovations: manoeuvres, sensor biases and bad scans are distinguished, and clean
+logs give none of them.
 """
 
 from __future__ import annotations
@@ -144,9 +143,8 @@ def test_nothing_is_found_on_a_clean_log() -> None:
     "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
 )
 def test_a_push_is_reported_and_followed(seed: int) -> None:
-    """A velocity step of 1 cm/s at 45.2 s.
-
-    Instant, size and sigma, and no claim of convergence while in doubt.
+    """A velocity step of 1 cm/s at 45.2 s: instant, size and sigma, and no claim of
+    convergence while in doubt.
     """
     case = surprises.Case("push", velocity=0.01, seconds=60.0)
     result = surprises.run(case, seed)
@@ -172,9 +170,8 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
 def test_a_step_far_below_the_expected_size_of_a_change_is_a_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of a tracker may show any motion.
-
-    The changes that are expected are ten times those of scans.
+    """Poses of a tracker may show any motion: the changes that are expected are ten times
+    those of scans.
     """
     wide = partial(surprises.EstimatorParams, start_vel_1s_mps=2.0)
     monkeypatch.setattr(surprises, "EstimatorParams", wide)
@@ -190,9 +187,8 @@ def test_a_step_far_below_the_expected_size_of_a_change_is_a_manoeuvre(
 
 
 def test_a_change_of_the_rate_contains_the_error_of_the_mass_centre() -> None:
-    """Of a body at rest the centre of mass is unknown.
-
-    Its velocity after a release is known along the axis only.
+    """Of a body at rest the centre of mass is unknown: its velocity after a release is known
+    along the axis only.
     """
     case = surprises.Case("release", speed=1e-9, rate=0.1, at_s=20.0, seconds=30.0)
     for seed in range(3):
@@ -219,9 +215,8 @@ def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> Non
 
 @pytest.mark.slow
 def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
-    """5 cm along the line of sight from 60 to 70 s.
-
-    Flagged from the first scan, and the estimate is not moved.
+    """5 cm along the line of sight from 60 to 70 s: flagged from the first scan, and the
+    estimate is not moved.
     """
     case = surprises.Case("bias", at_s=60.0, until_s=70.0, bias=0.05, seconds=75.0)
     result = surprises.run(case, 1)
@@ -235,9 +230,8 @@ def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
 
 
 def test_a_bias_before_convergence_does_not_stay() -> None:
-    """15 cm over the first 10 s.
-
-    The estimate starts anew from the later poses, which agree with one another.
+    """15 cm over the first 10 s: the estimate starts anew from the later poses, which agree
+    with one another.
     """
     case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=30.0)
     result = surprises.run(case, 2)
@@ -273,9 +267,8 @@ def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None:
-    """A quarter of the poses is off by 0.1 m.
-
-    They are no disturbance, no manoeuvre and no noise of the others.
+    """A quarter of the poses is off by 0.1 m: they are no disturbance, no manoeuvre and no
+    noise of the others.
     """
     result = surprises.run(surprises.Case("wrong", wrong=0.25, seconds=40.0), seed)
     assert result.track is not None
@@ -287,9 +280,8 @@ def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None
 
 
 def test_three_poses_that_agree_replace_the_first_ones() -> None:
-    """The first four poses are 15 cm off.
-
-    Too few for a test of the next ones, which agree with one another.
+    """The first four poses are 15 cm off: too few for a test of the next ones, which agree
+    with one another.
     """
     case = surprises.Case("first", at_s=0.0, until_s=2.0, bias=0.15, seconds=10.0)
     result = surprises.run(case, 0)
@@ -302,9 +294,8 @@ def test_three_poses_that_agree_replace_the_first_ones() -> None:
 def test_disturbances_that_the_end_of_a_bias_feigns_are_estimated_again(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of 0.1 mm.
-
-    The end of the bias looks like a driven target, with a fit of fewer poses than an estimate.
+    """Poses of 0.1 mm: the end of the bias looks like a driven target, with a fit of fewer
+    poses than an estimate.
     """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
@@ -321,9 +312,8 @@ def test_disturbances_that_the_end_of_a_bias_feigns_are_estimated_again(
 def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """15 cm off for 10 s, 2 cm more in the last second.
-
-    Changes of the velocity that cancel would explain the step.
+    """15 cm off for 10 s, 2 cm more in the last second: changes of the velocity that cancel
+    would explain the step.
     """
     simulated = surprises.measured
 
@@ -347,9 +337,8 @@ def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
 
 
 def test_an_outlier_before_the_estimate_is_tested_causes_no_doubt_about_later_scans() -> None:
-    """The fourth pose alone is 8 cm off.
-
-    Where it is used, with a small weight, the next scans are not deferred.
+    """The fourth pose alone is 8 cm off; where it is used, with a small weight, the next
+    scans are not deferred.
     """
     case = surprises.Case("early outlier", at_s=1.5, until_s=2.0, bias=0.08, seconds=12.0)
     results = [surprises.run(case, seed) for seed in (1, 3, 5)]
@@ -373,9 +362,8 @@ def test_a_bias_from_40_s_on_is_flagged_from_its_first_scan_before_convergence(
 
 
 def test_the_end_of_an_early_bias_restores_the_estimate_before_it() -> None:
-    """Biased from 8 to 12 s: the estimate begins anew at 8 s.
-
-    At 12 s that of the first 8 s is right again.
+    """Biased from 8 to 12 s: the estimate begins anew at 8 s; at 12 s that of the first 8 s
+    is right again.
     """
     case = surprises.Case("bias", at_s=8.0, until_s=12.0, bias=0.15, seconds=20.0)
     result = surprises.run(case, 2)
@@ -471,9 +459,8 @@ def test_a_bias_below_the_gate_of_a_single_scan_is_found(seed: int) -> None:
 
 @pytest.mark.slow
 def test_a_push_during_a_bias_ends_the_claim_of_convergence() -> None:
-    """The offset of 3 cm begins at once, so that no manoeuvre explains it.
-
-    From the push on it grows.
+    """The offset of 3 cm begins at once, so that no manoeuvre explains it; from the push on
+    it grows.
     """
     case = surprises.Case("bias", at_s=45.0, bias=0.03, seconds=64.0)
     times, states, _, _ = surprises.world_of(case, 31005)
@@ -504,9 +491,8 @@ def test_a_single_wild_scan_changes_nothing() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_covariance_of_scans_with_common_errors_is_positive_semidefinite(seed: int) -> None:
-    """Neighbouring views may have very different covariances.
-
-    A nearly degenerate one beside a good one.
+    """Neighbouring views may have very different covariances: a nearly degenerate one beside
+    a good one.
     """
     rng = np.random.default_rng(seed)
     R = []
@@ -735,9 +721,8 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(
 
 @pytest.mark.parametrize("cancels", [False, True])
 def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
-    """Half a second at 0.3 m/s.
-
-    A step of the pose by 15 cm if the target stops again, an impact if it does not.
+    """Half a second at 0.3 m/s: a step of the pose by 15 cm if the target stops again, an
+    impact if it does not.
     """
     rng, n, step = np.random.Generator(np.random.PCG64(8)), 14, np.array([0.0, 0.1, -0.3])
     start = Belief(0, tumbling.draw(2, seconds=7.0).states[0], np.eye(20) * 1e-10)
@@ -806,9 +791,8 @@ def _poses_of(monkeypatch: pytest.MonkeyPatch, pose_at: Callable[[float], Pose])
 
 
 def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Poses of 0.1 mm at 10 Hz.
-
-    The offset of 50 mm varies by 0.5 mm, which is many times their standard deviation.
+    """Poses of 0.1 mm at 10 Hz; the offset of 50 mm varies by 0.5 mm, which is many times
+    their standard deviation.
     """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", 1e-4)
@@ -837,9 +821,8 @@ def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.Mon
 
 
 def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The offset stays, because the prediction has it.
-
-    The scans from 60 s on have half of the residuals.
+    """The offset stays, because the prediction has it: the scans from 60 s on have half of
+    the residuals.
     """
     simulated = surprises.measured
 
@@ -872,9 +855,8 @@ def _swing(t: float) -> Pose:
 def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Gravity and the cable accelerate it by 2 m/s^2.
-
-    After five rejected poses their level is estimated from them.
+    """Gravity and the cable accelerate it by 2 m/s^2: after five rejected poses their level
+    is estimated from them.
     """
     _poses_of(monkeypatch, _swing)
     result = surprises.run(surprises.Case("swing", hz=10.0, seconds=15.0), 0)
@@ -907,9 +889,8 @@ def test_poses_that_contradict_one_another_are_no_driven_target(
 def test_the_level_of_disturbances_is_found_from_differences_of_poses(
     interval_s: float, density: float
 ) -> None:
-    """A velocity that is a random walk.
-
-    The root density is found to within the error of few poses.
+    """A velocity that is a random walk: the root density is found to within the error of few
+    poses.
     """
     rng = np.random.Generator(np.random.PCG64(7))
     fine = 50
@@ -936,9 +917,8 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(
 
 
 def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
-    """Mean square over motions of which a fifth has a change of the velocities.
-
-    A linear motion of the mass centre.
+    """Mean square over motions of which a fifth has a change of the velocities; a linear
+    motion of the mass centre.
     """
     world, rng, share = tumbling.draw(3, seconds=1.0), np.random.Generator(np.random.PCG64(4)), 0.2
     x, times = world.states[0], np.array([5.0, 30.0])

@@ -1,5 +1,4 @@
-"""Errors of single scans, and noise that rises without a larger claimed covariance.
-
+"""Errors of single scans, and noise that rises without a larger claimed covariance:
 ``estimate/bad_scans.py``.
 """
 
@@ -23,9 +22,8 @@ PRIORS, FIRST, SCANS = ChangePriors(0.01, 0.02, 0.2, 0.05), 2, 4
 
 
 def window(seed: int, errors: float = 1.0) -> tuple[Window, np.ndarray]:
-    """Scans whose innovations have any covariance, the doubtful ones larger by ``errors``.
-
-    Whitened innovations.
+    """Scans whose innovations have any covariance, the doubtful ones larger by ``errors``;
+    whitened innovations.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     A, n = 0.01 * rng.normal(size=(6 * SCANS, 6 * SCANS)), SCANS
@@ -110,9 +108,8 @@ def test_a_rise_lasts_while_the_noise_is_larger_and_ends_soon_after(factor: floa
 def test_noise_that_rises_unannounced_is_no_manoeuvre(
     monkeypatch: pytest.MonkeyPatch, level: float, seed: int
 ) -> None:
-    """The poses keep the covariance that they claim.
-
-    The scans are used with more noise after three of them at most.
+    """The poses keep the covariance that they claim: the scans are used with more noise after
+    three of them at most.
     """
     simulated, sigma = surprises.measured, np.repeat([surprises.ROT_RAD, surprises.POS_M], 3)
 

@@ -64,9 +64,8 @@ def grown(fixes: tuple[PoseFix, ...], *counts: int):
 
 
 def test_poses_almost_at_one_instant_do_not_determine_the_first_rate() -> None:
-    """Stamps that step back are replaced by times 1 ns after the one before.
-
-    A difference of poses is no rate then.
+    """Stamps that step back are replaced by times 1 ns after the one before: a difference of
+    poses is no rate then.
     """
     world = tumbling.draw(3, mu_deg=80.0, seconds=10.0)
     first, second, *others = seen(world, 3, rot_deg=0.1)[:6]
@@ -101,9 +100,8 @@ def test_to_errors_is_the_derivative_of_to_state(seed: int) -> None:
 
 
 def test_every_parameter_vector_is_a_valid_inertia() -> None:
-    """The triangle inequalities need no guarding.
-
-    Every M gives |sigma| < 1, moments that a mass could have.
+    """The triangle inequalities need no guarding: every M gives |sigma| < 1, moments that a
+    mass could have.
     """
     rng = np.random.Generator(np.random.PCG64(5))
     base = to_chart(tumbling.draw(0, seconds=1.0).states[0])
@@ -177,9 +175,8 @@ def test_the_step_follows_the_cost() -> None:
 
 
 def test_a_pass_without_disturbance_is_the_fit() -> None:
-    """One least-squares problem solved pose by pose.
-
-    Mean and covariance of the normal equations.
+    """One least-squares problem solved pose by pose: mean and covariance of the normal
+    equations.
     """
     fixes = seen(tumbling.draw(2, seconds=30.0), 2)
     poses, fitted, prior = grown(fixes, 61)
@@ -242,9 +239,8 @@ def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
-    """600 poses at 10 Hz with an outlier, a reference 1 sigma off.
-
-    Mean and covariance of both fits agree.
+    """600 poses at 10 Hz with an outlier, a reference 1 sigma off: mean and covariance of
+    both fits agree.
     """
     world = tumbling.draw(seed, seconds=60.0, hz=10.0, sigma_max=0.85)
     fixes = list(seen(world, seed, pos_m=0.005, rot_deg=0.3))
@@ -285,9 +281,8 @@ def test_poses_are_corrected_by_their_mean_errors() -> None:
     ("n", "rate", "hz"), [(153, 0.1, 2.0), (1000, 0.05, 10.0), (500, 1e-6, 5.0), (300, 1.0, 2.0)]
 )
 def test_there_are_not_more_normal_points_than_asked_for(n: int, rate: float, hz: float) -> None:
-    """153 poses at 0.05 rad per pose: four poses and 0.25 rad end at different poses.
-
-    Both rules split them once.
+    """153 poses at 0.05 rad per pose: four poses and 0.25 rad end at different poses; both
+    rules split them once.
     """
     world = tumbling.draw(2, rate=rate, seconds=(n - 1) / hz, hz=hz)
     rng = np.random.Generator(np.random.PCG64(4))
@@ -361,9 +356,8 @@ def test_a_bent_valley_of_the_cost_is_followed_to_its_minimum_in_few_steps(seed:
 
 
 def test_a_descent_over_many_turns_is_done_in_parts_and_takes_the_same_steps() -> None:
-    """Each step passes the rotation between the poses in pieces.
-
-    A log of many turns has few normal points.
+    """Each step passes the rotation between the poses in pieces; a log of many turns has few
+    normal points.
     """
     fixes = seen(tumbling.draw(3, seconds=240.0, hz=0.25, rate=1.0), 3)
     poses, start = poses_of(fixes), to_chart(tumbling.draw(3, seconds=1.0, rate=1.0).states[0])
@@ -428,9 +422,8 @@ def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: floa
 
 
 def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
-    """Seven bodies seen for 40 s.
-
-    The curvature alone is far too sure, the mended covariance is not.
+    """Seven bodies seen for 40 s: the curvature alone is far too sure, the mended covariance
+    is not.
     """
     plain, mended = [], []
     for seed in (3, 6, 9, 15, 2):
@@ -483,9 +476,8 @@ def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_varia
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(seed: int) -> None:
-    """A fit ends some tenths of a sigma away from the minimum.
-
-    This difference is no evidence for a torque.
+    """A fit ends some tenths of a sigma away from the minimum; this difference is no evidence
+    for a torque.
     """
     poses, fitted, prior = grown(seen(tumbling.draw(seed, seconds=30.0), seed, 0.001, 0.05), 41, 61)
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))
@@ -637,9 +629,8 @@ def test_poses_can_be_cut() -> None:
 
 
 def test_a_body_at_rest_is_estimated() -> None:
-    """No turn, nothing to tell inertia by.
-
-    The fit stays with its prior and says so by its covariance.
+    """No turn, nothing to tell inertia by: the fit stays with its prior and says so by its
+    covariance.
     """
     x = State(
         [0, 0, 0, 1.0],
@@ -666,9 +657,8 @@ def test_a_body_at_rest_is_estimated() -> None:
 
 @pytest.mark.slow
 def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_unknown() -> None:
-    """A spent stage.
-
-    Where its cross axes lie can hardly be told, where its fixture will be in 30 s can.
+    """A spent stage: where its cross axes lie can hardly be told, where its fixture will be
+    in 30 s can.
     """
     moments, base = np.array([1.0, 1.003, 0.3]), tumbling.draw(5, seconds=1.0).states[0]
     first = State(
@@ -695,9 +685,8 @@ def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_u
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_pure_spin_stays_predictable(axis: int) -> None:
-    """Spin about a principal axis, 120 s.
-
-    Inertia is unobservable, yet the forecast of the grasp point gets better.
+    """Spin about a principal axis, 120 s: inertia is unobservable, yet the forecast of the
+    grasp point gets better.
     """
     case = surprises.Case("spin", spin=axis, seconds=120.0)
     result = surprises.run(case, 0)
@@ -713,9 +702,8 @@ def test_a_pure_spin_stays_predictable(axis: int) -> None:
 def test_a_fit_without_any_prior_knowledge_ends_although_first_trials_are_absurd(
     count: int,
 ) -> None:
-    """A few poses and a prior of a thousand times the usual width.
-
-    Trials have inertias beyond all bounds.
+    """A few poses and a prior of a thousand times the usual width: trials have inertias
+    beyond all bounds.
     """
     fixes = seen(tumbling.draw(0, mu_deg=80.0, seconds=4.0), 0, pos_m=0.05)[:count]
     poses = poses_of(fixes)

@@ -1,6 +1,5 @@
-"""Scheduling of the batch fit.
-
-The effect of accepted bad scans on the estimate, and of impulses on a fit.
+"""Scheduling of the batch fit: the effect of accepted bad scans on the estimate, and of
+impulses on a fit.
 """
 
 from __future__ import annotations
@@ -54,9 +53,8 @@ def fold(
     noise=1.0,
     wide=1.0,
 ) -> Iterator[Track]:
-    """The track after each scan.
-
-    ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy.
+    """The track after each scan; ``wrong`` (index, pose) -> the pose that registration gives,
+    all of them healthy.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
     estimator = Estimator(
@@ -107,9 +105,8 @@ def test_an_accepted_frozen_scan_leaves_the_estimate_consistent(seed: int) -> No
 
 @pytest.mark.slow
 def test_a_consistent_filter_is_not_changed() -> None:
-    """Twenty bodies, three audits each.
-
-    The fit takes the word from none, and nothing differs in a bit.
+    """Twenty bodies, three audits each: the fit takes the word from none, and nothing differs
+    in a bit.
     """
     recalls = 0
     for seed in range(20):
@@ -193,9 +190,8 @@ def test_the_memory_is_where_pushes_have_turned_the_body_by_the_stray() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [Start.NEAR, Start.COLD])
 def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
-    """Ten times the default torque noise over 100 s.
-
-    Mean NEES of eight bodies, the fit's word or the filter's.
+    """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's
+    word or the filter's.
     """
     sizes = []
     for seed in range(8):
@@ -233,9 +229,8 @@ def test_the_fit_begins_where_the_belief_came_from() -> None:
 
 @pytest.mark.slow
 def test_a_given_start_is_consistent_under_precise_poses() -> None:
-    """Poses far finer than the start.
-
-    What the printed filter linearises on the way it takes for knowledge.
+    """Poses far finer than the start: what the printed filter linearises on the way it takes
+    for knowledge.
     """
     sizes: dict[Constraint, list[float]] = {constraint: [] for constraint in Constraint}
     for seed in range(10):
@@ -250,9 +245,8 @@ def test_a_given_start_is_consistent_under_precise_poses() -> None:
 
 
 def test_a_belief_becomes_a_prior_by_its_draws() -> None:
-    """Where it is narrow the derivative says the same.
-
-    Where two moments are nearly equal the axes count for more.
+    """Where it is narrow the derivative says the same; where two moments are nearly equal the
+    axes count for more.
     """
     world = tumbling.draw(4, seconds=1.0)
     x = replace(world.states[0], sigma=np.array([-0.5, 0.4]))
@@ -276,9 +270,8 @@ def test_a_belief_becomes_a_prior_by_its_draws() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("constraint", Constraint)
 def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None:
-    """Ten of its own sigma off.
-
-    No confident wrong number is made of it, and the row says that it was contradicted.
+    """Ten of its own sigma off: no confident wrong number is made of it, and the row says
+    that it was contradicted.
     """
     for seed in range(2):
         world = tumbling.draw(seed, seconds=100.0, sigma_max=0.6)
@@ -321,9 +314,8 @@ def fixes_of(world: tumbling.World, seed: int) -> tuple[PoseFix, ...]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
-    """The older half joined in pairs, twice over.
-
-    The estimate changes by a small part of its standard deviation.
+    """The older half joined in pairs, twice over: the estimate changes by a small part of its
+    standard deviation.
     """
     world = tumbling.draw(seed, seconds=80.0, hz=5.0, sigma_max=0.85)
     fixes = fixes_of(world, seed)
@@ -373,9 +365,8 @@ def test_a_fit_uses_a_bounded_number_of_poses() -> None:
 
 @pytest.mark.parametrize(("seed", "axis"), [(1, 0), (4, 2)])
 def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: int) -> None:
-    """The spin about an unstable axis for 300 rad.
-
-    Its covariance grows beyond what numbers can hold.
+    """The spin about an unstable axis for 300 rad: its covariance grows beyond what numbers
+    can hold.
     """
     world = tumbling.draw(seed, seconds=1500.0, hz=0.1, sigma_max=0.85)
     first = replace(world.states[0], w_b=0.2 * np.eye(3)[axis])

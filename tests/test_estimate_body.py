@@ -1,6 +1,5 @@
-"""Physical parameters in {C}.
-
-Correct for a known body, equal for every axis permutation, inside their range.
+"""Physical parameters in {C}: correct for a known body, equal for every axis permutation,
+inside their range.
 """
 
 from __future__ import annotations
@@ -81,9 +80,8 @@ def test_a_small_spread_is_the_linear_one() -> None:
 @pytest.mark.parametrize("gap", [1e-6, 1e-3, 0.3])
 @pytest.mark.parametrize("wide", [1e-3, 1.0, 100.0])
 def test_standard_deviations_stay_in_the_physical_range(gap: float, wide: float) -> None:
-    """However wide the covariance and however undetermined the axes.
-
-    No sigma beyond that of no information.
+    """However wide the covariance and however undetermined the axes: no sigma beyond that of
+    no information.
     """
     x = tumbling.draw(3, seconds=1.0).states[0]
     x = replace(x, sigma=np.array([gap, 0.4]))

@@ -1,6 +1,5 @@
-"""Errors that all measured poses have in common.
-
-A wrong size, wrong ranges, errors of the shape of the model.
+"""Errors that all measured poses have in common: a wrong size, wrong ranges, errors of the
+shape of the model.
 """
 
 from __future__ import annotations
@@ -116,9 +115,8 @@ def test_a_constant_motion_of_the_model_is_an_error_of_the_fixture() -> None:
 
 
 def bent(surface: Surface, angle: float) -> Surface:
-    """The model with its second box rotated about its middle [rad].
-
-    A part that is not where the model says.
+    """The model with its second box rotated about its middle [rad]: a part that is not where
+    the model says.
     """
     v = np.array(surface.vertices)
     middle = v[8:16].mean(axis=0)

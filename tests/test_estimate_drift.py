@@ -1,6 +1,5 @@
-"""A constant torque or force.
-
-Found with onset and size, tracked, and not found where there is none.
+"""A constant torque or force: found with onset and size, tracked, and not found where there
+is none.
 """
 
 from __future__ import annotations
@@ -38,9 +37,8 @@ PARAMS = EstimatorParams(correlated_share=0.1).resolved(4.0)
 def fixes_of(
     case: surprises.Case, seed: int, force: float = 0.0, onset_s: float = 0.0
 ) -> tuple[PoseFix, ...]:
-    """Noisy poses of a case.
-
-    ``force`` is a constant acceleration along x of {A} from ``onset_s`` on.
+    """Noisy poses of a case; ``force`` is a constant acceleration along x of {A} from
+    ``onset_s`` on.
     """
     times, states, _, _ = surprises.world_of(case, seed)
     found = []
@@ -167,9 +165,8 @@ def test_the_covariance_allows_for_a_torque_that_a_wrong_inertia_explains(seed: 
 
 
 def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """1e-4 rad/s2 per unit inertia.
-
-    Size and onset within their standard deviations, no claim beyond 4 sigma.
+    """1e-4 rad/s2 per unit inertia: size and onset within their standard deviations, no claim
+    beyond 4 sigma.
     """
     monkeypatch.setattr(surprises, "POS_M", 1e-3)
     monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.05))
@@ -202,9 +199,8 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
 def test_a_torque_is_found_in_precise_poses_that_free_motion_cannot_explain(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Poses of 0.1 mm and 0.01 deg.
-
-    The fit of free motion leaves residuals of many sigma and does not converge.
+    """Poses of 0.1 mm and 0.01 deg: the fit of free motion leaves residuals of many sigma and
+    does not converge.
     """
     monkeypatch.setattr(surprises, "POS_M", 1e-4)
     monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.01))
@@ -222,9 +218,8 @@ def test_a_torque_is_found_in_precise_poses_that_free_motion_cannot_explain(
     ("density", "seed"), [(3e-5, 3), (3e-5, 4), (1e-4, 11), (1e-4, 4107), (1e-4, 5003)]
 )
 def test_a_random_torque_and_force_are_no_drift(density: float, seed: int) -> None:
-    """3e-5 or 1e-4 rad/s^1.5 and m/s^1.5.
-
-    The rate wanders, and a constant torque would explain much of it.
+    """3e-5 or 1e-4 rad/s^1.5 and m/s^1.5: the rate wanders, and a constant torque would
+    explain much of it.
     """
     result = surprises.run(surprises.Case("random", random=(density, density), seconds=60.0), seed)
     assert result.track is not None
@@ -373,9 +368,8 @@ def test_correlated_errors_of_the_poses_are_no_unexplained_motion() -> None:
 def test_a_torque_is_found_where_the_linear_problem_about_it_has_another_inertia_instead(
     seed: int,
 ) -> None:
-    """At 1 Hz and 0.05 rad/s.
-
-    Free motion costs 200 to 500 more, which the linear problem does not show.
+    """At 1 Hz and 0.05 rad/s: free motion costs 200 to 500 more, which the linear problem
+    does not show.
     """
     case = surprises.Case("d", torque=1e-4, speed=0.05, hz=1.0, seconds=68.0)
     fixes = fixes_of(case, seed)

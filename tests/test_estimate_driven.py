@@ -32,9 +32,8 @@ U = np.array([1.2e-3, -0.8e-3, 0.5e-3, 2e-3, 1e-3, -1e-3])
 
 
 def pushed(x: State, u: Array, seconds: float, parts: int = 1000) -> State:
-    """The motion under u (6,).
-
-    Rad/s2 in {C}, m/s2 in {A}, as impulses in the middle of many free steps.
+    """The motion under u (6,): rad/s2 in {C}, m/s2 in {A}, as impulses in the middle of many
+    free steps.
     """
     h = seconds / parts
     for _ in range(parts):

@@ -213,9 +213,8 @@ def test_a_gap_of_years_is_refused_in_one_line() -> None:
 
 
 def noise_by_quadrature(x: State, moments: np.ndarray, h: float, torque: float) -> np.ndarray:
-    """Q (6, 6) as an integral.
-
-    What a push at each instant has become by the end, on a motion from there on.
+    """Q (6, 6) as an integral: what a push at each instant has become by the end, on a motion
+    from there on.
     """
     G = np.zeros((6, 3))
     G[3:] = np.diag(moments.sum() / moments) * torque

@@ -48,9 +48,8 @@ def test_the_bound_holds_and_beta_only_shortens(sigma: float, step: float) -> No
 
 
 def test_the_papers_beta_would_leave_the_bound() -> None:
-    """Erratum.
-
-    Sigma 0.9 and a step of 0.5 leave the printed rule (which acts on |k'e| > 1 only) at 1.4.
+    """Erratum: sigma 0.9 and a step of 0.5 leave the printed rule (which acts on |k'e| > 1
+    only) at 1.4.
     """
     betas, hits = sigma_bounds(np.array([0.9, 0.0]), np.array([0.5, 0.0]), 0.01)
     assert hits == 1
@@ -73,9 +72,8 @@ def test_update_is_bayes_where_nothing_binds() -> None:
 
 
 def test_constrained_update_stays_symmetric_and_positive() -> None:
-    """Erratum: with beta below 1 the printed (I - KH)P is not even symmetric.
-
-    Joseph's form is the covariance.
+    """Erratum: with beta below 1 the printed (I - KH)P is not even symmetric; Joseph's form
+    is the covariance.
     """
     rng = np.random.Generator(np.random.PCG64(1))
     x = tumbling.draw(2, seconds=1.0).states[0]
@@ -309,9 +307,8 @@ def test_scale_corrects_nis_when_the_registration_covariance_is_wrong() -> None:
 
 
 def burst(level: float, seconds: float = 20.0):
-    """Noise up by ``level`` from 30 s on for ``seconds``.
-
-    The factor the window finds after each scan.
+    """Noise up by ``level`` from 30 s on for ``seconds``; the factor the window finds after
+    each scan.
     """
     world = tumbling.draw(12, seconds=80.0, hz=5.0)
     estimator = Estimator(

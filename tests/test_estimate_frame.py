@@ -1,6 +1,5 @@
-"""The estimate does not depend on the origin of the model.
-
-Poses about one origin against poses about another.
+"""The estimate does not depend on the origin of the model: poses about one origin against
+poses about another.
 """
 
 from __future__ import annotations
@@ -32,9 +31,8 @@ def shifted(pose: Pose, by: Array) -> Pose:
 
 
 def about(alignment: Alignment, by: Array) -> Alignment:
-    """The same measurement with the origin of {C} moved by ``by``.
-
-    Covariance by differences of the poses.
+    """The same measurement with the origin of {C} moved by ``by``: covariance by differences
+    of the poses.
     """
     exact, J, step = shifted(alignment.T_ac, by), np.zeros((6, 6)), 1e-5
     for k in range(6):

@@ -1,6 +1,5 @@
-"""Measurement model and update.
-
-Signs and units against finite differences, the kernel against numpy.
+"""Measurement model and update: signs and units against finite differences, the kernel
+against numpy.
 """
 
 from __future__ import annotations
@@ -186,9 +185,8 @@ def of_eigenvalues(x: State, m: tuple[float, float, float]) -> State:
 
 
 def retract(x: State, P: np.ndarray, d: np.ndarray) -> tuple[State, np.ndarray]:
-    """The oracle.
-
-    The state displaced by the error d, and P about it, by the chart as the fit has it.
+    """The oracle: the state displaced by the error d, and P about it, by the chart as the fit
+    has it.
     """
     here = to_chart(x)
     T = to_errors(here)
@@ -208,9 +206,8 @@ def spread_of(x: State, rng: np.random.Generator) -> np.ndarray:
 def aimed(
     x: State, size: float, rng: np.random.Generator, colour: np.ndarray = WHITE
 ) -> tuple[float, float]:
-    """How far extension and oracle differ after a step of a given size.
-
-    In the mean, and in P by its sigmas.
+    """How far extension and oracle differ after a step of a given size: in the mean, and in P
+    by its sigmas.
     """
     P, R = spread_of(x, rng), np.diag(rng.uniform(1.0, 2.0, 6)) * 1e-4
     H, S, alpha = measurement_jacobian(x), np.eye(6), np.eye(6)[0]
@@ -282,9 +279,8 @@ def test_update_of_slender_and_flat_bodies(sigma: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_steps_beyond_a_half_turn_and_new_names(seed: int) -> None:
-    """A half angle over 1 is cut to a half turn.
-
-    Inertia that turns far takes the nearest of the 24 names.
+    """A half angle over 1 is cut to a half turn; inertia that turns far takes the nearest of
+    the 24 names.
     """
     mean, covariance = aimed(some_state(seed), 2.0, np.random.Generator(np.random.PCG64([seed, 4])))
     assert mean < 1e-11
@@ -417,9 +413,8 @@ def test_the_gate_on_an_estimated_noise_is_that_of_hotelling(dof: float) -> None
 
 
 def test_the_weight_of_a_pose_begins_at_the_gate_of_its_degrees_of_freedom() -> None:
-    """A pose at twice the 99.99 % point of T^2 has half the weight.
-
-    A known noise has the point of chi-square.
+    """A pose at twice the 99.99 % point of T^2 has half the weight; a known noise has the
+    point of chi-square.
     """
     H, R = np.zeros((6, 20)), np.eye(6)
     for dof, point in ((50.0, 6.0 * 50.0 / 45.0 * f.isf(1e-4, 6, 45)), (np.inf, chi2.isf(1e-4, 6))):

@@ -301,9 +301,8 @@ def test_a_gap_before_convergence_leaves_the_estimate_consistent(seed: int) -> N
 
 
 def test_no_weight_of_a_mixture_in_a_pure_spin_is_negative() -> None:
-    """More than three directions are not Gaussian.
-
-    The weights of Gauss-Hermite would give the mean a negative one.
+    """More than three directions are not Gaussian: the weights of Gauss-Hermite would give
+    the mean a negative one.
     """
     world = tumbling.draw(54, seconds=60.0, hz=1.0, sigma_max=0.85)
     spin = replace(world.states[0], w_b=np.array([0.0, 0.1, 0.0]))

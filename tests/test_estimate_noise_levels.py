@@ -1,6 +1,5 @@
-"""Levels of the noise from simulated poses whose noise is known.
-
-White, common to near views, and disturbances.
+"""Levels of the noise from simulated poses whose noise is known: white, common to near views,
+and disturbances.
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ HZ = 2.0
 
 
 def fixes(states, seed: int, *, share: float = 0.0, claimed: float = 0.0, factor: float = 1.0):
-    """Poses with ``share`` of the variance a smooth random function of the direction of view.
-
+    """Poses with ``share`` of the variance a smooth random function of the direction of view;
     ``claimed`` is theirs.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 40]))

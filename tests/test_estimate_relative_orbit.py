@@ -128,9 +128,8 @@ def orbiting(
 
 
 def test_the_fit_finds_the_motion_over_600_s() -> None:
-    """Its residuals are the noise, and its initial values the truth.
-
-    A fit of free motion leaves decimetres.
+    """Its residuals are the noise, and its initial values the truth; a fit of free motion
+    leaves decimetres.
     """
     world, states, poses = orbiting(2, 600.0, 0.5)
     t_ns = [EPOCH_NS + round(t * 1e9) for t in world.times]
@@ -145,9 +144,8 @@ def test_the_fit_finds_the_motion_over_600_s() -> None:
 
 
 def test_the_estimator_follows_the_orbit(tmp_path: Path) -> None:
-    """A run over 600 s: errors within the claims with the orbit.
-
-    Without it they are several times as large.
+    """A run over 600 s: errors within the claims with the orbit; without it they are several
+    times as large.
     """
     world, states, poses = orbiting(4, 600.0, 0.5)
     times = [EPOCH_NS + round(t * 1e9) for t in world.times]

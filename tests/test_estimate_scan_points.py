@@ -1,6 +1,5 @@
-"""Older scans combined into points.
-
-``estimate/scan_points.py`` and the windows and decisions that use them.
+"""Older scans combined into points: ``estimate/scan_points.py`` and the windows and decisions
+that use them.
 """
 
 from __future__ import annotations
@@ -156,9 +155,8 @@ def test_small_changes_are_compared_however_large_changes_are_expected(hz: float
 def test_a_step_at_a_high_scan_rate_is_found_with_its_instant(
     monkeypatch: pytest.MonkeyPatch, seed: int, step: dict[str, float], within_s: float
 ) -> None:
-    """Poses of a tracker at 10 Hz.
-
-    A step of 1 cm/s moves the target by the error of a pose in 0.2 s.
+    """Poses of a tracker at 10 Hz: a step of 1 cm/s moves the target by the error of a pose
+    in 0.2 s.
     """
     monkeypatch.setattr(surprises, "NEES_S", ())
     case = surprises.Case(

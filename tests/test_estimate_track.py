@@ -72,9 +72,8 @@ def test_inputs_of_inconsistent_size_are_refused() -> None:
 
 
 def surface_points(seed: int, late_half: bool):
-    """(500, 3) points with normals.
-
-    With ``late_half`` the second half of them lies on one side of the body.
+    """(500, 3) points with normals; with ``late_half`` the second half of them lies on one
+    side of the body.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     p, n = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
@@ -96,9 +95,8 @@ def mean_instants(p, n, times):
 def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(
     begin: float, late_half: bool
 ) -> None:
-    """A prior off by dx carries the points.
-
-    Least squares over surface distances then gives the pose: no H in it.
+    """A prior off by dx carries the points; least squares over surface distances then gives
+    the pose: no H in it.
     """
     world = tumbling.draw(3, rate=0.2, seconds=1.0)
     times = begin + np.sort(np.random.Generator(np.random.PCG64(5)).uniform(0.0, 0.5, 500))

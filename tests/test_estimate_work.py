@@ -84,9 +84,8 @@ def test_a_track_that_is_read_from_a_checkpoint_after_every_scan_has_the_same_bi
 def test_the_drift_that_is_found_does_not_depend_on_the_budget(
     monkeypatch: pytest.MonkeyPatch, budget: int
 ) -> None:
-    """1e-4 rad/s2, poses of 0.5 mm.
-
-    Found at 52.5 s where a scan does the whole test, else six scans later.
+    """1e-4 rad/s2, poses of 0.5 mm: found at 52.5 s where a scan does the whole test, else
+    six scans later.
     """
     monkeypatch.setattr("avsreplay.estimate.work.BUDGET", budget)
     monkeypatch.setattr(surprises, "POS_M", 5e-4)

@@ -1,6 +1,5 @@
-"""Every built-in case through the command line.
-
-The golden rows are reproduced, and the comparison can fail.
+"""Every built-in case through the command line: the golden rows are reproduced, and the
+comparison can fail.
 """
 
 import json

@@ -64,9 +64,8 @@ def test_the_seeds_themselves_are_read(tmp_path: Path, name: str) -> None:
 @settings(max_examples=300)
 @given(st.binary(max_size=200), st.sampled_from(["cdr", "ros1"]))
 def test_any_bytes_as_a_message(data: bytes, encoding: str) -> None:
-    """What is read from any bytes is no larger than they are, and finite where it must be.
-
-    The rest is refused.
+    """What is read from any bytes is no larger than they are, and finite where it must be;
+    the rest is refused.
     """
     for prefix in (b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"):
         message = prefix + data

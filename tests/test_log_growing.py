@@ -1,6 +1,5 @@
-"""A growing log.
-
-Scans are replayed when they are complete, and the rows are those of the whole log.
+"""A growing log: scans are replayed when they are complete, and the rows are those of the
+whole log.
 """
 
 from __future__ import annotations
@@ -149,9 +148,8 @@ class Written(GrowingLog):
 def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay(
     fixtures_folder, tmp_path
 ):
-    """A strong robot arrives before the log ends.
-
-    The true poses at its arrival come after the plan.
+    """A strong robot arrives before the log ends; the true poses at its arrival come after
+    the plan.
     """
     log, settings = fixtures_folder / "tumble.mcap", ("plan.a_max_mps2=5",)
     growing = Written(tmp_path / "log.mcap", log.read_bytes(), 20)

@@ -1,6 +1,5 @@
-"""Damage of every kind, at every place, under every compression.
-
-All intact data is read, and each loss is listed.
+"""Damage of every kind, at every place, under every compression: all intact data is read, and
+each loss is listed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Folders of scans in every format, their order, times and poses; models.
-
-Real data if it is available.
+"""Folders of scans in every format, their order, times and poses; models; real data if it is
+available.
 """
 
 from __future__ import annotations
@@ -357,9 +356,8 @@ def test_quads_and_mixed_polygons_become_triangles() -> None:
 def test_the_stanford_scans(
     folder: str, first: tuple[float, ...], in_model: tuple[float, ...], count: int
 ) -> None:
-    """The worked values of the data's own notes.
-
-    The first vertex of one scan, in the scan and in the model.
+    """The worked values of the data's own notes: the first vertex of one scan, in the scan
+    and in the model.
     """
     found = read(shared(folder))
     assert len(found) == count

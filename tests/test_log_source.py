@@ -1,6 +1,5 @@
-"""Logs of other writers.
-
-ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form.
+"""Logs of other writers: ROS 1 and ROS 2 bags, split files, several topics, moving sensors,
+truth in every form.
 """
 
 from __future__ import annotations

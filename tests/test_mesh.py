@@ -1,6 +1,5 @@
-"""Winding of meshes.
-
-Properties on random bodies, with trimesh's volume and containment as oracles.
+"""Winding of meshes: properties on random bodies, with trimesh's volume and containment as
+oracles.
 """
 
 from __future__ import annotations
@@ -190,9 +189,8 @@ def test_corners_that_differ_by_rounding_are_one(seed: int) -> None:
 
 
 def test_a_sliver_does_not_separate_its_neighbours() -> None:
-    """A face whose corners are nearer than the tolerance.
-
-    The mesh stays closed, and the winding is found across it.
+    """A face whose corners are nearer than the tolerance: the mesh stays closed, and the
+    winding is found across it.
     """
     box = trimesh.creation.box((1, 1, 1))
     vertices, faces = np.array(box.vertices), np.array(box.faces, dtype=np.int32)
@@ -270,9 +268,8 @@ def test_merged_vertices_are_those_of_a_dictionary(seed: int) -> None:
 
 
 def test_a_sheet_beside_closed_parts_is_registered_from_both_sides() -> None:
-    """The points of either side of a panel without thickness are matched.
-
-    The closed parts are matched on one side.
+    """The points of either side of a panel without thickness are matched; the closed parts
+    are matched on one side.
     """
     body = boxes()
     panel = np.array(

@@ -58,9 +58,8 @@ def test_an_over_confident_filter_is_detected_and_a_conservative_one_is_accepted
 
 
 def test_a_small_error_that_all_innovations_share_is_inconsistent() -> None:
-    """0.8 standard deviations along one axis.
-
-    The mean NIS is 6.6, inside its band, the sum of 50 is 5.7 of its own.
+    """0.8 standard deviations along one axis: the mean NIS is 6.6, inside its band, the sum
+    of 50 is 5.7 of its own.
     """
     shifted, held = 0, 0
     for seed in range(40):

@@ -1,6 +1,5 @@
-"""t_1: thresholds by block, the dwell time, both criteria.
-
-An inconsistent filter does not converge.
+"""t_1: thresholds by block, the dwell time, both criteria; an inconsistent filter does not
+converge.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""The fault rule.
-
-Every reason, their order, both policies, and a limit that grows with the predicted 1 sigma.
+"""The fault rule: every reason, their order, both policies, and a limit that grows with the
+predicted 1 sigma.
 """
 
 from __future__ import annotations

@@ -282,9 +282,8 @@ def test_rows_agree_with_the_motion_fitted_to_the_whole_log(tmp_path) -> None:
 
 
 def test_rows_of_a_body_at_rest_do_not_claim_more_than_pose_and_velocity(tmp_path) -> None:
-    """Twelve directions.
-
-    Without rotation neither inertia nor centre of mass nor axes have an effect.
+    """Twelve directions: without rotation neither inertia nor centre of mass nor axes have an
+    effect.
     """
     pairs = _compared(_pose_log(tmp_path / "rest.tum", 1e-9, 20.0), *POSES)
     assert {line["rank_fitted_motion"] for _, line in pairs[2:]} == {12}

@@ -1,6 +1,5 @@
-"""The joints of a manipulator during the last metres, against an independent forward kinematics.
-
-Needs pinocchio.
+"""The joints of a manipulator during the last metres, against an independent forward
+kinematics; needs pinocchio.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""The turn of the gripper.
-
-Closed form, the angular bound, the end condition, and its coupling with the flight.
+"""The turn of the gripper: closed form, the angular bound, the end condition, and its
+coupling with the flight.
 """
 
 import math

@@ -66,17 +66,15 @@ def _problem(seed, n=8):
 
 
 def _independent(p):
-    """The same programme in Clarabel, its constraints collected by evaluating them.
-
-    Interval length and slack.
+    """The same programme in Clarabel, its constraints collected by evaluating them: interval
+    length and slack.
     """
     clarabel = pytest.importorskip("clarabel", reason="the independent solver is not installed")
     from scipy import sparse
 
     def values(x):
-        """All constraints at x = (w, h/h_ref, slack), in metres.
-
-        Positive parts first, then cones of four rows.
+        """All constraints at x = (w, h/h_ref, slack), in metres; positive parts first, then
+        cones of four rows.
         """
         w, g, slack = x[:-2].reshape(p.n, 3), x[-2], x[-1]
         q = p.v0 * p.h * g + np.concatenate([np.zeros((1, 3)), np.cumsum(w, axis=0)])
@@ -218,9 +216,8 @@ def _values(p, rows, h=1.0):
 
 @pytest.mark.parametrize("entry", [None, (0.5, 0.8)])
 def test_rows_of_the_constraints_have_the_margins_at_the_reference(entry):
-    """A plane has the margin of the second alternative there.
-
-    In a cone the first row less the norm of the others.
+    """A plane has the margin of the second alternative there; in a cone the first row less
+    the norm of the others.
     """
     base = (0.0, 2.0, 0.0)
     workspace = Limits(reach_max_m=30.0, reach_min_m=0.01, base_m=base)

@@ -1,6 +1,5 @@
-"""Plans under limits.
-
-The limits hold between the nodes, and inactive limits do not change a plan.
+"""Plans under limits: the limits hold between the nodes, and inactive limits do not change a
+plan.
 """
 
 import math
@@ -30,9 +29,8 @@ CENTRE = np.array([0.0, 0.0, 5.0])
 
 
 def body(rate=0.03, arm=1.0, phase=0.5):
-    """A target that turns about y at ``rate``.
-
-    The grasp point lies on an arm along +x of {C}, as does the axis.
+    """A target that turns about y at ``rate``; the grasp point lies on an arm along +x of
+    {C}, as does the axis.
     """
 
     def axis(t):
@@ -370,9 +368,8 @@ def test_plans_with_a_clearance_are_near_the_best_known(number, known_s):
 
 
 def test_the_number_of_intervals_costs_less_than_a_tenth_of_a_second():
-    """Time of IPOPT with 200 nodes.
-
-    Plan_limits.py --kind cone --first 37 --count 1 --seed 71 --ipopt 38.
+    """Time of IPOPT with 200 nodes: plan_limits.py --kind cone --first 37 --count 1 --seed 71
+    --ipopt 38.
     """
     problem = problems(38, 71)[37]
     params = PlanParams(a_max_mps2=problem.a_max)

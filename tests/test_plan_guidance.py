@@ -47,9 +47,8 @@ def scene(rng):
 
 
 def inputs(rng, end_s=160.0, step_s=0.5):
-    """Scans in random runs of healthy, faulty and unconverged.
-
-    The uncertainty grows while no scan is healthy.
+    """Scans in random runs of healthy, faulty and unconverged; the uncertainty grows while no
+    scan is healthy.
     """
     target, growth = scene(rng), rng.uniform(0.0, 1.0)
     mode, until, healthy_s = "healthy", 3.0, 0.0
@@ -88,9 +87,8 @@ def test_every_sequence_ends_and_attempts_are_limited(seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_withdrawal_comes_no_closer_than_braking_needs(seed):
-    """Distance d0, approach speed v0 along the line of sight.
-
-    Never nearer than d0 - v0^2 / (2 a).
+    """Distance d0, approach speed v0 along the line of sight: never nearer than d0 - v0^2 /
+    (2 a).
     """
     begin = None
     for known, state in flights(seed):

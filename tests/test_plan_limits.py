@@ -1,6 +1,5 @@
-"""Constraints of the approach.
-
-Margins of the alternatives, the workspace, and the limits in the rows of a run.
+"""Constraints of the approach: margins of the alternatives, the workspace, and the limits in
+the rows of a run.
 """
 
 import math

@@ -22,9 +22,8 @@ def fixed(point, rate=(0.0, 0.0, 0.0)):
 
 
 def tumbling(rng, rate=(0.1, 0.35), arm=1.5):
-    """Grasp point of a torque-free body by DOP853.
-
-    An oracle that shares nothing with the package.
+    """Grasp point of a torque-free body by DOP853: an oracle that shares nothing with the
+    package.
     """
     J, w, c = np.sort(rng.uniform(1, 3, 3)), rng.normal(size=3), rng.normal(size=3)
     w *= rng.uniform(*rate) / np.linalg.norm(w)

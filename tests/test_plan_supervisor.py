@@ -1,6 +1,5 @@
-"""The supervisor: every rule can apply, and their order holds. Guidance.
-
-Flights on a constructed estimate.
+"""The supervisor: every rule can apply, and their order holds. Guidance: flights on a
+constructed estimate.
 """
 
 import dataclasses
@@ -133,9 +132,8 @@ def turning(rate=0.1, arm=1.0, distance=5.0):
 def inputs(
     truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0, end=90.0, from_s=5.0
 ):
-    """What a made-up estimator knows: the truth, moved by ``error`` [m].
-
-    Sigmas grow with prediction time.
+    """What a made-up estimator knows: the truth, moved by ``error`` [m]; sigmas grow with
+    prediction time.
     """
     seen = 0.0
     for t in np.arange(0.0, end, 0.2):

@@ -255,9 +255,8 @@ def test_a_unit_in_which_no_scan_shows_the_model_may_be_another_object(surface):
 
 @pytest.fixture(scope="module")
 def own_bag(tmp_path_factory):
-    """The log and the model of the tutorial.
-
-    A camera that moves, a wall, a model in millimetres.
+    """The log and the model of the tutorial: a camera that moves, a wall, a model in
+    millimetres.
     """
     folder = tmp_path_factory.mktemp("own")
     subprocess.run([sys.executable, EXAMPLE, folder], check=True)
@@ -469,9 +468,8 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
 
 
 def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures_folder, tmp_path):
-    """The mirror image is made with trimesh.
-
-    The run with --model-mirror has the poses of the model turned about x.
+    """The mirror image is made with trimesh; the run with --model-mirror has the poses of the
+    model turned about x.
     """
     log, mirrored = fixtures_folder / "tumble.mcap", tmp_path / "mirrored.ply"
     with open_source(log) as source:

@@ -1,6 +1,5 @@
-"""Real data.
-
-Turntable scans, depth views, flights of a cube, a depth scene, bags without clouds (docs/real.md).
+"""Real data: turntable scans, depth views, flights of a cube, a depth scene, bags without
+clouds (docs/real.md).
 """
 
 import json
@@ -111,9 +110,8 @@ def test_every_bunny_scan_comes_back_from_a_wrong_guess(off_deg, bunny):
 
 
 def test_gravity_is_found_and_every_impact_is_a_manoeuvre_at_its_time(shared_data, tmp_path):
-    """Ten real flights of a cube.
-
-    The campaign determines the instants of the impacts without the estimator.
+    """Ten real flights of a cube; the campaign determines the instants of the impacts without
+    the estimator.
     """
     import tosses
 
@@ -204,9 +202,8 @@ def test_raw_packets_are_named_and_a_road_scene_fits_no_spacecraft(shared_data, 
 def test_a_carton_in_a_depth_scene_is_found_with_the_crop_that_info_proposes(
     shared_data, tmp_path, cli
 ):
-    """No ground truth.
-
-    The reference is the best of 641 starts of a trimmed ICP by others, see the data's README.
+    """No ground truth: the reference is the best of 641 starts of a trimmed ICP by others,
+    see the data's README.
     """
     import json
 

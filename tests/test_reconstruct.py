@@ -1,6 +1,5 @@
-"""Reconstruction of an unknown target.
-
-Properties of the result against simulated and real shapes.
+"""Reconstruction of an unknown target: properties of the result against simulated and real
+shapes.
 """
 
 from __future__ import annotations
@@ -44,9 +43,8 @@ HULL = ConvexHull(CORNERS)
 
 
 def hull_scan(rng, T_ac: Pose, noise_m: float = 0.0) -> np.ndarray:
-    """Points on the faces of an irregular convex body that face the camera at the origin of {A}.
-
-    Exact visibility.
+    """Points on the faces of an irregular convex body that face the camera at the origin of
+    {A}: exact visibility.
     """
     parts = []
     for corners, plane in zip(CORNERS[HULL.simplices], HULL.equations, strict=True):
@@ -192,9 +190,8 @@ def test_steps_that_are_too_large_are_refused():
 
 
 def box_scan(rng, T_ac: Pose, marks) -> np.ndarray:
-    """Points on a box that looks alike after half turns, except for small boxes on its faces.
-
-    Exact visibility.
+    """Points on a box that looks alike after half turns, except for small boxes on its faces;
+    exact visibility.
     """
     parts = []
     for size, centre in [(np.array([1.0, 0.7, 0.5]), np.zeros(3)), *marks]:
@@ -290,9 +287,8 @@ def test_an_arm_beside_the_target_is_left_out_because_other_scans_have_no_return
 
 
 def test_the_standard_error_of_points_that_few_scans_have_seen_is_that_of_their_noise():
-    """Against the faces of the body, at the frame of the first scan.
-
-    Of the right size within a factor of two.
+    """Against the faces of the body, at the frame of the first scan: of the right size within
+    a factor of two.
     """
     scans, truth = turning(4, 10.0, noise_m=0.004)
     made = reconstruct(lambda: scans)
@@ -357,9 +353,8 @@ def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
 
 @pytest.mark.slow
 def test_scans_of_the_bunny_that_were_placed_wrongly_are_left_out(shared_data):
-    """Ten views in any order.
-
-    Those that are used must agree with the scanner's poses up to one common displacement.
+    """Ten views in any order: those that are used must agree with the scanner's poses up to
+    one common displacement.
     """
     folder = shared_data / "stanford-bunny"
     with open_source(folder, SourceOptions(model=folder / "bun_zipper.ply")) as source:
@@ -407,9 +402,8 @@ def test_the_frame_is_moved_to_a_grasp_point_with_x_along_the_normal(full_turn):
 
 
 def test_the_true_frame_is_the_mean_over_all_scans_and_not_that_of_the_first(full_turn_small):
-    """A constant transformation is found exactly.
-
-    An error of the first pose counts as one of ten.
+    """A constant transformation is found exactly; an error of the first pose counts as one of
+    ten.
     """
     made, offset = (
         full_turn_small,
@@ -572,9 +566,8 @@ def test_a_scan_is_deskewed_exactly_for_constant_rate_and_velocity():
 
 
 def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
-    """A second body beside the CAD model is 'added'.
-
-    A spike of the CAD model that scans look through is 'missing'.
+    """A second body beside the CAD model is 'added'; a spike of the CAD model that scans look
+    through is 'missing'.
     """
     made = full_turn_small
     hull = Surface(CORNERS, HULL.simplices.astype(np.int32), "hull.ply", "")
@@ -720,9 +713,8 @@ def test_the_equations_of_pairs_are_the_derivatives_of_the_distances_and_pairs_a
 def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of_a_model(
     fixtures_folder,
 ):
-    """A scan that shows one flat side mainly.
-
-    From guesses 4 cm beside it, every pose that is accepted is right.
+    """A scan that shows one flat side mainly: from guesses 4 cm beside it, every pose that is
+    accepted is right.
     """
     with open_source(fixtures_folder / "tumble.mcap") as source:
         scans = list(source.scans())
@@ -741,9 +733,8 @@ def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of
 
 
 def test_scans_of_a_plate_in_front_of_the_target_are_not_used():
-    """For three scans a plate hides the target entirely.
-
-    It is flat, as are the faces of the target.
+    """For three scans a plate hides the target entirely; it is flat, as are the faces of the
+    target.
     """
     scans, truth = turning(12, 10.0, noise_m=0.003)
     rng = np.random.default_rng(8)

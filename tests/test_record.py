@@ -1,6 +1,5 @@
-"""Recording by the command.
-
-The log contains the input, with the same bytes every time, and no partial file remains.
+"""Recording by the command: the log contains the input, with the same bytes every time, and
+no partial file remains.
 """
 
 import hashlib

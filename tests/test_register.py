@@ -1,6 +1,5 @@
-"""Properties of registration.
-
-Signs, frames, quality, unobservable directions of a view, visible faces.
+"""Properties of registration: signs, frames, quality, unobservable directions of a view,
+visible faces.
 """
 
 from __future__ import annotations
@@ -63,9 +62,8 @@ def test_horn_agrees_with_the_singular_value_solution() -> None:
 
 
 def test_horn_matrix_is_scalar_first() -> None:
-    """No motion must give [1 0 0 0] as the largest eigenvector.
-
-    Read scalar last it would be a half turn (errata).
+    """No motion must give [1 0 0 0] as the largest eigenvector; read scalar last it would be
+    a half turn (errata).
     """
     points = _rng().normal(size=(20, 3))
     centred = points - points.mean(axis=0)
@@ -163,9 +161,8 @@ def _off(degrees: float) -> Pose:
 def test_a_guess_that_is_returned_unchanged_is_no_measurement(
     monkeypatch, surface: Surface, scan: np.ndarray
 ) -> None:
-    """Even a good guess.
-
-    It says nothing of this scan, and the filter would take it as a perfect confirmation.
+    """Even a good guess: it says nothing of this scan, and the filter would take it as a
+    perfect confirmation.
     """
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _Unchanged)
     noisy = scan + np.random.default_rng(3).normal(0.0, 0.005, scan.shape)
@@ -221,9 +218,8 @@ def test_information_is_the_curvature_of_the_cost(
 
 
 def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np.ndarray) -> None:
-    """The kernel's sums against numpy, point by point; the patches in any order; few patches.
-
-    A point each.
+    """The kernel's sums against numpy, point by point; the patches in any order; few patches:
+    a point each.
     """
     T_ca, index = example_pose().inverse(), SurfaceIndex.build(surface, 0.5)
     for points in (scan, scan[:40], scan[:1], scan[:0]):
@@ -356,9 +352,8 @@ def test_a_registration_that_did_not_converge_is_reported_and_graded(
 def test_instants_say_which_pose_a_moving_scan_is_registered_at(
     registrar: Registrar, surface: Surface, scan: np.ndarray, late_far: bool
 ) -> None:
-    """The target drifts by t d1 while it is scanned, along one side or at random.
-
-    The pose found is off by M d1.
+    """The target drifts by t d1 while it is scanned, along one side or at random: the pose
+    found is off by M d1.
     """
     T_ac, rng = example_pose(), _rng()
     body = T_ac.inverse().apply(scan)

@@ -1,6 +1,5 @@
-"""Views that do not determine all directions of a pose.
-
-Which, their covariance, and a run that begins with one.
+"""Views that do not determine all directions of a pose: which, their covariance, and a run
+that begins with one.
 """
 
 from __future__ import annotations
@@ -92,9 +91,8 @@ def test_a_refined_pose_has_no_residuals_left_and_does_not_move_along_the_unobse
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_information_is_that_of_the_observable_directions_alone(seed):
-    """Oracle.
-
-    Least squares in the observable directions only, with the covariance of independent noise.
+    """Oracle: least squares in the observable directions only, with the covariance of
+    independent noise.
     """
     J, axis = cylinder_rows(seed)
     rng = np.random.default_rng(seed)
@@ -132,9 +130,8 @@ def test_a_body_of_revolution_is_found_up_to_its_rotation_and_not_called_ambiguo
 
 
 def test_the_estimate_of_a_body_of_revolution_states_that_its_rotation_is_not_determined():
-    """It turns about an axis across its own.
-
-    The position is tracked, and the attitude never claimed.
+    """It turns about an axis across its own; the position is tracked, and the attitude never
+    claimed.
     """
     surface, registrar = stage(), Registrar(stage())
     estimator = Estimator(EstimatorParams(), None, surface.extent)

@@ -93,9 +93,8 @@ def is_wrong(found: Alignment, T_ac: Pose, extent: float) -> bool:
 
 
 def test_a_part_of_a_repeated_pattern_is_not_accepted_at_another_place() -> None:
-    """The cells of a grid are alike.
-
-    A part of it fits in several places, of which a search reaches a few.
+    """The cells of a grid are alike: a part of it fits in several places, of which a search
+    reaches a few.
     """
     mesh = grid()
     registrar, extent = Registrar(surface_of(mesh)), float(np.linalg.norm(mesh.extents))

@@ -1,6 +1,5 @@
-"""Global search without a guess at any attitude.
-
-Unique where possible, ambiguous for a symmetric target.
+"""Global search without a guess at any attitude: unique where possible, ambiguous for a
+symmetric target.
 """
 
 from __future__ import annotations
@@ -120,9 +119,8 @@ def test_an_empty_scan_and_a_handful_of_points_are_answered(registrar: Registrar
 
 
 def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
-    """The scan moved into a frame whose origin lies in the target.
-
-    That is no camera, and nothing says where it was.
+    """The scan moved into a frame whose origin lies in the target: that is no camera, and
+    nothing says where it was.
     """
     rng = np.random.default_rng(SEED)
     registrar = Registrar(boxes())
@@ -170,9 +168,8 @@ def test_a_search_that_fails_stops_at_the_budget(
 
 
 def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registrar) -> None:
-    """Exact points cost almost nothing, points five cells away cost all.
-
-    Neither depends on the number of threads.
+    """Exact points cost almost nothing, points five cells away cost all; neither depends on
+    the number of threads.
     """
     surface = boxes()
     points, normals = sample(surface, 3000)
@@ -254,9 +251,8 @@ def test_directions_are_even() -> None:
 
 
 def test_the_visible_centre_of_a_sphere_is_towards_the_camera() -> None:
-    """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer.
-
-    Mean cosine over a disc.
+    """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer: mean
+    cosine over a disc.
     """
     normals = directions(8000)
     centres = VisibleCentroids(2.0 * normals, normals, 4.0, count=30)
@@ -343,9 +339,8 @@ def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_
 def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     registrar: Registrar, noise: float, unique: bool
 ) -> None:
-    """Noise favours a wrong pose with more surface nearby.
-
-    3 % more points on the model say nothing at large noise.
+    """Noise favours a wrong pose with more surface nearby: 3 % more points on the model say
+    nothing at large noise.
     """
     extent, rng = registrar._target.surface.extent, np.random.default_rng(6)
     distance = noise * extent * np.abs(rng.standard_normal(1500))
@@ -370,9 +365,8 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
 
 
 def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
-    """Sensors report a missing return as (0, 0, 0).
-
-    The choice between nearly symmetric poses uses directions.
+    """Sensors report a missing return as (0, 0, 0); the choice between nearly symmetric poses
+    uses directions.
     """
     surface, T_ac = _box((1.0, 0.8, 0.4)), example_pose()
     points, missing = T_ac.apply(view(surface, 500, T_ac.inverse().t)), np.zeros((5, 3))
@@ -386,9 +380,8 @@ def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
 
 
 def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:
-    """Two faces of a wedge fit an L-bracket.
-
-    They determine no size, and other faces of the bracket are missing.
+    """Two faces of a wedge fit an L-bracket; they determine no size, and other faces of the
+    bracket are missing.
     """
     parts = [trimesh.creation.box((2.0, 0.3, 1.0)), trimesh.creation.box((0.3, 1.5, 1.0))]
     parts[1].apply_translation((-0.85, 0.7, 0.0))

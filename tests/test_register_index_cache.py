@@ -83,9 +83,8 @@ def test_a_damaged_file_is_rebuilt(surface: Surface, tmp_path: Path, harm: str) 
 
 @pytest.mark.slow
 def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> None:
-    """Payloads with a right checksum but random words in them.
-
-    Refused, or searched without leaving the arrays.
+    """Payloads with a right checksum but random words in them: refused, or searched without
+    leaving the arrays.
     """
     SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     path = saved(tmp_path)
@@ -169,9 +168,8 @@ def _searched(registrar: Registrar) -> list[bytes]:
 def test_what_a_search_needs_is_kept_with_the_index_and_made_again_if_damaged(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A nearly symmetric body.
-
-    Its near-symmetries and marks are the same from the file, built, or after damage.
+    """A nearly symmetric body: its near-symmetries and marks are the same from the file,
+    built, or after damage.
     """
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -1,6 +1,5 @@
-"""The C++ kernel.
-
-Exact against independent searches, the same bits for any thread count and instruction set.
+"""The C++ kernel: exact against independent searches, the same bits for any thread count and
+instruction set.
 """
 
 from __future__ import annotations
@@ -78,9 +77,8 @@ def _to_side(q: Array, u: Array, v: Array) -> Array:
 
 
 def adversarial(vertices: Array, seed: int, n: int) -> Array:
-    """Queries where a search goes wrong if it can.
-
-    On vertices, halfway between them, a rounding beside, far off.
+    """Queries where a search goes wrong if it can: on vertices, halfway between them, a
+    rounding beside, far off.
     """
     r = rng(seed)
     i, j = r.integers(len(vertices), size=(2, n))
@@ -231,9 +229,8 @@ def test_kernel_and_oracle_find_the_same_closest_points_on_the_built_in_like_mes
 
 
 def hard_meshes() -> dict[str, Surface]:
-    """Meshes that are not closed, single and outer.
-
-    What a display model of a spacecraft is made of.
+    """Meshes that are not closed, single and outer: what a display model of a spacecraft is
+    made of.
     """
     trimesh = pytest.importorskip("trimesh")
     r = rng(20)
@@ -315,9 +312,8 @@ def test_neighbours_kept_over_many_passes_are_those_of_a_search(name: str, facin
 
 @pytest.mark.parametrize("seed", range(6))
 def test_newton_steps_end_at_the_fixed_point_of_horns_iteration(seed: int) -> None:
-    """Horn's passes alone, continued to 1e-10, stay where Newton's ended.
-
-    They need many times more passes.
+    """Horn's passes alone, continued to 1e-10, stay where Newton's ended; they need many
+    times more passes.
     """
     trimesh = pytest.importorskip("trimesh")
     parts = [
@@ -463,9 +459,8 @@ def test_a_number_of_threads_that_no_system_has_is_refused(target: Surface) -> N
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the address space of a process")
 def test_threads_that_the_system_refuses_do_not_end_the_process() -> None:
-    """Those that start do the work.
-
-    Here the stacks of 1024 threads do not fit in the address space.
+    """Those that start do the work: here the stacks of 1024 threads do not fit in the address
+    space.
     """
     code = (
         "import resource\n"
@@ -509,9 +504,8 @@ def sheet(n: int) -> Surface:
 
 @pytest.mark.parametrize("facing", [False, True])
 def test_on_small_triangles_most_searches_are_skipped_with_the_same_bits(facing: bool) -> None:
-    """Neighbouring triangles are nearly as near as the nearest.
-
-    Only its block can be kept, not the triangle.
+    """Neighbouring triangles are nearly as near as the nearest: only its block can be kept,
+    not the triangle.
     """
     mesh, r = sheet(80), rng(31)
     model = SurfaceIndex.build(mesh, 0.4)
@@ -540,9 +534,8 @@ def test_on_small_triangles_most_searches_are_skipped_with_the_same_bits(facing:
 def test_each_point_is_found_as_if_it_were_alone(
     shape: str, eye: tuple[float, float, float] | None
 ) -> None:
-    """The points of a strip are searched together.
-
-    No point may have the blocks or the distances of another one.
+    """The points of a strip are searched together: no point may have the blocks or the
+    distances of another one.
     """
     shapes = {
         "sheet": sheet(40),
@@ -658,9 +651,8 @@ def test_the_share_of_points_on_faces_towards_the_camera_is_compared_with_the_le
 def test_distances_are_those_of_the_closest_points(
     count: int, eye: tuple[float, float, float]
 ) -> None:
-    """A plate whose upper side alone is there.
-
-    From below no face faces the camera, and both sides count.
+    """A plate whose upper side alone is there: from below no face faces the camera, and both
+    sides count.
     """
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
     plate = SurfaceIndex.build(surface(corners, [[0, 1, 2], [0, 2, 3]]), 0.5)
@@ -807,9 +799,8 @@ def stub_arguments(function: ast.FunctionDef) -> list[tuple[str, bool]]:
 
 
 def bound_arguments(text: str) -> list[tuple[str, bool]]:
-    """The same from the signature that nanobind writes.
-
-    A default is ``\\0``, ``\\1``, and types are not in Python.
+    """The same from the signature that nanobind writes; a default is ``\0``, ``\1``, and
+    types are not in Python.
     """
     while "[" in text:
         text = re.sub(r"\[[^\[\]]*\]", "", text)

@@ -117,9 +117,8 @@ def test_the_motion_of_a_box_of_the_right_size_says_nothing_of_it(acceleration: 
 def moving_scans(
     surface: Surface, duration_s: float, count: int, sigma: float = 0.001
 ) -> list[tuple[Scan, Pose]]:
-    """Scans of a moving target every 0.5 s, point after point from left to right.
-
-    The poses are those in the middle.
+    """Scans of a moving target every 0.5 s, point after point from left to right; the poses
+    are those in the middle.
     """
     rng, found = np.random.default_rng(SEED), []
     rate, velocity = np.array([0.05, 0.08, -0.04]), np.array([0.004, -0.003, 0.002])

@@ -1,6 +1,5 @@
-"""Wrong poses are rejected, correct ones are not.
-
-Noise, contradictions, and the work that a scan may cost.
+"""Wrong poses are rejected, correct ones are not: noise, contradictions, and the work that a
+scan may cost.
 """
 
 from __future__ import annotations
@@ -92,9 +91,8 @@ def test_the_surface_that_the_camera_sees_is_not_hidden(surface: Surface) -> Non
 
 
 def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surface) -> None:
-    """The camera looks through the model at a wall.
-
-    The distances of the part on the model alone do not show it.
+    """The camera looks through the model at a wall: the distances of the part on the model
+    alone do not show it.
     """
     index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
     test, T_ac, rng = (
@@ -114,9 +112,8 @@ def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surf
 def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(
     surface: Surface,
 ) -> None:
-    """Nearly all points stay on a long box that is shifted along its axis.
-
-    Its small end alone shows the shift.
+    """Nearly all points stay on a long box that is shifted along its axis: its small end
+    alone shows the shift.
     """
     made = trimesh.creation.box((4.0, 1.0, 0.3))
     box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "box", "")
@@ -242,9 +239,8 @@ def test_no_scan_costs_more_than_twenty_ordinary_registrations(
     scene: str,
     guessed: bool,
 ) -> None:
-    """Of the last step, too.
-
-    It is counted how much each scan takes in all, whatever its result is.
+    """Of the last step, too: it is counted how much each scan takes in all, whatever its
+    result is.
     """
     spent, spend, rng, T_ac = [0], Budget.spend, np.random.default_rng(SEED), example_pose()
 
@@ -291,9 +287,8 @@ def test_searches_become_rare_where_none_finds_a_pose() -> None:
 
 
 def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
-    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most.
-
-    On few of 2000.
+    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most; on
+    few of 2000.
     """
     tried = [failed for failed in range(2000) if effort_after(failed) is not Effort.NONE]
     assert tried[:50] == list(range(50))
@@ -305,9 +300,8 @@ def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
 def test_a_guess_that_few_points_confirm_gets_the_full_effort(
     registrar: Registrar, surface: Surface, noise: float
 ) -> None:
-    """As at the end of an occlusion at the start of a run.
-
-    Another body costs no registration of the whole scan.
+    """As at the end of an occlusion at the start of a run; another body costs no registration
+    of the whole scan.
     """
     rng, T_ac = np.random.default_rng(SEED), example_pose()
     scan = hidden_view(surface, T_ac, 3000, rng, noise * surface.extent)
@@ -362,9 +356,8 @@ def test_a_body_is_separated_from_the_wall_behind_it(surface: Surface) -> None:
 
 
 def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
-    """Two tetrahedra with a common edge.
-
-    Four faces meet there, and both are closed with outward faces.
+    """Two tetrahedra with a common edge: four faces meet there, and both are closed with
+    outward faces.
     """
     apex = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)

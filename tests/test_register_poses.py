@@ -1,6 +1,5 @@
-"""Measured poses in place of clouds.
-
-Every format gives the same run, and wrong input gives one clear line.
+"""Measured poses in place of clouds: every format gives the same run, and wrong input gives
+one clear line.
 """
 
 from __future__ import annotations

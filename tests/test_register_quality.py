@@ -24,9 +24,8 @@ from avsreplay.register.degenerate import unbounded_directions
 
 @pytest.mark.parametrize("patches", [5, 8, 9, 30, 122])
 def test_the_sandwich_of_any_number_of_patches_is_that_of_their_eigenvalues(patches: int) -> None:
-    """Patches with little and with much leverage in any order.
-
-    Four of them are computed together.
+    """Patches with little and with much leverage in any order: four of them are computed
+    together.
     """
     rng = np.random.default_rng(patches)
     for _ in range(20):
@@ -62,9 +61,8 @@ def _rows(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("count", [600, 30, 12])
 def test_covariance_is_right_in_the_mean_for_independent_noise(count: int) -> None:
-    """Of patches of unequal size, the largest with a third of the points.
-
-    The delete-one jackknife claims too much.
+    """Of patches of unequal size, the largest with a third of the points; the delete-one
+    jackknife claims too much.
     """
     rng, total = np.random.default_rng(3), np.zeros((6, 6))
     J = rng.normal(size=(600, 6))
@@ -78,9 +76,8 @@ def test_covariance_is_right_in_the_mean_for_independent_noise(count: int) -> No
 
 
 def _normalised_errors(per_patch: float) -> np.ndarray:
-    """Squared errors of 400 fits over their covariance.
-
-    Noise of unit variance, ``per_patch`` of it in common.
+    """Squared errors of 400 fits over their covariance; noise of unit variance, ``per_patch``
+    of it in common.
     """
     rng, values = np.random.default_rng(12), []
     for _ in range(400):
@@ -98,9 +95,8 @@ def _normalised_errors(per_patch: float) -> np.ndarray:
 def test_few_patches_do_not_make_the_covariance_too_small_in_some_direction(
     per_patch: float,
 ) -> None:
-    """Thirty patches do not determine 21 variances.
-
-    Without shrinkage the 99 % point is that of Hotelling's T^2, 28.
+    """Thirty patches do not determine 21 variances: without shrinkage the 99 % point is that
+    of Hotelling's T^2, 28.
     """
     values = _normalised_errors(per_patch)
     assert 0.85 < values.mean() / 6.0 < 1.15
@@ -110,9 +106,8 @@ def test_few_patches_do_not_make_the_covariance_too_small_in_some_direction(
 
 
 def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:
-    """Nothing but patch 7 sees the last motion: it is left out, and the motion is free.
-
-    Without it nothing is lone.
+    """Nothing but patch 7 sees the last motion: it is left out, and the motion is free;
+    without it nothing is lone.
     """
     J, e = _rows(4)
     found = summed(J, e, PATCH)
@@ -125,9 +120,8 @@ def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:
 
 
 def test_patches_are_left_out_until_none_determines_a_motion_alone() -> None:
-    """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest.
-
-    All three go, one after the other.
+    """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest: all three
+    go, one after the other.
     """
     J, e = _rows(4)
     for patch in range(30):

@@ -76,9 +76,8 @@ def test_a_close_guess_is_registered_once(scans, monkeypatch):
 
 
 def test_a_scan_of_scattered_points_costs_few_restarts():
-    """A few stray returns are worth at most eight restarts.
-
-    A result equal to the guess is not a second start.
+    """A few stray returns are worth at most eight restarts: a result equal to the guess is
+    not a second start.
     """
     registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
     restarter = registrar._restarter
@@ -155,9 +154,8 @@ def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise
 
 
 def test_the_size_is_fitted_for_the_pose_that_is_returned(monkeypatch):
-    """Half of the points are far away.
-
-    Two alignments are graded, and the size is fitted to the second only.
+    """Half of the points are far away: two alignments are graded, and the size is fitted to
+    the second only.
     """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(5)
     registrar, graded, sized = Registrar(surface), [], []
@@ -281,9 +279,8 @@ def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() 
 
 
 def test_a_pose_beside_the_truth_is_left_along_the_valley():
-    """A stage with one fin, turned about its axis.
-
-    The cost is nearly flat there and has its minimum at the truth.
+    """A stage with one fin, turned about its axis: the cost is nearly flat there and has its
+    minimum at the truth.
     """
     angle = 2.0 * np.pi * np.arange(48) / 48.0
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(48)])
@@ -323,9 +320,8 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
 def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(
     scans, monkeypatch, seed, error
 ):
-    """Three tenths of a scan, from a guess 3 deg off.
-
-    Nearly all of its points are near the model at a wrong pose.
+    """Three tenths of a scan, from a guess 3 deg off: nearly all of its points are near the
+    model at a wrong pose.
     """
     registrar, rng, scan = Registrar(builtin_surface()), np.random.default_rng(seed), scans[0]
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -373,9 +369,8 @@ def test_a_target_of_another_size_is_said_and_covered():
 
 
 def test_points_beyond_three_standard_deviations_do_not_pull_the_pose():
-    """Some points a little in front of one side, nearer than the gate.
-
-    Mixed pixels at the edges of what is hidden.
+    """Some points a little in front of one side, nearer than the gate: mixed pixels at the
+    edges of what is hidden.
     """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(7)
     scan = seen(surface, T_ac, 0.001, rng)
@@ -389,9 +384,8 @@ def test_points_beyond_three_standard_deviations_do_not_pull_the_pose():
 
 
 def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
-    """The second alignment of a noisy scan.
-
-    Passes over few points, or to the planes, would lead away first.
+    """The second alignment of a noisy scan: passes over few points, or to the planes, would
+    lead away first.
     """
     model, rng = boxes(), np.random.default_rng(4)
     T_ac = example_pose()
@@ -410,9 +404,8 @@ def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
 def test_where_the_guess_is_only_tested_nothing_is_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Between the due scans of a run without an accepted pose.
-
-    No restart, no search, no steps along the valley.
+    """Between the due scans of a run without an accepted pose: no restart, no search, no
+    steps along the valley.
     """
     rng = np.random.default_rng(8)
     sphere = rng.standard_normal((600, 3))
@@ -480,9 +473,8 @@ def test_the_bias_of_the_noise_is_corrected_and_the_covariance_contains_the_rest
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["guitar", "truss"])
 def test_small_noise_does_not_bias_the_pose_of_thin_parts(kind, monkeypatch):
-    """Noise of 0.2 % of the extent moves points of small parts to other faces.
-
-    Trimesh casts the rays of the views.
+    """Noise of 0.2 % of the extent moves points of small parts to other faces; trimesh casts
+    the rays of the views.
     """
     surface = bodies.surface_of(bodies.body(kind, 4), "")
     views = [scenes.view(surface, 10_000, seed, noise=0.002) for seed in range(20)]
@@ -544,9 +536,8 @@ def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
 
 
 def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
-    """The distances at this minimum change their sign within a twentieth of the extent.
-
-    Nearly all are inliers.
+    """The distances at this minimum change their sign within a twentieth of the extent;
+    nearly all are inliers.
     """
     surface = shared("spacecraft-meshes", "Kepler.obj")
     if surface is None:
@@ -559,9 +550,8 @@ def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
 
 
 def test_a_fit_whose_points_share_their_distances_is_not_close() -> None:
-    """A pose shifted by a third of the gate, with points off the model.
-
-    Noise of single points is a close fit.
+    """A pose shifted by a third of the gate, with points off the model; noise of single
+    points is a close fit.
     """
     surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
     registrar = Registrar(surface)

@@ -1,6 +1,5 @@
-"""Nearly symmetric bodies.
-
-Rays decide between poses that differ by a near-symmetry, or the result is ambiguous.
+"""Nearly symmetric bodies: rays decide between poses that differ by a near-symmetry, or the
+result is ambiguous.
 """
 
 from __future__ import annotations

@@ -103,9 +103,8 @@ def test_without_transforms_no_scan_of_a_log_that_names_a_fixed_frame_can_be_use
 
 
 def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path):
-    """The camera stands 90 m from the origin of the fixed frame.
-
-    The target is behind it as seen from there.
+    """The camera stands 90 m from the origin of the fixed frame; the target is behind it as
+    seen from there.
     """
     log = _far_log(tmp_path / "far.mcap")
     with Run(Job(source=log)) as run:
@@ -121,9 +120,8 @@ def test_a_run_in_a_far_fixed_frame_is_that_in_the_frame_of_the_sensor(tmp_path)
 
 
 def _turning(after_s: float) -> Pose:
-    """Pose of a sensor that turns and moves.
-
-    Between two instants the position is interpolated by the reader.
+    """Pose of a sensor that turns and moves; between two instants the position is
+    interpolated by the reader.
     """
     return Pose(
         geometry.multiply(SENSOR.q, geometry.exp(after_s * np.array([0.1, -0.2, 0.15]))),
@@ -132,9 +130,8 @@ def _turning(after_s: float) -> Pose:
 
 
 def _turning_log(log: Path, raw: Path = RASTER) -> float:
-    """A log with points at their own times, measured by that sensor.
-
-    Returns the duration of a scan [s].
+    """A log with points at their own times, measured by that sensor; returns the duration of
+    a scan [s].
     """
     with open_source(raw) as source:
         header = replace(

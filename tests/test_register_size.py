@@ -1,6 +1,5 @@
-"""Size of the target from one scan.
-
-Reported if it is wrong, not if noise or another error has a similar effect.
+"""Size of the target from one scan: reported if it is wrong, not if noise or another error
+has a similar effect.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from avsreplay.simulate.target import builtin_surface
 
 
 def scan_of(surface: Surface, seed: int, noise: float, count: int = 3000) -> tuple[Array, Pose]:
-    """A view from a random side at three extents, noise in units of the extent along the ray.
-
-    And T_ac.
+    """A view from a random side at three extents, noise in units of the extent along the ray;
+    and T_ac.
     """
     rng = np.random.default_rng(seed)
     q = rng.standard_normal(4)
@@ -140,9 +138,8 @@ def test_the_bias_of_noise_is_that_of_repeated_scans() -> None:
 
 
 def test_an_error_of_aspect_is_not_called_an_error_of_size() -> None:
-    """Along one axis alone.
-
-    The sign of the isotropic fit depends on the view, and its standard error includes that.
+    """Along one axis alone: the sign of the isotropic fit depends on the view, and its
+    standard error includes that.
     """
     model = boxes()
     stretched = replace(model, vertices=model.vertices * [1.0, 1.0, 1.012])

@@ -1,6 +1,5 @@
-"""The surface index and its numpy reference.
-
-Recovery, invariance, meaning of the sums, invalid input.
+"""The surface index and its numpy reference: recovery, invariance, meaning of the sums,
+invalid input.
 """
 
 from __future__ import annotations
@@ -176,9 +175,8 @@ def test_horn_passes_lower_the_rms_every_time(build: Build) -> None:
 
 
 def test_information_is_the_residuals_curvature(build: Build) -> None:
-    """J = de/dd for T_ac_true = T_ac Exp(d).
-
-    The residual at the moved pose, feet and normals held, against J d.
+    """J = de/dd for T_ac_true = T_ac Exp(d): the residual at the moved pose, feet and normals
+    held, against J d.
     """
     mesh = shape()
     model = build(mesh, 0.5)
@@ -297,9 +295,8 @@ def test_only_faces_that_look_at_the_camera_count(build: Build) -> None:
 
 
 def test_a_thin_plate_is_not_pulled_to_its_far_side(build: Build) -> None:
-    """Half the noise of the near side lies nearer to the far one.
-
-    All faces bias the pose, those seen do not.
+    """Half the noise of the near side lies nearer to the far one: all faces bias the pose,
+    those seen do not.
     """
     mesh = shape()
     thin = dataclasses.replace(mesh, vertices=mesh.vertices * [1, 1, 0.02])

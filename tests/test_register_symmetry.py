@@ -1,6 +1,5 @@
-"""Motions that carry most of a model onto itself.
-
-Turns of gears, of bodies of revolution, and finite groups.
+"""Motions that carry most of a model onto itself: turns of gears, of bodies of revolution,
+and finite groups.
 """
 
 from __future__ import annotations
@@ -19,9 +18,8 @@ from avsreplay.register.symmetry import TURNS, near_symmetries
 
 
 def prism(outline: Array, height: float) -> trimesh.Trimesh:
-    """A prism over an outline (n, 2) that is star-shaped about the origin.
-
-    Its parts end at z = 0 and the height.
+    """A prism over an outline (n, 2) that is star-shaped about the origin; its parts end at z
+    = 0 and the height.
     """
     n = len(outline)
     low, high = (np.column_stack([outline, np.full(n, z)]) for z in (0.0, height))
@@ -103,9 +101,8 @@ def test_products_complete_the_group_of_a_cube() -> None:
 
 @pytest.mark.parametrize("teeth", [17, 38])
 def test_no_pose_of_a_gear_is_accepted_that_is_turned_by_teeth(teeth: int) -> None:
-    """With the key in sight one tooth is right.
-
-    With the key on the other side none is told from the others.
+    """With the key in sight one tooth is right; with the key on the other side none is told
+    from the others.
     """
     surface, rng, accepted = gear(teeth, 0.15), np.random.default_rng(teeth), 0
     registrar = Registrar(surface)

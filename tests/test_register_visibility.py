@@ -84,9 +84,8 @@ def test_a_camera_beside_the_target_sees_one_side_of_a_panel(distance: float) ->
 
 
 def test_a_camera_beside_the_target_may_have_a_poor_guess() -> None:
-    """At a guess several degrees off it is not decided which faces were measured.
-
-    At the result it is.
+    """At a guess several degrees off it is not decided which faces were measured; at the
+    result it is.
     """
     surface, rng = _box_and_panel(), _rng()
     registrar, visibility, undecided = Registrar(surface), Visibility(surface), 0
@@ -136,9 +135,8 @@ def _fits(
 
 
 def test_the_choice_of_faces_holds_at_the_result() -> None:
-    """Clear of the model one alignment is made where the test holds.
-
-    Next to it, up to three, counted together.
+    """Clear of the model one alignment is made where the test holds; next to it, up to three,
+    counted together.
     """
     surface = _box_and_panel()
     model, visibility = SurfaceIndex.build(surface, 0.6), Visibility(surface)
@@ -172,9 +170,8 @@ def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.nda
 
 @pytest.mark.parametrize("offset", [0.06, -0.06])
 def test_a_thin_panel_is_not_matched_to_its_reverse_side(offset: float) -> None:
-    """Half a panel's thickness off along the sight, either way.
-
-    Only one side of it can have been measured.
+    """Half a panel's thickness off along the sight, either way: only one side of it can have
+    been measured.
     """
     surface = boxes()
     T_ac = example_pose()
@@ -185,9 +182,8 @@ def test_a_thin_panel_is_not_matched_to_its_reverse_side(offset: float) -> None:
 
 
 def _patches(rng: np.random.Generator, joined: bool) -> Surface:
-    """Convex bodies whose faces are single patches, each wound at random.
-
-    Some of the patches are left unsplit.
+    """Convex bodies whose faces are single patches, each wound at random; some of the patches
+    are left unsplit.
     """
     vertices, faces, count = [], [], 0
     for _ in range(3):
@@ -208,9 +204,8 @@ def _patches(rng: np.random.Generator, joined: bool) -> Surface:
 
 
 def _seen(surface: Surface, rng: np.random.Generator) -> np.ndarray:
-    """Slope of the first face on rays from outside, below 0 if it faces the eye.
-
-    Of faces there the least.
+    """Slope of the first face on rays from outside, below 0 if it faces the eye; of faces
+    there the least.
     """
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     middle = surface.vertices.mean(axis=0)
@@ -255,9 +250,8 @@ def test_patches_that_no_edge_connects_face_the_cameras_that_see_them(
 def test_both_sides_of_a_bowl_are_matched_and_one_of_a_body(
     subdivisions: int, turned: bool
 ) -> None:
-    """A bowl without thickness beside a box.
-
-    Finely meshed it has few open edges, and its sides are still two.
+    """A bowl without thickness beside a box: finely meshed it has few open edges, and its
+    sides are still two.
     """
     bowl, body = (
         trimesh.creation.icosphere(subdivisions=subdivisions),

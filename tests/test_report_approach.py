@@ -16,9 +16,8 @@ SQUARE = np.array([[0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 1.0, 1.0]], np.flo
 
 
 def rows(action: str = "approach") -> list[Row]:
-    """A target at (0, 0, 5) m whose {C} is {A} turned by 90 degrees about z.
-
-    A plan of 10 s is made at the scan 2.
+    """A target at (0, 0, 5) m whose {C} is {A} turned by 90 degrees about z; a plan of 10 s
+    is made at the scan 2.
     """
     place = {"x_m": 0.0, "y_m": 0.0, "z_m": 5.0, "qx": 0.0, "qy": 0.0, "qz": HALF, "qw": HALF}
     made = [

@@ -72,9 +72,8 @@ def _with_errors(rows, errors):
 
 @pytest.mark.parametrize("slope", [2.0, 10.0, 100.0])
 def test_an_error_that_grows_during_the_run_is_worse(make_rows, slope):
-    """Larger in every block of scans.
-
-    The differences of the mean squares spread over powers of ten.
+    """Larger in every block of scans; the differences of the mean squares spread over powers
+    of ten.
     """
     rows, base = make_rows(200), [r.pos_err_m for r in _noisy(make_rows(200), 1.0)]
     other = [
@@ -91,9 +90,8 @@ def test_an_error_that_grows_during_the_run_is_worse(make_rows, slope):
 
 
 def test_an_error_in_a_few_scans_is_no_evidence(make_rows):
-    """Smaller in nine blocks of ten and much larger in one.
-
-    The rms is larger, but by chance in one place.
+    """Smaller in nine blocks of ten and much larger in one: the rms is larger, but by chance
+    in one place.
     """
     rows = make_rows(200)
     base = np.array([r.pos_err_m for r in _noisy(rows, 1.0)])
@@ -146,9 +144,8 @@ def _series(rng, count, phi):
 
 @pytest.mark.parametrize(("count", "phi", "least"), [(35, 0.0, 0.86), (100, 0.8, 0.82)])
 def test_intervals_cover_zero_where_the_runs_do_not_differ(make_rows, count, phi, least):
-    """Errors of equal size, correlated from scan to scan.
-
-    3 sigma of 60 trials below 95 % and 91 %.
+    """Errors of equal size, correlated from scan to scan: 3 sigma of 60 trials below 95 % and
+    91 %.
     """
     rng, rows, inside = np.random.default_rng(7), make_rows(count), 0
     for _ in range(60):
@@ -186,9 +183,8 @@ def test_a_median_of_one_pair_is_neither_better_nor_worse(make_rows):
 
 
 def test_four_percent_on_35_scans_are_no_evidence(make_rows):
-    """Errors that are correlated from scan to scan, as those of a filter.
-
-    20 pairs, two of which may be decided.
+    """Errors that are correlated from scan to scan, as those of a filter: 20 pairs, two of
+    which may be decided.
     """
     words = []
     for k in range(20):

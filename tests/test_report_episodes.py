@@ -22,9 +22,8 @@ def test_labels_outside_the_replayed_time_are_not_missed():
 
 
 def test_a_window_within_the_replayed_time_counts_although_it_left_no_scan():
-    """Scans 3 to 6 are not in the log: the gap is the detection.
-
-    A window without scans and without a gap is missed.
+    """Scans 3 to 6 are not in the log: the gap is the detection; a window without scans and
+    without a gap is missed.
     """
     labels = [Label("dropped", 3 * NS, 7 * NS), Label("dropped", 8 * NS + 1, 8 * NS + 2)]
     found = account([Mark(k * NS, 1, None) for k in (0, 1, 2, 7, 8, 9, 10, 11)], labels)

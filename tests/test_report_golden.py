@@ -1,6 +1,5 @@
-"""Golden comparison.
-
-In both directions, each column by its declared tolerance, missing values included.
+"""Golden comparison: in both directions, each column by its declared tolerance, missing
+values included.
 """
 
 from __future__ import annotations

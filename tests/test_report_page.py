@@ -162,9 +162,8 @@ def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
 
 
 def test_intensities_are_levels_up_to_the_brightest_points(make_rows):
-    """A level for each point in the order of the points.
-
-    Grey (255) where the sensor gives no value.
+    """A level for each point in the order of the points; grey (255) where the sensor gives no
+    value.
     """
     rows, points = make_rows(2), np.zeros((4, 3)) + np.arange(4.0)[:, None]
     clouds = (

@@ -275,9 +275,8 @@ def test_parameters_are_compared_with_the_truth(make_rows):
 
 
 def test_values_in_the_fixture_frame_are_the_same_for_every_order_of_the_principal_axes(make_rows):
-    """24 descriptions of one body.
-
-    The paper's parameters differ and say so, the others have the same true values.
+    """24 descriptions of one body: the paper's parameters differ and say so, the others have
+    the same true values.
     """
     in_c = {
         "rate_cx_radps": 0.1,
@@ -423,9 +422,8 @@ def test_moments_follow_from_the_inertia_ratios() -> None:
 
 
 def test_each_manoeuvre_is_listed_as_last_reported(make_rows):
-    """The first is corrected by a later row and withdrawn by none.
-
-    The second is reported five scans later.
+    """The first is corrected by a later row and withdrawn by none; the second is reported
+    five scans later.
     """
     rows = make_rows(20)
     first = {
@@ -478,9 +476,8 @@ def test_without_a_scan_free_of_faults_no_rate_of_false_alarms_is_stated(clean):
 
 
 def test_manoeuvres_are_those_that_the_last_rows_describe(clean):
-    """A row counts the manoeuvres and describes the last one.
-
-    A later count of fewer withdraws the others.
+    """A row counts the manoeuvres and describes the last one; a later count of fewer
+    withdraws the others.
     """
     described = [(0, None), (1, 1.0), (1, 1.1), (2, 4.0), (2, None), (2, 4.2), (1, 1.2)]
     rows = [

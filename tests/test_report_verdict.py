@@ -1,6 +1,5 @@
-"""The verdict.
-
-No run with a serious problem passes, and every reason states what, when and how large.
+"""The verdict: no run with a serious problem passes, and every reason states what, when and
+how large.
 """
 
 from __future__ import annotations
@@ -156,9 +155,8 @@ def test_errors_that_are_the_same_in_all_scans_are_those_of_another_frame(make_r
     [(1.0, 0.0, True), (0.0, 30.0, True), (1.0, 30.0, True), (0.1, 1.0, False)],
 )
 def test_a_displaced_or_a_turned_frame_is_found(make_rows, metres, degrees, said):
-    """Only one of both may be there.
-
-    The other errors are then those of the estimate, which scatter.
+    """Only one of both may be there: the other errors are then those of the estimate, which
+    scatter.
     """
     rng, rows = np.random.default_rng(4), make_rows(100, seed=3)
     noise = np.abs(rng.normal(size=(100, 2))) * (0.02, 0.5)

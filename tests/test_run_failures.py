@@ -57,9 +57,8 @@ def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(monkeypa
 
 
 def test_a_back_end_that_returns_its_guess_is_no_sensor(monkeypatch):
-    """The first pose is that of the global search.
-
-    The later ones would be those of the filter itself, with NIS 0.
+    """The first pose is that of the global search; the later ones would be those of the
+    filter itself, with NIS 0.
     """
     _replace_backend(monkeypatch, lambda points, guess: Fit(guess, 1, True))
     with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
@@ -79,9 +78,8 @@ def test_a_healthy_scan_has_no_message():
 
 
 def test_a_wrong_model_is_searched_for_ever_more_rarely(monkeypatch, tmp_path):
-    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans.
-
-    The rows say so.
+    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans;
+    the rows say so.
     """
     made = []
     search = Registrar._acquire

@@ -89,9 +89,8 @@ def test_the_ratio_form_of_the_dynamics_gives_the_same_motion(motion):
 
 
 def test_the_fixture_is_fixed_to_the_body(motion):
-    """T_ac from the state equals the mass centre carried by the model's own coordinates.
-
-    Velocity is its slope.
+    """T_ac from the state equals the mass centre carried by the model's own coordinates;
+    velocity is its slope.
     """
     for t in (0.0, 7.3, 61.0):
         R_ac, t_ac = motion.poses([t])
@@ -140,9 +139,8 @@ def test_symmetric_and_slender_bodies_keep_their_momentum(moments):
 
 
 def test_disturbances_move_the_velocity_as_their_level_says():
-    """Over n held steps the velocity walks by std step sqrt(n).
-
-    A chi-square over 40 seeds and 3 axes.
+    """Over n held steps the velocity walks by std step sqrt(n): a chi-square over 40 seeds
+    and 3 axes.
     """
     std, step, span = 1e-3, 0.5, 20.0
     params = MotionParams(force_std_mps2=std, disturbance_step_s=step)

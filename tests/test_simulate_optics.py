@@ -251,9 +251,8 @@ def grid_of(found):
 
 
 def test_more_returns_of_a_beam_separate_the_surfaces_on_an_edge():
-    """Half of each beam on the edge meets the near plate, half the far one.
-
-    Both ranges return, without a mixture.
+    """Half of each beam on the edge meets the near plate, half the far one: both ranges
+    return, without a mixture.
     """
     wide = replace(CLEAN, divergence_mrad=40.0, merge_m=0.1)
     plates = (plate(0.0, x=(-1.0, 0.0)), plate(1.0, x=(-3.0, 3.0), y=(-3.0, 3.0)))
@@ -291,9 +290,8 @@ def test_range_walk_is_proportional_to_the_logarithm_of_the_intensity():
 
 
 def test_stray_light_pulls_all_ranges_to_that_of_the_strongest_return():
-    """A retro-reflector at 2 m and a plate at 4 m.
-
-    Phasors of a long modulation wave give the weighted mean.
+    """A retro-reflector at 2 m and a plate at 4 m: phasors of a long modulation wave give the
+    weighted mean.
     """
     ranges, intensities, ratio = np.array([4.0, 4.2, 2.0]), np.array([0.5, 0.1, 100.0]), 1e-3
     found = crosstalk(ranges, intensities, ratio)
@@ -308,9 +306,8 @@ def test_stray_light_pulls_all_ranges_to_that_of_the_strongest_return():
 
 
 def test_a_saturated_return_blooms_over_the_rays_around_it():
-    """A retro-reflector seen by the central ray only fills a disc of bloom_deg.
-
-    Outside nothing changes.
+    """A retro-reflector seen by the central ray only fills a disc of bloom_deg; outside
+    nothing changes.
     """
     reflector = [
         Material("reflector", box_m=(-0.05, -0.05, -0.2, 0.05, 0.05, -0.1), retroreflectance=50.0)

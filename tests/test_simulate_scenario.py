@@ -236,9 +236,8 @@ def test_the_first_belief_is_drawn_from_its_own_covariance():
 
 
 def _error(truth, mean):
-    """The 20 errors as the state convention has them.
-
-    Q = dq (x) q_hat, mu = mu_hat (x) dmu, all else a difference.
+    """The 20 errors as the state convention has them: q = dq (x) q_hat, mu = mu_hat (x) dmu,
+    all else a difference.
     """
     dq = geometry.normalise(geometry.multiply(geometry.conjugate(mean.q_ab), truth.q_ab))
     dmu = geometry.normalise(geometry.multiply(truth.q_bc, geometry.conjugate(mean.q_bc)))

@@ -249,9 +249,8 @@ def angle_from(points, centre):
 
 
 def test_false_returns_come_from_the_beams_that_look_at_the_earth():
-    """Their share of those beams, and their ranges, are as stated.
-
-    Beams on the target or to the sky have none.
+    """Their share of those beams, and their ranges, are as stated; beams on the target or to
+    the sky have none.
     """
     _, _, alone = scans_of("max_incidence_deg = 90.0\n")
     simulation, _, scenes = scans_of("max_incidence_deg = 90.0\n" + LIMB)

@@ -59,9 +59,8 @@ def test_the_attachment_reads_back_as_the_surface(shape):
 
 
 def test_touching_parts_of_the_satellite_do_not_overlap():
-    """Otherwise its volume, and its inertia, would count material twice.
-
-    Sampled points lie in one part at most.
+    """Otherwise its volume, and its inertia, would count material twice: sampled points lie
+    in one part at most.
     """
     surface = builtin_surface()
     parts = trimesh.Trimesh(surface.vertices, surface.faces, process=False).split()

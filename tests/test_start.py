@@ -1,6 +1,5 @@
-"""The start of a run and its reference.
-
-Global search, cold start, deskewing, a fitted reference.
+"""The start of a run and its reference: global search, cold start, deskewing, a fitted
+reference.
 """
 
 import json
@@ -62,9 +61,8 @@ def test_points_with_times_are_carried_to_one_instant(cli, fixtures_folder):
     [(2.0, 0.3, "raster"), (1.0, 0.9, "raster"), (5.0, 0.15, "lissajous")],
 )
 def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path, hz, scan_s, pattern):
-    """The points are moved to the stamp by a motion that is hardly known.
-
-    The pose has this error too.
+    """The points are moved to the stamp by a motion that is hardly known; the pose has this
+    error too.
     """
     scenario, log = tmp_path / "raster.toml", tmp_path / "raster.mcap"
     text = (

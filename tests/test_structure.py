@@ -1,6 +1,5 @@
-"""Structure of the code.
-
-One direction of imports, types, lint, line limit, import time, vocabulary.
+"""Structure of the code: one direction of imports, types, lint, line limit, import time,
+vocabulary.
 """
 
 import ast

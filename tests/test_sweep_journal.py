@@ -1,6 +1,5 @@
-"""The journal of a campaign: damaged lines are set aside and their runs repeated.
-
-Everything else is kept.
+"""The journal of a campaign: damaged lines are set aside and their runs repeated; everything
+else is kept.
 """
 
 import math
@@ -90,9 +89,8 @@ def test_a_folder_of_other_results_is_left_alone(tmp_path, name):
 
 
 def test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches(tmp_path):
-    """Each fifth byte and each line end of a journal of 4 runs.
-
-    A changed line end joins two lines.
+    """Each fifth byte and each line end of a journal of 4 runs; a changed line end joins two
+    lines.
     """
     path = filled(tmp_path, count=4, scans=0)
     whole = path.read_bytes()

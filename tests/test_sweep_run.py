@@ -1,6 +1,5 @@
-"""Whole campaigns.
-
-The same bytes with any number of workers, continuation after a kill, workers that die.
+"""Whole campaigns: the same bytes with any number of workers, continuation after a kill,
+workers that die.
 """
 
 import json
@@ -227,9 +226,8 @@ def test_ctrl_c_ends_workers_without_the_messages_of_dask(campaign, tmp_path):
 
 @pytest.mark.slow
 def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, reference, tmp_path):
-    """A cluster of our own, reached by its address as a remote one would be.
-
-    Its first worker is killed mid-run.
+    """A cluster of our own, reached by its address as a remote one would be; its first worker
+    is killed mid-run.
     """
     from distributed import Client, LocalCluster
 

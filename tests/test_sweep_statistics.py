@@ -1,6 +1,5 @@
-"""Statistics over runs, against exact distributions and independent formulas.
-
-Faults by kind, against sums by hand.
+"""Statistics over runs, against exact distributions and independent formulas; faults by kind,
+against sums by hand.
 """
 
 from __future__ import annotations
@@ -37,9 +36,8 @@ from avsreplay.sweep.statistics import (
 
 
 def test_wilson_intervals_cover_as_they_promise():
-    """Exact coverage over all outcomes of 50 runs at several true shares.
-
-    Near 95 % on average, never far below.
+    """Exact coverage over all outcomes of 50 runs at several true shares: near 95 % on
+    average, never far below.
     """
     covered = []
     for p in (0.02, 0.1, 0.5, 0.9, 0.98):

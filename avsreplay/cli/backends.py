@@ -1,6 +1,5 @@
-"""``avsreplay backends`` and ``avsreplay bench``.
-
-The registration back ends, their laws, speed and error on a log.
+"""``avsreplay backends`` and ``avsreplay bench``: the registration back ends, their laws,
+speed and error on a log.
 """
 
 from __future__ import annotations
@@ -133,9 +132,8 @@ HEADS = (
 
 @dataclass(slots=True)
 class Tally:
-    """Results of one back end, scan by scan. Times are wall clock.
-
-    Errors are relative to the log's truth.
+    """Results of one back end, scan by scan. Times are wall clock; errors are relative to the
+    log's truth.
     """
 
     name: str
@@ -272,9 +270,8 @@ def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]
 
 
 def _one(tally: Tally, registrar: Registrar, scan: TrueScan, guess: Pose | None) -> Pose | None:
-    """Register one scan, count it, and give the next guess.
-
-    The first scan is acquired and not counted.
+    """Register one scan, count it, and give the next guess; the first scan is acquired and
+    not counted.
     """
     from avsreplay.records import AlignStatus
 
@@ -312,9 +309,8 @@ def _registrar(name: str, surface: Surface) -> Registrar:
 
 
 def _peak_mib(name: str, surface: Surface, scans: list[TrueScan]) -> float | None:
-    """Peak memory of a fresh process that builds the back end and registers three scans.
-
-    None if it is unknown.
+    """Peak memory of a fresh process that builds the back end and registers three scans; None
+    if it is unknown.
     """
     if sys.platform == "win32":
         return None

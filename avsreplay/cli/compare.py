@@ -221,9 +221,8 @@ def _outcomes(
     base: _Group,
     pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]],
 ) -> list[gates.RuleOutcome]:
-    """The rules on every run against its own baseline.
-
-    On the runs themselves where there is only one group.
+    """The rules on every run against its own baseline; on the runs themselves where there is
+    only one group.
     """
     if not rules:
         return []

@@ -73,9 +73,8 @@ class _Choice(click.ParamType[str]):
 
 
 class SettingOption(click.Option):
-    """An option for one setting. ``owner`` is ``module:class``.
-
-    ``key`` is the parameter's name where not given.
+    """An option for one setting. ``owner`` is ``module:class``; ``key`` is the parameter's
+    name where not given.
     """
 
     def __init__(self, names: list[str], owner: str = CONFIG, key: str = "", **more: Any) -> None:
@@ -148,9 +147,8 @@ def robot_option(**more: Any) -> Callable[[F], F]:
 
 
 def run_settings(command: F) -> F:
-    """Add the settings of a run to a command.
-
-    One option each for the frequent ones, ``--config`` and ``--set``.
+    """Add the settings of a run to a command: one option each for the frequent ones,
+    ``--config`` and ``--set``.
     """
     options = [
         setting_option(

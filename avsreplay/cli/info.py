@@ -1,6 +1,5 @@
-"""``avsreplay info`` and ``avsreplay doctor``.
-
-The content of a log, its damage, and a repaired copy.
+"""``avsreplay info`` and ``avsreplay doctor``: the content of a log, its damage, and a
+repaired copy.
 """
 
 from __future__ import annotations

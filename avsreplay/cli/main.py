@@ -138,9 +138,8 @@ PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", 
 
 
 def versions() -> dict[str, str]:
-    """Versions of the package, Python and its dependencies.
-
-    "missing" where one is not installed.
+    """Versions of the package, Python and its dependencies; "missing" where one is not
+    installed.
     """
     import platform
     from importlib import metadata
@@ -235,9 +234,8 @@ class _Discarding(io.FileIO):
     failure: OSError | None = None
 
     def write(self, data: Any) -> int | None:  # type: ignore[override]
-        """Write the data, or discard them after a failed write.
-
-        In both cases their number of bytes is returned.
+        """Write the data, or discard them after a failed write; in both cases their number of
+        bytes is returned.
         """
         if self.failure is None:
             try:
@@ -248,9 +246,8 @@ class _Discarding(io.FileIO):
 
 
 def entry_point() -> None:
-    """Run a command of the arguments of this process and exit with its code.
-
-    Every error is one line on stderr.
+    """Run a command of the arguments of this process and exit with its code; every error is
+    one line on stderr.
     """
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
@@ -285,9 +282,8 @@ def entry_point() -> None:
 
 
 def _end_as_interrupt() -> list[int]:
-    """Let SIGTERM and SIGHUP, unless they are ignored, act as Ctrl-C.
-
-    The returned list receives their numbers.
+    """Let SIGTERM and SIGHUP, unless they are ignored, act as Ctrl-C; the returned list
+    receives their numbers.
     """
     received: list[int] = []
 
@@ -344,9 +340,8 @@ def _standard_output() -> _Discarding | None:
 
 
 def _crash(error: Exception) -> int:
-    """Report an unexpected error in one line and write its traceback to a file.
-
-    Return exit code 70.
+    """Report an unexpected error in one line and write its traceback to a file; return exit
+    code 70.
     """
     import hashlib
     import tempfile

@@ -1,6 +1,5 @@
-"""``avsreplay model`` and ``avsreplay odometry``.
-
-An unknown target, with and without a model built from its scans.
+"""``avsreplay model`` and ``avsreplay odometry``: an unknown target, with and without a model
+built from its scans.
 """
 
 from __future__ import annotations
@@ -138,9 +137,8 @@ def model_command(
 
 
 def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
-    """Return the JSON document.
-
-    Figures of the reconstruction and of its deviations from a CAD model.
+    """Return the JSON document: figures of the reconstruction and of its deviations from a
+    CAD model.
     """
     out: dict[str, Any] = {
         "scans_used": made.used,

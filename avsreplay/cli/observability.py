@@ -1,6 +1,5 @@
-"""``avsreplay observability``.
-
-The observability Gramian of a log for three sets of estimated parameters.
+"""``avsreplay observability``: the observability Gramian of a log for three sets of estimated
+parameters.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Shared parts of the commands.
-
-Options, sources, results, progress on stderr, and interruption between scans.
+"""Shared parts of the commands: options, sources, results, progress on stderr, and
+interruption between scans.
 """
 
 from __future__ import annotations
@@ -170,9 +169,8 @@ def report_losses(source: Source, damaged: int | None = None) -> None:
 
 
 def read_result(path: Path) -> Result:
-    """Read and verify a saved result.
-
-    Warn on stderr if it could not be verified or its log was damaged.
+    """Read and verify a saved result; warn on stderr if it could not be verified or its log
+    was damaged.
     """
     from avsreplay.report.result import load_result
 
@@ -279,9 +277,8 @@ PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield the items and show the progress on stderr.
-
-    ``total`` 0 means that their number is unknown.
+    """Yield the items and show the progress on stderr; ``total`` 0 means that their number is
+    unknown.
     """
     if not sys.stderr.isatty():
         yield from _with_lines(items, total, what)

@@ -1,6 +1,5 @@
-"""``avsreplay record`` writes a log.
-
-``export`` and ``report`` write a saved result in other formats and as a page.
+"""``avsreplay record`` writes a log; ``export`` and ``report`` write a saved result in other
+formats and as a page.
 """
 
 from __future__ import annotations

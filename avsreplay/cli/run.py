@@ -1,6 +1,5 @@
-"""``avsreplay run``.
-
-Replays a log, prints tables, writes a result directory, compares with a golden file.
+"""``avsreplay run``: replays a log, prints tables, writes a result directory, compares with a
+golden file.
 """
 
 from __future__ import annotations
@@ -220,9 +219,8 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
 
 
 def _checked(run: Run) -> list[Advice]:
-    """Check the log before the replay.
-
-    Findings are printed on stderr, and are reasons of the verdict.
+    """Check the log before the replay: findings are printed on stderr, and are reasons of the
+    verdict.
     """
     from avsreplay.preflight import preflight
 
@@ -315,9 +313,8 @@ def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows unless size or background explain them.
-
-    Also said on stderr.
+    """Return the findings on the model from the rows unless size or background explain them;
+    also said on stderr.
     """
     if any(
         a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail")

@@ -1,6 +1,5 @@
-"""State estimation.
-
-The noise-adaptive constrained Kalman filter and the maximum-likelihood batch fit.
+"""State estimation: the noise-adaptive constrained Kalman filter and the maximum-likelihood
+batch fit.
 """
 
 try:

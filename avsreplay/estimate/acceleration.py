@@ -142,9 +142,8 @@ def fit_acceleration(
 def _consistent(
     times: Array, poses: Sequence[Pose], covariances: Sequence[Array], arm_1s_m: float
 ) -> int:
-    """How many poses from the first on agree with one acceleration.
-
-    Sequential least squares with a gate.
+    """How many poses from the first on agree with one acceleration: sequential least squares
+    with a gate.
     """
     first = _System(times[:_FEWEST], poses[:_FEWEST], covariances[:_FEWEST], arm_1s_m)
     mean, P, noise = first.solved()

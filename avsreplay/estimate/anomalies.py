@@ -194,9 +194,8 @@ class AnomalyTest:
         return track.changed(bias=bias), Verdict(0, Reason.SENSOR_BIAS)
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
-        """Too few scans were accepted for the hypotheses to be compared.
-
-        The doubtful ones may agree by themselves.
+        """Too few scans were accepted for the hypotheses to be compared: the doubtful ones
+        may agree by themselves.
         """
         if len(track.doubtful) < _FEWEST:
             return track, Verdict(0, Reason.DOUBTFUL)
@@ -282,9 +281,8 @@ class AnomalyTest:
         )
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
-        """The track initialised anew from the doubtful poses if they agree with one another.
-
-        Else they are bad.
+        """The track initialised anew from the doubtful poses if they agree with one another;
+        else they are bad.
         """
         old = track.previous
         if old is not None and self._previous_agrees(track):
@@ -348,9 +346,8 @@ class AnomalyTest:
         return out.changed(recent=latest((*track.recent, *used)))
 
     def _reported(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
-        """The track with the manoeuvre in its list.
-
-        A later report of the same one replaces the first.
+        """The track with the manoeuvre in its list; a later report of the same one replaces
+        the first.
         """
         at_ns = window[0].track.belief.t_ns + round(best.after_s * 1e9)
         now_ns = (

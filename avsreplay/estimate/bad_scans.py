@@ -109,9 +109,8 @@ def frozen_sensor(window: Window, first: int) -> Explanation:
 
 
 def _given_accepted(window: Window, white: Array, first: int) -> tuple[float, Array, Array]:
-    """Log density of the accepted innovations.
-
-    The doubtful ones less their mean given these, and their covariance.
+    """Log density of the accepted innovations; the doubtful ones less their mean given these,
+    and their covariance.
     """
     a = 6 * window.points.before(first)
     value = -0.5 * float(white[:a] @ white[:a]) + float(

@@ -113,9 +113,8 @@ class Poses:
         return len(self.times_s)
 
     def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
-        """(n, 6) d = [theta.
-
-        V] in {C} of these poses at a chart, by default where ``problem`` is linearised.
+        """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where
+        ``problem`` is linearised.
         """
         if problem.poses is self and chart is None:
             return problem.core.d
@@ -216,9 +215,8 @@ class BatchFit:
 
     @property
     def effective(self) -> Array:
-        """(2,) noise factors of the covariance.
-
-        Those of white noise that carries the same information.
+        """(2,) noise factors of the covariance: those of white noise that carries the same
+        information.
         """
         return np.asarray(self.factors * np.sqrt(self.inflation))
 
@@ -232,9 +230,8 @@ class BatchFit:
 
 @value_class
 class Pin:
-    """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``.
-
-    It fixes one direction.
+    """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``: it fixes
+    one direction.
     """
 
     centre: Chart

@@ -73,9 +73,8 @@ class ProfilePoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NonGaussianDirection:
-    """A non-Gaussian direction.
-
-    ``row`` (20,) of the coordinate along it, and the profile fits on either side.
+    """A non-Gaussian direction: ``row`` (20,) of the coordinate along it, and the profile
+    fits on either side.
     """
 
     row: Array
@@ -137,9 +136,8 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Part
 
 
 def _affordable_steps(problem: Problem, fitted: BatchFit) -> int:
-    """Steps of the fits with one direction fixed.
-
-    A step passes all poses, and the rotation between them in pieces.
+    """Steps of the fits with one direction fixed; a step passes all poses, and the rotation
+    between them in pieces.
     """
     turned = float(np.linalg.norm(fitted.chart.w_c)) * float(np.ptp(problem.poses.times_s))
     return max(_FEWEST_STEPS, int(_PIN_WORK / (len(problem.poses) + turned / SUBSTEP_RAD)))
@@ -348,9 +346,8 @@ def final_mixture(
 
 
 def _without(found: BatchCovariance, pin: Pin) -> BatchCovariance:
-    """The covariance without the direction that ``pin`` fixes.
-
-    The variance along it stays that of the Gaussian.
+    """The covariance without the direction that ``pin`` fixes: the variance along it stays
+    that of the Gaussian.
     """
     kept = tuple(d for d in found.directions if all(point.pin is not pin for point in d.points))
     return replace(found, directions=kept, others=True)
@@ -374,9 +371,8 @@ def _moved_on(
 
 
 def _fixed(P: Array, rows: list[Array]) -> Array:
-    """P given the coordinates along ``rows``.
-
-    Their variance is that between the components of the mixture.
+    """P given the coordinates along ``rows``: their variance is that between the components
+    of the mixture.
     """
     for row in rows:
         column = P @ row

@@ -139,9 +139,8 @@ class BatchSchedule:
         return track.changed(belief=belief, batch=replace(last, components=mixture))
 
     def fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
-        """The fit to all poses of a track, in parts. ``forgot``.
-
-        The last fit began with an earlier pose.
+        """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an
+        earlier pose.
         """
         start = self.chart_at(belief, track.fixes[0].t_ns) if forgot else None
         levels, given = self._levels(track), self._given(track)
@@ -170,16 +169,14 @@ class BatchSchedule:
         )
 
     def _growth(self, last: BatchResult) -> float:
-        """The share by which the poses grow until the next fit.
-
-        A Gaussian likelihood is propagated well in between.
+        """The share by which the poses grow until the next fit; a Gaussian likelihood is
+        propagated well in between.
         """
         return CHECK_GROWTH if last.gaussian else self.params.refit_growth
 
     def _due(self, track: Track, last: BatchResult) -> bool:
-        """Return whether the last fit no longer represents the likelihood.
-
-        By the poses since then, or by its drift.
+        """Return whether the last fit no longer represents the likelihood: by the poses since
+        then, or by its drift.
         """
         enough = track.since >= max(1.0, self._growth(last) * last.count)
         return enough or worn(last.components) or _bent(last, track.belief)
@@ -294,9 +291,8 @@ class BatchSchedule:
         return chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
 
     def _given(self, track: Track) -> Prior | None:
-        """The track's prior, propagated to the first pose.
-
-        None where disturbances or time have made it useless.
+        """The track's prior, propagated to the first pose; None where disturbances or time
+        have made it useless.
         """
         t_ns = track.fixes[0].t_ns
         if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns(track):
@@ -316,9 +312,8 @@ class BatchSchedule:
     def _with(
         self, track: Track, prediction: Prediction, innovation: Innovation
     ) -> tuple[tuple[PoseFix, ...], tuple[PoseFix, ...]]:
-        """Poses within the fit's memory, with this one, and older ones.
-
-        Of many the first half is joined in pairs.
+        """Poses within the fit's memory, with this one, and older ones; of many the first
+        half is joined in pairs.
         """
         oldest = bisect_left(
             track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant
@@ -340,9 +335,8 @@ class BatchSchedule:
         return (*fixes, self.fix(prediction, innovation)), older
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
-        """The healthy pose at its own instant.
-
-        A scan deskewed by the prior's motion is moved back by it.
+        """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved
+        back by it.
         """
         x, lag_ns = prediction.belief.x, round(prediction.lag_s * 1e9)
         pose = measured_pose(x, innovation.alpha)

@@ -54,9 +54,8 @@ _LEAST_GAP, _MOST_MOVED = (
 
 @value_class
 class AxisPermutation:
-    """One of the 24.
-
-    R_bn (3, 3), its quaternion, new axis i is old axis perm[i] up to sign, parity of perm.
+    """One of the 24: R_bn (3, 3), its quaternion, new axis i is old axis perm[i] up to sign,
+    parity of perm.
     """
 
     R_bn: Array

@@ -104,8 +104,7 @@ class ModelErrors:
 
     @property
     def size_error(self) -> float:
-        """The error of size that noise does not explain: the root of what its square exceeds.
-
+        """The error of size that noise does not explain: the root of what its square exceeds;
         0 for too few scans.
         """
         weight, first, second, squares, n = self.sizes
@@ -127,8 +126,7 @@ class ModelErrors:
 
     @property
     def motions(self) -> Array:
-        """Motions d (6, k) of {C}, each with a 1 sigma, that all poses may have in common.
-
+        """Motions d (6, k) of {C}, each with a 1 sigma, that all poses may have in common;
         (6, 0) for none.
         """
         if not (counted := self.counted):
@@ -141,9 +139,8 @@ NO_MODEL_ERRORS = ModelErrors()
 
 
 def systematic_share(alignment: Alignment) -> float:
-    """Return the share of systematic errors in the covariance of a pose, from 0 to 1.
-
-    0 where there is none.
+    """Return the share of systematic errors in the covariance of a pose, from 0 to 1; 0 where
+    there is none.
     """
     if alignment.covariance is None or alignment.systematic is None:
         return 0.0

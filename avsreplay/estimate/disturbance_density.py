@@ -35,9 +35,8 @@ _FEW_ROWS = 36  # rows up to which a triangular matrix is inverted
 
 @value_class
 class Residuals:
-    """Whitened residuals e (n,) and their Jacobian J (n, m).
-
-    Information (m, m) and offset (m,) of the prior.
+    """Whitened residuals e (n,) and their Jacobian J (n, m); information (m, m) and offset
+    (m,) of the prior.
     """
 
     e: Array
@@ -48,9 +47,8 @@ class Residuals:
 
 @value_class
 class Present:
-    """The present rate or velocity.
-
-    Its derivatives by the m initial values (3, m) and by the k impulses (3, k).
+    """The present rate or velocity: its derivatives by the m initial values (3, m) and by the
+    k impulses (3, k).
     """
 
     by_initial: Array
@@ -93,9 +91,8 @@ class Marginal:
 
     @property
     def excluded(self) -> float:
-        """The least root density that is excluded together with all larger ones.
-
-        Inf where none is.
+        """The least root density that is excluded together with all larger ones; inf where
+        none is.
         """
         possible = np.flatnonzero(self.log_odds > _EXCLUDED)
         first = int(possible[-1]) + 1 if possible.size else 0
@@ -131,9 +128,8 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
 
 
 def _divided(L: Array, B: Array) -> Array:
-    """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves.
-
-    Numpy has the general solution only.
+    """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves: numpy has the general
+    solution only.
     """
     if len(L) <= _FEW_ROWS:
         return np.asarray(_motion.lower_inverse(np.ascontiguousarray(L)) @ B)

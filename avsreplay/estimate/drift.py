@@ -342,9 +342,8 @@ def _products(frame: DrivenFit, columns: Array) -> tuple[Array, ...]:
 
 
 def _step_odds(frame: DrivenFit, params: EstimatorParams, noise: float) -> float:
-    """Log odds over free motion of the most likely single change of the velocities.
-
-    It may explain the poses better.
+    """Log odds over free motion of the most likely single change of the velocities: it may
+    explain the poses better.
     """
     times, widths = frame.points.times_s, _SMALL * np.repeat(params.change_1s, 3)
     instants = 0.5 * (times[1:] + times[:-1])

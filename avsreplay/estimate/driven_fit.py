@@ -234,9 +234,8 @@ def levels_of(
 def drift_unknowns(
     fitted: DrivenFit, points: Poses, problem: Problem, widths: Array, kinds: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """The acceleration as unknowns of ``disturbed_likelihood``.
-
-    Columns at the prior 1 sigma ``widths``, and size.
+    """The acceleration as unknowns of ``disturbed_likelihood``: columns at the prior 1 sigma
+    ``widths``, and size.
     """
     G = problem.core.rows()[1][:, :, :REACHED]
     columns = drift_columns(G, points.times_s, fitted.chart, fitted.onset_s) * widths

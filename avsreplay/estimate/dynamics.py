@@ -115,9 +115,8 @@ def ratios(sigma: Array) -> Triple:
 
 
 def torque_density(sigma: Array, torque: float) -> Triple:
-    """Variance that the disturbance torque adds to the rate per second [rad2/s3].
-
-    The diagonal of torque^2 B B'.
+    """Variance that the disturbance torque adds to the rate per second [rad2/s3]: the
+    diagonal of torque^2 B B'.
     """
     if torque == 0.0:
         return 0.0, 0.0, 0.0
@@ -126,9 +125,8 @@ def torque_density(sigma: Array, torque: float) -> Triple:
 
 
 def transition(step: Flow, sigma: Array, h: float, arc: OrbitArc | None = None) -> Array:
-    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``.
-
-    ``arc``: the orbit.
+    """State transition matrix Phi (20, 20) of a step of h seconds from a state with
+    ``sigma``; ``arc``: the orbit.
     """
     Phi = _I20.copy()
     Phi[:6, :6] = step.S[:, :6]
@@ -155,9 +153,8 @@ def process_noise(Q: Array, times_s: Array, force: float) -> Array:
 
 
 def translation(h: float, arc: OrbitArc | None = None) -> Array:
-    """(6, 6) position and velocity of the centre of mass h seconds later, by those now.
-
-    Free, or on an orbit.
+    """(6, 6) position and velocity of the centre of mass h seconds later, by those now: free,
+    or on an orbit.
     """
     if arc is not None:
         return np.ascontiguousarray(arc.transitions(np.array([h]))[0])
@@ -167,9 +164,8 @@ def translation(h: float, arc: OrbitArc | None = None) -> Array:
 
 
 def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[Array, Array]:
-    """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``.
-
-    Free, or on an orbit.
+    """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``: free,
+    or on an orbit.
     """
     if arc is None:
         return x.r_a + times_s[:, None] * x.v_a, np.broadcast_to(x.v_a, (len(times_s), 3))
@@ -178,9 +174,8 @@ def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[A
 
 
 def advance(x: State, step: Flow, h: float, arc: OrbitArc | None = None) -> State:
-    """The state after a step of h seconds; ``arc``.
-
-    The orbit from the instant of ``x`` on, None for free motion.
+    """The state after a step of h seconds; ``arc``: the orbit from the instant of ``x`` on,
+    None for free motion.
     """
     q_ab = hamilton(x.q_ab.tolist(), step.q.tolist())
     centre, velocity = translated(x, np.array([h]), arc)
@@ -301,9 +296,8 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None, drive: Triple = NO_D
 
 
 def fixture_attitude(x: State, drive: Triple = NO_DRIVE) -> Callable[[Array], Array]:
-    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture.
-
-    ``drive`` as in ``grasp_trajectory``.
+    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture; ``drive`` as in
+    ``grasp_trajectory``.
     """
     path = rotation_path(x, drive)
     return lambda times: geometry.multiply(path.at(np.asarray(times, dtype=np.float64))[0], x.q_bc)
@@ -356,9 +350,8 @@ def ascending(times_s: Array) -> Array:
 
 
 def forecast_of(times_s: Array, variances: Array) -> Forecast:
-    """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle.
-
-    Rounding below 0 is 0.
+    """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle;
+    rounding below 0 is 0.
     """
     position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
     return Forecast(times_s, position, velocity, 2.0 * half_angle)

@@ -31,9 +31,8 @@ Quad = tuple[float, float, float, float]
 
 
 def hamilton(a: Array | Quad, b: Array | Quad) -> Quad:
-    """Hamilton's product of two quaternions [x y z w], in scalars.
-
-    Faster than geometry.multiply for a single pair.
+    """Hamilton's product of two quaternions [x y z w], in scalars: faster than
+    geometry.multiply for a single pair.
     """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
@@ -111,9 +110,8 @@ def _unit(q: Quad) -> Array:
 
 
 def semidefinite(P: Array) -> bool:
-    """Whether P (20, 20) is finite and no eigenvalue, in units of its variances, is below -1e-6.
-
-    Variances may be 0.
+    """Whether P (20, 20) is finite and no eigenvalue, in units of its variances, is below
+    -1e-6; variances may be 0.
     """
     return _motion.above(P + _SMALLEST, -1e-6)
 

@@ -343,9 +343,8 @@ class Estimator:
         )
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
-        """A stored scan, predicted and used again from another track.
-
-        The track after it, and the scan as used.
+        """A stored scan, predicted and used again from another track: the track after it, and
+        the scan as used.
         """
         old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
         prediction = replace(prediction, lag_s=old.lag_s, blur=old.blur)

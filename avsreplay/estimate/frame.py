@@ -123,9 +123,8 @@ class EstimatorFrame:
         return self._converted(belief, 1.0)
 
     def belief_out(self, belief: Belief) -> Belief:
-        """Convert a belief from the estimator's coordinates to {C} and {A}.
-
-        The last ones are kept.
+        """Convert a belief from the estimator's coordinates to {C} and {A}; the last ones are
+        kept.
         """
         return _belief_out(self, belief)
 

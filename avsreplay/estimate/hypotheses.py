@@ -412,9 +412,8 @@ def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
 
 
 def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors) -> Explanation:
-    """A constant offset of the pose in {A} from one of the scans on.
-
-    Of its range, its position, or all of it.
+    """A constant offset of the pose in {A} from one of the scans on: of its range, its
+    position, or all of it.
     """
     M, scale = offsets(window, priors)
     columns = window.since_each(M)[1:]

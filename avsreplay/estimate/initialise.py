@@ -118,9 +118,8 @@ def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
 
 
 def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
-    """The belief at the last pose's scan.
-
-    Rate and velocity from all poses, at rest from a single one.
+    """The belief at the last pose's scan: rate and velocity from all poses, at rest from a
+    single one.
     """
     last = fixes[-1]
     x, _ = propagate_state(_at_pose(last.T_ac, *mean_rates(fixes)), -last.lag_ns * 1e-9)
@@ -135,9 +134,8 @@ def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
 
 
 def mean_rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
-    """Mean rate in {C} [rad/s] and velocity in {A} [m/s] over the poses.
-
-    Zero for one pose or no time between them.
+    """Mean rate in {C} [rad/s] and velocity in {A} [m/s] over the poses; zero for one pose or
+    no time between them.
     """
     h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
     if h <= 0.0:
@@ -244,9 +242,8 @@ def rough_state(fixes: tuple[PoseFix, ...]) -> State:
 
 
 def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
-    """Rate in {C} and velocity in {A}.
-
-    Medians over pairs of poses ``apart``, without those almost at one instant.
+    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``, without those
+    almost at one instant.
     """
     least = 1e-3 * (fixes[-1].t_ns - fixes[0].t_ns) / max(1, len(fixes) - 1)
     times, t = np.array([fix.t_ns for fix in fixes]), np.array([fix.T_ac.t for fix in fixes])

@@ -87,9 +87,8 @@ def registration_noise(alignment: Alignment, x: State, free: tuple[float, float]
 
 
 def _inverse(info: Array) -> Array:
-    """The inverse.
-
-    If ``info`` is numerically singular, eigenvalues are raised to 1e-15 of the largest.
+    """The inverse; if ``info`` is numerically singular, eigenvalues are raised to 1e-15 of
+    the largest.
     """
     try:
         return np.asarray(np.linalg.inv(info))
@@ -355,9 +354,8 @@ def step_of_sets(x: State, h: float) -> tuple[State, dict[str, tuple[Array, Arra
 
 
 def prior_1s(one_sigma: Array, sigma: Array) -> dict[str, Array]:
-    """Prior standard deviations (n,) of each set from the 20.
-
-    That of sigma3 follows from sigma1 and sigma2.
+    """Prior standard deviations (n,) of each set from the 20; that of sigma3 follows from
+    sigma1 and sigma2.
     """
     third = np.sqrt(np.sum((sigma_join(sigma)[2] * one_sigma[SIGMA]) ** 2))
     return {

@@ -65,9 +65,8 @@ class Component:
 
 
 def moments(components: tuple[Component, ...]) -> Belief:
-    """Mean and second moments about it.
-
-    The mean of the first component, and what the weights have moved it since.
+    """Mean and second moments about it: the mean of the first component, and what the weights
+    have moved it since.
     """
     return _belief(_joined(components))
 
@@ -238,9 +237,8 @@ def not_worse(
 
 
 def _excess(components: tuple[Component, ...], whiten: Array) -> tuple[Array, Array]:
-    """Ascending eigenvalues of S in units of C, and their directions in columns.
-
-    ``whiten`` C whiten' = 1.
+    """Ascending eigenvalues of S in units of C, and their directions in columns; ``whiten`` C
+    whiten' = 1.
     """
     joined = _joined(components)
     R_ac = rotation(joined.chart.q_ac)

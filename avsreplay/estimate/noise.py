@@ -131,9 +131,8 @@ class NoiseWindow:
 def push(
     window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
 ) -> NoiseWindow:
-    """The window with one more epoch.
-
-    Residual (6,) after the update, H P+ H' (6, 6), the base R that was used.
+    """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the
+    base R that was used.
     """
     (a, b), known = _motion.block_squares(base, residual, HPH)
     factors = window.factors[::3].tolist()
@@ -192,9 +191,8 @@ def _summed(
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
-    """The paper's R.
-
-    R0 until the window is full, then Sigma, the mean of r r' over it, plus the latest H P+ H'.
+    """The paper's R: R0 until the window is full, then Sigma, the mean of r r' over it, plus
+    the latest H P+ H'.
     """
     if len(window.epochs) < length:
         return R0

@@ -1,6 +1,5 @@
-"""Normal points.
-
-Few poses that carry the information of many, for fits whose cost does not grow with the log.
+"""Normal points: few poses that carry the information of many, for fits whose cost does not
+grow with the log.
 """
 
 from __future__ import annotations

@@ -293,17 +293,15 @@ class EstimatorParams(Settings):
 
     @property
     def disturbances(self) -> tuple[float | None, float | None]:
-        """Root densities of torque and force noise that are given.
-
-        None for one that is estimated.
+        """Root densities of torque and force noise that are given; None for one that is
+        estimated.
         """
         return self.torque_noise_radps15, self.force_noise_mps15
 
     @property
     def change_1s(self) -> tuple[float, float]:
-        """Prior 1 sigma of a change of the rate [rad/s] and of the velocity [m/s].
-
-        Auto values must be filled in.
+        """Prior 1 sigma of a change of the rate [rad/s] and of the velocity [m/s]; auto
+        values must be filled in.
         """
         return 0.1 * self.start_rate_1s_radps, 0.2 * given(self.start_vel_1s_mps)
 

@@ -1,6 +1,5 @@
-"""A reference for logs without ground truth.
-
-One batch fit over all poses of a log, as a function of time.
+"""A reference for logs without ground truth: one batch fit over all poses of a log, as a
+function of time.
 """
 
 from __future__ import annotations
@@ -119,9 +118,8 @@ class FittedMotion:
         )
 
     def at(self, t_ns: int, orbit: RelativeOrbit | None) -> tuple[FittedMotion, Array]:
-        """The motion at another instant [ns], and the transition (20, 20) to there; ``orbit``.
-
-        Of the target.
+        """The motion at another instant [ns], and the transition (20, 20) to there;
+        ``orbit``: of the target.
         """
         arc = None if orbit is None else orbit.at(self.t_ns)
         x, Phi = propagate_state(self.x, (t_ns - self.t_ns) * 1e-9, arc)

@@ -86,9 +86,8 @@ def with_scan_duration(
 
 
 def _fixture_jacobian(x: State, h: float) -> Array:
-    """(6, 20) error of the pose h seconds later, d = [theta.
-
-    V] in {C} [rad, m], by the error states now.
+    """(6, 20) error of the pose h seconds later, d = [theta; v] in {C} [rad, m], by the error
+    states now.
     """
     then, Phi = propagate_state(x, h)
     return to_fixture(then.T_ac.q, x.q_bc) @ measurement_jacobian(then) @ Phi

@@ -110,9 +110,8 @@ def scan_points(R: Sequence[Array], accepted: int) -> ScanPoints:
 
 
 def latest(scans: tuple[Epoch, ...]) -> tuple[Epoch, ...]:
-    """Return the accepted scans that are kept.
-
-    The last ``FEW``, or all within some seconds where these are more.
+    """Return the accepted scans that are kept: the last ``FEW``, or all within some seconds
+    where these are more.
     """
     since_ns = scans[-1].prediction.belief.t_ns - round(1e9 * _LONGEST_S)
     first = max(0, len(scans) - _MOST)

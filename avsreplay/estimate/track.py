@@ -63,9 +63,8 @@ class SensorBias:
 
 @value_class
 class Epoch:
-    """A scan as the estimator received it.
-
-    The track before it (without history), its prediction and innovation.
+    """A scan as the estimator received it: the track before it (without history), its
+    prediction and innovation.
     """
 
     track: Track
@@ -208,9 +207,8 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
 
 
 def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
-    """Return ``Track.undetermined`` after a scan.
-
-    ``track`` before it, ``length_m`` as in ``common_motions``.
+    """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in
+    ``common_motions``.
     """
     return (
         common_motions(track.undetermined, innovation.free, length_m)

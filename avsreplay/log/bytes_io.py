@@ -1,6 +1,5 @@
-"""Bytes of a file.
-
-Reading at an offset, decompression with a size limit, and text made safe to print.
+"""Bytes of a file: reading at an offset, decompression with a size limit, and text made safe
+to print.
 """
 
 from __future__ import annotations

@@ -75,9 +75,8 @@ def _first_offset(offsets: Sequence[int], header_ns: Sequence[int]) -> int:
 
 
 def _monotone(instants: Sequence[int], summary: ClockSummary) -> tuple[list[Placed], ClockSummary]:
-    """Use a clock unchanged.
-
-    A time that is not after the previous one is set one nanosecond after it.
+    """Use a clock unchanged; a time that is not after the previous one is set one nanosecond
+    after it.
     """
     placed, last = list[Placed](), None
     equal = back = 0
@@ -162,9 +161,8 @@ class _Tracker:
         return Placed(t_ns, _NOTES[trouble].format(deviation * 1e-9))
 
     def _log_stepped(self, log_ns: int, header_ns: int) -> bool:
-        """Return whether the log clock stepped.
-
-        The interval of the header is closer to the period.
+        """Return whether the log clock stepped: the interval of the header is closer to the
+        period.
         """
         if self._last is None or self._jumped:
             return False

@@ -44,9 +44,8 @@ class Severity(Enum):
 
 @value_class(eq=True)
 class Finding:
-    """One finding.
-
-    Severity, subject, text, and the file offsets or scan numbers that it refers to.
+    """One finding: severity, subject, text, and the file offsets or scan numbers that it
+    refers to.
     """
 
     severity: Severity

@@ -228,17 +228,15 @@ def parse_surface(data: bytes, name: str) -> Surface:
 
 
 def scaled(surface: Surface, scale: float) -> Surface:
-    """Return the model with its coordinates multiplied by ``scale``.
-
-    Its bytes and SHA-256 are those of the result.
+    """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256
+    are those of the result.
     """
     return surface if scale == 1.0 else with_vertices(surface, scale * surface.vertices)
 
 
 def with_vertices(surface: Surface, vertices: Array) -> Surface:
-    """Return the model with other coordinates (n, 3) [m].
-
-    Its bytes and SHA-256 are those of the result.
+    """Return the model with other coordinates (n, 3) [m]; its bytes and SHA-256 are those of
+    the result.
     """
     bare = replace(surface, vertices=frozen(vertices, -1, 3), sha256="", data=b"")
     data = surface_bytes(bare)
@@ -268,9 +266,8 @@ def in_metres(surface: Surface, factor: float, mirror: bool = False) -> Surface:
 
 
 def surface_bytes(surface: Surface) -> bytes:
-    """Return the bytes of the model's file.
-
-    If it was not read from one, a binary PLY with float64 vertices.
+    """Return the bytes of the model's file; if it was not read from one, a binary PLY with
+    float64 vertices.
     """
     if surface.data:
         return surface.data

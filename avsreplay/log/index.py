@@ -1,6 +1,5 @@
-"""The index of a log: its topics, chunks and the places of its messages.
-
-Base class of the log readers; its clouds.
+"""The index of a log: its topics, chunks and the places of its messages; base class of the
+log readers; its clouds.
 """
 
 from __future__ import annotations
@@ -111,9 +110,8 @@ class MessageTable:
     def add(
         self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]
     ) -> None:
-        """Add a message of a declared topic.
-
-        (log, publish) times [ns], payload and (container, offset).
+        """Add a message of a declared topic: (log, publish) times [ns], payload and
+        (container, offset).
         """
         known = self._topics[topic]
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))

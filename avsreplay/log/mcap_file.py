@@ -91,9 +91,8 @@ class McapFile(Recording):
         return dict(self._channels.by_id)
 
     def data_checksum_holds(self) -> bool:
-        """Return whether the checksum over the whole data section is correct.
-
-        True if the file has none.
+        """Return whether the checksum over the whole data section is correct; True if the
+        file has none.
         """
         end, expected = self.data_end
         crc, at = 0, 0

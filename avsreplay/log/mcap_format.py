@@ -41,9 +41,8 @@ class Channel:
 
 @value_class(eq=True)
 class ChunkHead:
-    """The fields before a chunk's data.
-
-    ``data_at`` is the offset of the data from the record's opcode.
+    """The fields before a chunk's data; ``data_at`` is the offset of the data from the
+    record's opcode.
     """
 
     start_ns: int
@@ -157,9 +156,8 @@ def is_mcap(path: Path) -> bool:
 
 
 class RecordSink(Protocol):
-    """Receives every intact record of a file, in file order.
-
-    Times are (log, publish or creation) [ns].
+    """Receives every intact record of a file, in file order; times are (log, publish or
+    creation) [ns].
     """
 
     def message(

@@ -47,9 +47,8 @@ class ChannelTable:
         )
 
     def guess(self, number: int, payload: memoryview, library: str) -> Channel | None:
-        """Add the channel that a message without a definition seems to belong to.
-
-        Return None if it is unknown.
+        """Add the channel that a message without a definition seems to belong to; return None
+        if it is unknown.
         """
         channel = guess_channel(number, payload, library)
         if channel is not None:
@@ -145,9 +144,8 @@ def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
 def next_record(
     file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool
 ) -> int | None:
-    """Return the offset of the next chunk in [at, stop).
-
-    Without chunks, of the next message of a known channel.
+    """Return the offset of the next chunk in [at, stop); without chunks, of the next message
+    of a known channel.
     """
     if chunked:
         return _search(

@@ -1,6 +1,5 @@
-"""Opening of a source.
-
-Detects the format, selects the topic of clouds or poses, attaches ground truth and model.
+"""Opening of a source: detects the format, selects the topic of clouds or poses, attaches
+ground truth and model.
 """
 
 from __future__ import annotations
@@ -95,9 +94,8 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
 def _messages(
     path: Path, options: SourceOptions, inspect: bool, upto: int | None, stated: str = ""
 ) -> Source:
-    """Open a log of messages; ``stated``.
-
-    The fixed frame of its header, used where the options name none.
+    """Open a log of messages; ``stated``: the fixed frame of its header, used where the
+    options name none.
     """
     if options.rate_hz is not None:
         hint = "leave out --rate; --every-scan N takes every N-th scan"
@@ -214,9 +212,8 @@ def _model(options: SourceOptions, carried: Surface | None = None) -> Surface | 
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
-    """Return the model in the log.
-
-    If it cannot be read it is a loss, and another model can be given.
+    """Return the model in the log; if it cannot be read it is a loss, and another model can
+    be given.
     """
     try:
         found = recording.attachment()
@@ -226,9 +223,8 @@ def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
 
 
 def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
-    """The header of a source of measured poses.
-
-    Without a model an octahedron of the stated extent is the target.
+    """The header of a source of measured poses; without a model an octahedron of the stated
+    extent is the target.
     """
     return (
         replace(header, surface=octahedron(options.extent_m)) if header.surface is None else header

@@ -181,9 +181,8 @@ class _Text:
             return {p.name: table[:, i].astype(p.kind) for i, p in enumerate(element.properties)}
 
     def lists(self, element: _Element) -> _Lists:
-        """Return the first list of each line.
-
-        Lists of equal length, the common case, are converted at once.
+        """Return the first list of each line; lists of equal length, the common case, are
+        converted at once.
         """
         rows = [line.split() for line in self._take(element)]
         if not all(
@@ -231,9 +230,8 @@ class _Binary:
         return {p.name: table[p.name].astype(p.kind) for p in element.properties}
 
     def lists(self, element: _Element) -> _Lists:
-        """Return the first list of each element.
-
-        Lists of equal length, the common case, are read at once.
+        """Return the first list of each element; lists of equal length, the common case, are
+        read at once.
         """
         same = self._uniform(element)
         if same is not None:

@@ -1,6 +1,5 @@
-"""Decoding of sensor_msgs/PointCloud2 with any layout.
-
-Without a copy where the layout allows it.
+"""Decoding of sensor_msgs/PointCloud2 with any layout; without a copy where the layout allows
+it.
 """
 
 from __future__ import annotations
@@ -179,9 +178,8 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
 
 
 def usable(points: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return which of the points (n, 3) are finite and within ``MAX_COORDINATE_M``.
-
-    None if all are.
+    """Return which of the points (n, 3) are finite and within ``MAX_COORDINATE_M``; None if
+    all are.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         if (
@@ -248,9 +246,8 @@ def _check(layout: Layout) -> None:
 
 
 def _points(layout: Layout) -> NDArray[Any]:
-    """Return the points (n, 3), float32 or float64.
-
-    A view if x, y and z are adjacent and in native byte order.
+    """Return the points (n, 3), float32 or float64; a view if x, y and z are adjacent and in
+    native byte order.
     """
     x, y, z = (layout.column(axis) for axis in "xyz")
     size = x.dtype.itemsize
@@ -269,9 +266,8 @@ def _points(layout: Layout) -> NDArray[Any]:
 
 
 def _times(layout: Layout) -> NDArray[np.float32] | None:
-    """Return times [s] after the stamp.
-
-    Floats are seconds, integers nanoseconds, large doubles absolute seconds.
+    """Return times [s] after the stamp: floats are seconds, integers nanoseconds, large
+    doubles absolute seconds.
     """
     names = {f.name for f in layout.fields}
     if {"time_sec", "time_nsec"} <= names:

@@ -73,9 +73,8 @@ def read_times(path: Path) -> list[int]:
 
 
 def seconds_to_ns(text: str) -> int | None:
-    """Convert decimal seconds to nanoseconds without rounding to a binary fraction.
-
-    None if it is not a number.
+    """Convert decimal seconds to nanoseconds without rounding to a binary fraction; None if
+    it is not a number.
     """
     try:
         value = Decimal(text)
@@ -254,9 +253,8 @@ def read_measured(path: Path) -> MeasuredFile:
 
 @value_class(eq=True)
 class _Columns:
-    """Where a CSV with a header has time and pose.
-
-    The exponent of its unit of time, and its unit of length [m].
+    """Where a CSV with a header has time and pose; the exponent of its unit of time, and its
+    unit of length [m].
     """
 
     time: int

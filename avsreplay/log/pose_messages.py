@@ -139,8 +139,7 @@ def pose_of_numbers(values: Sequence[float]) -> MeasuredPose:
 
 
 def _in_fixture(covariance: tuple[float, ...], T_ac: Pose) -> Array | None:
-    """Covariance of d = [theta; v] in {C} from that of (position, rotation vector) in {A}.
-
+    """Covariance of d = [theta; v] in {C} from that of (position, rotation vector) in {A};
     None where it is not one.
     """
     given = np.array(covariance).reshape(6, 6)
@@ -224,9 +223,8 @@ class PoseTrack:
         return self.pose(t_ns)
 
     def body(self, t_ns: int, constants: State) -> State | None:
-        """Return the full state from poses of {B} in {A} and twists in {B}.
-
-        ``constants`` gives sigma, c_b and q_bc.
+        """Return the full state from poses of {B} in {A} and twists in {B}; ``constants``
+        gives sigma, c_b and q_bc.
         """
         row = self._at(t_ns)
         if row is None or not (np.abs(row[7:]) < _MAX_VALUE).all():

@@ -122,9 +122,8 @@ class Source:
 
     @cached_property
     def sha256(self) -> str:
-        """Return the SHA-256 of the file.
-
-        For a folder or split log, of the names and bytes of its files in order.
+        """Return the SHA-256 of the file; for a folder or split log, of the names and bytes
+        of its files in order.
         """
         digest = hashlib.sha256()
         for path in self._files:
@@ -302,9 +301,8 @@ class Source:
 
     @cached_property
     def _selected(self) -> list[int]:
-        """Return the positions of the selected scans.
-
-        The window first, then every n-th, then at most ``n_scans``.
+        """Return the positions of the selected scans: the window first, then every n-th, then
+        at most ``n_scans``.
         """
         if not self._placed:
             return []
@@ -348,9 +346,8 @@ class Source:
         return None if track is None or constants is None else track.body(t_ns, constants)
 
     def _fault(self, log_ns: int) -> str | None:
-        """Return the kind of the fault active at ``log_ns``.
-
-        If there are several, the one that began last.
+        """Return the kind of the fault active at ``log_ns``; if there are several, the one
+        that began last.
         """
         inside = [label for label in self.header.labels if label.start_ns <= log_ns < label.end_ns]
         return max(inside, key=lambda label: label.start_ns).kind if inside else None
@@ -370,9 +367,8 @@ class Source:
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
 
     def _place_of_sensor(self, t_ns: int, frame: str) -> Pose | None:
-        """Return the pose of the sensor in the fixed frame.
-
-        None if the clouds stay in their own frame.
+        """Return the pose of the sensor in the fixed frame; None if the clouds stay in their
+        own frame.
         """
         return None if self._ground_truth.sensor is None else self._sensor(t_ns, frame)
 

@@ -264,9 +264,8 @@ class TruthCollector:
         self._tf = TfBuffer(gap, by_log)
 
     def sinks(self, *, transforms: bool = False) -> dict[str, Sink]:
-        """Return the sink of each topic; ``transforms``.
-
-        Collect those of the log also if no option names a frame.
+        """Return the sink of each topic; ``transforms``: collect those of the log also if no
+        option names a frame.
         """
         out = {
             self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth),
@@ -281,9 +280,8 @@ class TruthCollector:
         return out
 
     def check(self, topics: Sequence[TopicInfo], where: str, stated: str = "") -> None:
-        """Raise UsageError if a requested topic or frame does not exist. ``stated``.
-
-        The frame that the log names.
+        """Raise UsageError if a requested topic or frame does not exist. ``stated``: the
+        frame that the log names.
         """
         for role, name in (
             ("truth", self.options.truth_topic),
@@ -336,9 +334,8 @@ class TruthCollector:
 
 
 def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack | None]:
-    """Return a lookup in a pose file and its track.
-
-    By time if the file has times, else by line without a track.
+    """Return a lookup in a pose file and its track: by time if the file has times, else by
+    line without a track.
     """
     if found.t_ns is None:
         poses = found.poses

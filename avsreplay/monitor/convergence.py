@@ -150,9 +150,8 @@ class ConvergenceParams(Settings):
 
     @property
     def block_limits(self) -> dict[str, float]:
-        """Limit of each block in the covariance's own units (half angles).
-
-        Auto values must be filled in.
+        """Limit of each block in the covariance's own units (half angles); auto values must
+        be filled in.
         """
         half = math.radians(0.5)
         return {

@@ -99,9 +99,8 @@ def weighted_norm(seen: Innovation, length_m: float) -> float:
 
 
 def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: float) -> float:
-    """The limit on |alpha|_W [m].
-
-    ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that is more.
+    """The limit on |alpha|_W [m]: ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that
+    is more.
     """
     variances = np.diagonal(seen.S)
     predicted = math.sqrt(
@@ -147,9 +146,8 @@ class FaultDetector:
         seen: Innovation | None,
         prior: Belief,
     ) -> Reason | None:
-        """Return why the scan has no pose that can be tested, whatever the policy.
-
-        None if it has one.
+        """Return why the scan has no pose that can be tested, whatever the policy; None if it
+        has one.
         """
         if status in (ScanStatus.EMPTY, ScanStatus.DAMAGED) or (
             alignment and alignment.status is AlignStatus.NO_POINTS

@@ -106,9 +106,8 @@ class Arm:
 
     @property
     def reach_m(self) -> float:
-        """Upper bound of the distance from the base to the gripper.
-
-        The sum of the lengths of all links [m].
+        """Upper bound of the distance from the base to the gripper: the sum of the lengths of
+        all links [m].
         """
         return sum_of_links(self._model, self._frame)
 
@@ -279,9 +278,8 @@ class Arm:
         missed: tuple[float, float],
         best: tuple[Plan, JointPath],
     ) -> tuple[Plan, JointPath]:
-        """Return an earlier capture with the same branch of the joints; ``missed``.
-
-        A capture that they miss, share.
+        """Return an earlier capture with the same branch of the joints; ``missed``: a capture
+        that they miss, share.
         """
         missed_s, share = missed
         while best[0].t_go_s - missed_s > CLOSE_S:

@@ -108,9 +108,8 @@ class _Rows:
     sizes: list[Index] = field(default_factory=list)
 
     def put(self, size: int | Index, stage: Index, C: Array, d: Array) -> None:
-        """Add rows of cones of one size, or of the sizes of all.
-
-        Positions in C are those less the start.
+        """Add rows of cones of one size, or of the sizes of all; positions in C are those
+        less the start.
         """
         self.stage.append(stage)
         self.C.append(C)
@@ -118,9 +117,8 @@ class _Rows:
         self.sizes.append(np.full(len(stage) // size, size) if isinstance(size, int) else size)
 
     def solved(self, start: Array, weight: float) -> tuple[float, float, Array, int] | None:
-        """Return h, slack, w (n, 3) and the number of iterations.
-
-        None where no solution was found.
+        """Return h, slack, w (n, 3) and the number of iterations; None where no solution was
+        found.
         """
         stage, sizes = (np.concatenate(x).astype(np.int32) for x in (self.stage, self.sizes))
         C, d = np.concatenate(self.C), np.concatenate(self.d)
@@ -175,9 +173,8 @@ def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:
 
 
 def _thrust(rows: _Rows, p: Subproblem, scale: float) -> None:
-    """Bound on the thrust, |w| <= bound (2 h/h_ref - 1), the tangent of h^2; on the speed.
-
-    At contact.
+    """Bound on the thrust, |w| <= bound (2 h/h_ref - 1), the tangent of h^2; on the speed; at
+    contact.
     """
     n, stage, axis = p.n, np.repeat(np.arange(p.n), 4), np.arange(3)
     C, d = np.zeros((n, 4, 11)), np.zeros((n, 4))

@@ -174,9 +174,8 @@ def _closed_off(scene: Scene, r0: Array, limits: Limits) -> bool:
 
 
 def _free_plan(case: Case, free: Plan) -> Plan | None:
-    """Return the plan without constraints where it satisfies all of them.
-
-    None where it does not.
+    """Return the plan without constraints where it satisfies all of them; None where it does
+    not.
     """
     path, limits = path_of(free, case.r0, case.v0), case.limits
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)

@@ -47,9 +47,8 @@ LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fr
 
 @value_class
 class ReferencePath:
-    """A path to linearise about.
-
-    Thrust time t [s] and positions (2 n, 3) at the middle and end of every interval.
+    """A path to linearise about: thrust time t [s] and positions (2 n, 3) at the middle and
+    end of every interval.
     """
 
     t: float
@@ -78,9 +77,8 @@ def coarse_nodes(case: Case, least_s: float) -> int:
 
 
 def initial_references(case: Case, free: Plan) -> list[ReferencePath]:
-    """Initial paths.
-
-    The free plan, then flights to a point on the fixture's axis and along the axis, ever later.
+    """Initial paths: the free plan, then flights to a point on the fixture's axis and along
+    the axis, ever later.
     """
     s, wait, least = interval_fractions(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
     out = [ReferencePath(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
@@ -151,9 +149,8 @@ def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath
 
 
 def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
-    """Return the case with the interval length of an earlier path.
-
-    The rest of its flight needs fewer intervals.
+    """Return the case with the interval length of an earlier path: the rest of its flight
+    needs fewer intervals.
     """
     if not isinstance(path, StepPath):
         return case
@@ -163,18 +160,16 @@ def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
 
 
 def expected_s(case: Case, path: RobotPath, since_s: float) -> float:
-    """Return the time to go expected from an earlier path.
-
-    What is left of it, all of it for a robot off it.
+    """Return the time to go expected from an earlier path: what is left of it, all of it for
+    a robot off it.
     """
     away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
     return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
 
 
 def largest_change(case: Case, reference: ReferencePath, most: float) -> float:
-    """Return the largest relative change of the end time, at most ``most``.
-
-    The target may turn by TURN_RAD.
+    """Return the largest relative change of the end time, at most ``most``: the target may
+    turn by TURN_RAD.
     """
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
     return float(min(most, TURN_RAD / max(turn, 1e-9)))

@@ -257,9 +257,8 @@ class Guidance:
         return near and float(np.linalg.norm(v - rate[0])) <= share * (p.capture_speed_mps or 0.0)
 
     def _due(self, age_s: float, left_s: float) -> bool:
-        """Return whether to replan.
-
-        At the period, at every scan near the end, not where a plan would come too late.
+        """Return whether to replan: at the period, at every scan near the end, not where a
+        plan would come too late.
         """
         near = left_s <= 2.0 * self.supervisor.params.commit_s
         return (
@@ -389,9 +388,8 @@ class Guidance:
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
 
     def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:
-        """Return the margin of the constraints.
-
-        What the plan in force itself violates at its start is accepted.
+        """Return the margin of the constraints; what the plan in force itself violates at its
+        start is accepted.
         """
         if not self.limits.any:
             return 1.0
@@ -408,9 +406,8 @@ _Planner = Callable[[Scene, Array, Array, PlanParams, int], Plan]
 
 
 def _left_s(plan: Plan | None, segment: Segment | None, t_ns: int) -> float:
-    """Return the time to the end of the segment, else of the plan [s], at least 0.
-
-    NaN without a plan.
+    """Return the time to the end of the segment, else of the plan [s], at least 0; NaN
+    without a plan.
     """
     if plan is None or not plan.found:
         return math.nan

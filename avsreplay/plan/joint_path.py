@@ -50,9 +50,8 @@ class JointPath:
 
     @property
     def slower(self) -> float:
-        """Share of the acceleration with which rates and torques may fit.
-
-        1 where another limit is exceeded.
+        """Share of the acceleration with which rates and torques may fit; 1 where another
+        limit is exceeded.
         """
         inside = self.complete and not self.range_share > 1.0 + 1e-9
         rate, torque = (

@@ -197,9 +197,8 @@ class Margins:
 
     @property
     def between(self) -> Array:
-        """Margins (n - 1, 5) between consecutive points.
-
-        Where the alternatives change, that of the crossing.
+        """Margins (n - 1, 5) between consecutive points: where the alternatives change, that
+        of the crossing.
         """
         difference = self.first - self.second
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -288,9 +287,8 @@ def in_fixture_axes(R: Array, vectors: Array) -> Array:
 
 
 class SampledScene:
-    """Motion of {C} sampled on a grid and interpolated by cubic splines.
-
-    The grid is extended when needed.
+    """Motion of {C} sampled on a grid and interpolated by cubic splines; the grid is extended
+    when needed.
     """
 
     def __init__(self, scene: Scene, horizon_s: float, step_s: float, span_s: float) -> None:
@@ -318,9 +316,8 @@ class SampledScene:
         return in_fixture_axes(R, r - rho)
 
     def sigma(self, times: Array) -> tuple[Array, Array] | None:
-        """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,).
-
-        None where unknown.
+        """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None
+        where unknown.
         """
         if self.scene.sigma is None:
             return None
@@ -380,9 +377,8 @@ class Case:
 
     @property
     def axes(self) -> Array | None:
-        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component.
-
-        None without.
+        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each
+        component; None without.
         """
         bounds = self.limits.accel_axes_mps2
         return (

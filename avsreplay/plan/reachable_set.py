@@ -105,9 +105,8 @@ def _gauss_support(
 def _closed_support(
     p0x: float, p0y: float, p1x: float, p1y: float
 ) -> tuple[float, list[float], list[float]]:
-    """Evaluate the support function in closed form.
-
-    P = u e + d n, u = u0 + l s, e = (P1 - P0)/l, n normal to e.
+    """Evaluate the support function in closed form: P = u e + d n, u = u0 + l s, e = (P1 -
+    P0)/l, n normal to e.
     """
     j0, r0, r1 = _rod(p0x, p0y, p1x, p1y)
     dx, dy = p1x - p0x, p1y - p0y
@@ -286,9 +285,8 @@ def gauge(
 
 
 def _scaled(b0: Array, b1: Array) -> tuple[Vector, Vector, float]:
-    """Return both vectors in units of their common norm, and that norm.
-
-    Lists are faster than arrays of three.
+    """Return both vectors in units of their common norm, and that norm; lists are faster than
+    arrays of three.
     """
     x, y = b0.tolist(), b1.tolist()
     size = math.sqrt(_dot3(x, x) + _dot3(y, y))

@@ -84,9 +84,8 @@ class PlanParams(Settings):
 
 @value_class
 class _Search:
-    """End of the certified steps: no capture before ``t``.
-
-    If ``reached``, a capture at ``t`` to rounding.
+    """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t``
+    to rounding.
     """
 
     t: float
@@ -244,9 +243,8 @@ def _grade(path: CostatePath, goal: Trajectory, t_ns: int, search: _Search) -> P
 def _first_feasible(
     goal: Trajectory, r0: Array, v0: Array, params: PlanParams, near: bool
 ) -> tuple[_Search, SampledGoal]:
-    """Advance the certified bound, time span by time span, until a_max suffices (``near``.
-
-    Nearly suffices).
+    """Advance the certified bound, time span by time span, until a_max suffices (``near``:
+    nearly suffices).
     """
     end, t, found = params.horizon_s - params.latency_s, 0.0, None
     begin, steps = 0.0, 0

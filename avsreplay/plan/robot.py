@@ -17,9 +17,8 @@ from avsreplay.settings import Settings, is_unit, setting
 
 @dataclass(frozen=True, slots=True)
 class Limits(Settings):
-    """Constraints of a plan besides thrust.
-
-    One that is not set is switched off, unless it scales with the target.
+    """Constraints of a plan besides thrust; one that is not set is switched off, unless it
+    scales with the target.
     """
 
     cone_deg: float | None = setting(
@@ -289,9 +288,8 @@ class RobotParams(Settings):
 
     @property
     def axes_mps2(self) -> tuple[float, float, float] | None:
-        """Largest acceleration along each axis of the base [m/s2].
-
-        None where it is equal in all directions.
+        """Largest acceleration along each axis of the base [m/s2]; None where it is equal in
+        all directions.
         """
         if self.accel_axes_mps2 is not None:
             return self.accel_axes_mps2
@@ -338,9 +336,8 @@ class RobotParams(Settings):
 
     @property
     def gripper(self) -> tuple[Array, float] | None:
-        """Attitude (4,) of the gripper at the start and its largest angular acceleration; None.
-
-        Not planned.
+        """Attitude (4,) of the gripper at the start and its largest angular acceleration;
+        None: not planned.
         """
         q = np.array(self.start_attitude_xyzw)
         turn = self.angular_accel_radps2

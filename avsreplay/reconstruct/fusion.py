@@ -393,9 +393,8 @@ def fused(
 
 
 def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wide: float) -> Array:
-    """Number of sights (n,) that have measured something behind each point.
-
-    A point seen OFTEN needs several.
+    """Number of sights (n,) that have measured something behind each point; a point seen
+    OFTEN needs several.
     """
     through, tested = np.zeros(len(p)), np.arange(len(p))
     for part in (sights[::3], sights[1::3], sights[2::3]):

@@ -1,6 +1,5 @@
-"""The reconstructed model.
-
-Its frame, its comparison with a CAD model, and the files that hold it.
+"""The reconstructed model: its frame, its comparison with a CAD model, and the files that
+hold it.
 """
 
 from __future__ import annotations
@@ -86,9 +85,8 @@ class Reconstruction:
 
     @property
     def mass_centre(self) -> tuple[Array, float] | None:
-        """Mass centre (3,) in {C} [m] and its 1 sigma, the root of the trace [m].
-
-        None if the motion is not known.
+        """Mass centre (3,) in {C} [m] and its 1 sigma, the root of the trace [m]; None if the
+        motion is not known.
         """
         if self.motion is None:
             return None
@@ -97,9 +95,8 @@ class Reconstruction:
 
     @property
     def principal_axes(self) -> tuple[Array, float] | None:
-        """Attitude q_cb (4,) of the principal axes in {C} and its 1 sigma [rad].
-
-        None if the motion is not known.
+        """Attitude q_cb (4,) of the principal axes in {C} and its 1 sigma [rad]; None if the
+        motion is not known.
         """
         if self.motion is None:
             return None

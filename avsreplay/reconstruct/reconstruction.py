@@ -211,9 +211,8 @@ def true_frame(made: Reconstruction, truth: Iterable[tuple[int, Pose]]) -> Pose 
 def _tracked(
     scans: Scans, survey: Survey, p: ReconstructionParams
 ) -> tuple[list[ScanView], Tracked]:
-    """The thinned views and their poses.
-
-    Scans with times of their own are deskewed and tracked twice.
+    """The thinned views and their poses; scans with times of their own are deskewed and
+    tracked twice.
     """
     size_m = p.thin * survey.extent
     views = [thinned_view(scan, survey, size_m) for scan in surveyed_scans(scans, survey)]

@@ -36,9 +36,8 @@ FINE_STARTS = 6  # poses of a search that are registered with all points
 
 @value_class
 class Patchwork:
-    """The model so far.
-
-    Points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree over the points.
+    """The model so far: points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree
+    over the points.
     """
 
     points: Array
@@ -119,9 +118,8 @@ def between(a: Array, b: Array) -> Array:
 
 
 def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
-    """The step d = [theta; v] in {C}.
-
-    Directions that the surface does not determine are left out.
+    """The step d = [theta; v] in {C}; directions that the surface does not determine are left
+    out.
     """
     scale = np.array([1.0 / extent] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
@@ -298,9 +296,8 @@ class Pairing:
     def _search(
         self, p: Array, n: Array, first: NDArray[np.int64], poses: Sequence[Pose], gate: float
     ) -> None:
-        """Search the corresponding points of the pairs whose relative poses have changed.
-
-        Of all if the gate has.
+        """Search the corresponding points of the pairs whose relative poses have changed; of
+        all if the gate has.
         """
         if gate != self._gate:
             self._gate, self._at[:] = gate, np.inf

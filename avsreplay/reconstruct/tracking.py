@@ -1,6 +1,5 @@
-"""Tracking of an unknown target: each scan is registered against the model of the scans before it.
-
-Its free motion.
+"""Tracking of an unknown target: each scan is registered against the model of the scans
+before it; its free motion.
 """
 
 from __future__ import annotations
@@ -129,9 +128,8 @@ def free_motion(t_ns: Sequence[int], poses: Sequence[Pose], extent: float) -> Fr
 def twists(
     t_ns: Sequence[int], poses: dict[int, Pose], motion: FreeMotion | None
 ) -> dict[int, Twist]:
-    """Motion of the target at every view that has a pose.
-
-    Of the free motion, else from its neighbours' poses.
+    """Motion of the target at every view that has a pose: of the free motion, else from its
+    neighbours' poses.
     """
     known = sorted(poses)
     found = {}
@@ -212,9 +210,8 @@ class Tracked:
 
 
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
-    """Register every view against the model that the key views before it give.
-
-    Then try the lost ones once more.
+    """Register every view against the model that the key views before it give; then try the
+    lost ones once more.
     """
     origin = views[0].points.mean(axis=0)
     found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], [], 0, [])
@@ -292,9 +289,8 @@ def _accepted(
 
 
 def _explained(view: ScanView, model: Patchwork, T_ac: Pose, extent: float) -> float:
-    """Share of the model's side toward the camera that a scan shows.
-
-    Small for a scan of something else.
+    """Share of the model's side toward the camera that a scan shows; small for a scan of
+    something else.
     """
     every = max(1, len(model.points) // 1500)
     p, n = T_ac.apply(model.points[::every]), model.normals[::every] @ T_ac.R.T
@@ -341,9 +337,8 @@ def _searched(
     p: ReconstructionParams,
     extent: float,
 ) -> Match | None:
-    """The best acceptable match from turned guesses.
-
-    First about the prediction, then over all attitudes.
+    """The best acceptable match from turned guesses: first about the prediction, then over
+    all attitudes.
     """
     turned = [near_attitudes(guess.q)]
     if found.lost % SEARCH_EVERY < 2:
@@ -410,9 +405,8 @@ def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patch
 
 
 def _predicted(views: Sequence[ScanView], found: Tracked, k: int, extent: float) -> Pose:
-    """The pose at view k by the constant twist, in {C}, of the last poses.
-
-    After a gap by free motion if it fits.
+    """The pose at view k by the constant twist, in {C}, of the last poses; after a gap by
+    free motion if it fits.
     """
     known = sorted(found.poses)
     before = [j for j in known if j < k] or known[:1]

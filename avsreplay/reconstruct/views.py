@@ -75,9 +75,8 @@ class Survey:
 
 @value_class
 class Twist:
-    """Motion of the target during a scan.
-
-    Pose at the stamp, rate w_c (3,) [rad/s], velocity v_a (3,) [m/s] of {C}.
+    """Motion of the target during a scan: pose at the stamp, rate w_c (3,) [rad/s], velocity
+    v_a (3,) [m/s] of {C}.
     """
 
     T_ac: Pose
@@ -132,9 +131,8 @@ def full_cloud(scan: Scan, twist: Twist | None) -> Array:
 
 
 def camera_of(scan: Scan, survey: Survey) -> Array:
-    """Return the position (3,) of the camera in {A} [m] at a scan.
-
-    Of the sensor, or as the survey found it.
+    """Return the position (3,) of the camera in {A} [m] at a scan: of the sensor, or as the
+    survey found it.
     """
     return survey.camera if scan.sensor is None else scan.sensor.t
 
@@ -173,9 +171,8 @@ def spacings(tree: Any, points: Array) -> Array:
 
 
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
-    """Points (n, 3) in {A} moved to the stamp.
-
-    P(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity.
+    """Points (n, 3) in {A} moved to the stamp: p(0) = T_ac(0) T_ac(t)^-1 p(t), with constant
+    rate and velocity.
     """
     p_c = (points - twist.T_ac.t) @ twist.T_ac.R
     return np.asarray(
@@ -184,9 +181,8 @@ def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
 
 
 def _connected(points: Array) -> Array:
-    """The points without isolated ones.
-
-    The fourth neighbour is farther away than ISOLATED times the median.
+    """The points without isolated ones: the fourth neighbour is farther away than ISOLATED
+    times the median.
     """
     distance = spacings(point_tree(points), points)
     return np.asarray(points[distance < ISOLATED * np.median(distance)])
@@ -232,9 +228,8 @@ def _camera(clouds: Sequence[Array]) -> Array:
 
 
 def central_points(points: Array, size_m: float) -> Array:
-    """The point nearest to the mean of each voxel.
-
-    A measured point, because a mean lies inside a curved surface.
+    """The point nearest to the mean of each voxel: a measured point, because a mean lies
+    inside a curved surface.
     """
     cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
@@ -244,9 +239,8 @@ def central_points(points: Array, size_m: float) -> Array:
 
 
 def cell_of(points: Array, size_m: float, normals: Array | None = None) -> NDArray[np.intp]:
-    """Number (n,) of the occupied voxel of every point.
-
-    With normals the two sides of a thin wall are distinguished.
+    """Number (n,) of the occupied voxel of every point; with normals the two sides of a thin
+    wall are distinguished.
     """
     place = np.floor(points / size_m).astype(np.int64)
     place -= place.min(axis=0)
@@ -280,9 +274,8 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 
 
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
-    """Unit normals (n, 3) toward the camera.
-
-    Smallest principal direction of the nearest points of the whole scan.
+    """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest
+    points of the whole scan.
     """
     full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
     normals = point_tree(full).planes(full, full, points, points, NEIGHBOURS)[0]

@@ -150,9 +150,8 @@ class HornBackend:
         return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
 
     def align_roughly(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """Return T_ca as :meth:`align`.
-
-        Of a part of the scan, not converged, if that shows that no fit is close.
+        """Return T_ca as :meth:`align`; of a part of the scan, not converged, if that shows
+        that no fit is close.
         """
         return (
             self.align(points, guess)
@@ -211,9 +210,8 @@ class HornBackend:
         rules: Callable[[bool], IcpParams],
         most_work: int = 0,
     ) -> Fit:
-        """Align with one of the rules; ``most_work`` point searches at most, 0.
-
-        Those of an alignment.
+        """Align with one of the rules; ``most_work`` point searches at most, 0: those of an
+        alignment.
         """
         most = most_work or _most(ALIGN_WORK, len(points))
 
@@ -402,9 +400,8 @@ def _availability(name: str, factory: Any) -> Availability:
 
 
 def _elsewhere(factory: Any) -> str:
-    """Attribute ``same_bytes``, or the stated accuracy.
-
-    One that stops by its own rule can end anywhere in it.
+    """Attribute ``same_bytes``, or the stated accuracy: one that stops by its own rule can
+    end anywhere in it.
     """
     if getattr(factory, "same_bytes", False):
         return "same bytes"

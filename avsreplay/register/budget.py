@@ -91,9 +91,8 @@ def near_work(surface: Surface, index: SurfaceIndex) -> float:
 
 
 def grade_work(points: int, noisy: bool = False) -> int:
-    """Return the work of the quality of a pose of a scan of so many points, in point searches.
-
-    Of one with noise.
+    """Return the work of the quality of a pose of a scan of so many points, in point
+    searches; of one with noise.
     """
     simulated = SIMULATED_WORK[0] + SIMULATED_WORK[1] * min(points, MOST_SIMULATED) if noisy else 0
     return GRADE_WORK + points // POINTS_GRADED + simulated
@@ -168,9 +167,8 @@ class Budget:
         return max(1, self.left - grade_work(points, noisy=True) - TEST_WORK)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
-        """Return whether this much work is left besides ``kept`` for a later step.
-
-        Without any, it is exhausted.
+        """Return whether this much work is left besides ``kept`` for a later step; without
+        any, it is exhausted.
         """
         self.exhausted = self.exhausted or searches > self.left
         return not self.exhausted and searches + kept <= self.left

@@ -300,9 +300,8 @@ def check(backend: str, scale: float = 1.0) -> tuple[LawResult, ...]:
 
 
 def boxes(scale: float = 1.0) -> Surface:
-    """Return the target of the laws in {C}.
-
-    Five boxes with outward faces, about 6.5 m overall at scale 1.
+    """Return the target of the laws in {C}: five boxes with outward faces, about 6.5 m
+    overall at scale 1.
     """
     parts = [
         Pose(exp(turn), np.array(centre)).apply(CORNERS * np.array(size))
@@ -319,9 +318,8 @@ def example_pose(scale: float = 1.0) -> Pose:
 
 
 def view(surface: Surface, count: int, camera_c: Array) -> Array:
-    """Return exact points (n, 3) in {C} of the faces that face a camera there.
-
-    Faces do not hide each other.
+    """Return exact points (n, 3) in {C} of the faces that face a camera there; faces do not
+    hide each other.
     """
     points, normals = sample(surface, count)
     sight = camera_c - points
@@ -332,9 +330,8 @@ def view(surface: Surface, count: int, camera_c: Array) -> Array:
 
 
 def plate_scan(scale: float = 1.0) -> Array:
-    """Return (900, 3) points inside the top face of the first box, in {C}.
-
-    A plane and nothing else.
+    """Return (900, 3) points inside the top face of the first box, in {C}: a plane and
+    nothing else.
     """
     u, v = np.meshgrid(np.linspace(-0.6, 0.6, 30), np.linspace(-0.45, 0.45, 30))
     return scale * np.stack([u.ravel(), v.ravel(), np.full(u.size, 1.2)], axis=1)

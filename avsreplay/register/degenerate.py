@@ -203,9 +203,8 @@ def turn_words(step: Pose) -> str:
 
 
 def _sparse_basis(rows: Array) -> Array:
-    """Basis of the same space by elimination with full pivoting.
-
-    One motion per row, as few axes as possible.
+    """Basis of the same space by elimination with full pivoting: one motion per row, as few
+    axes as possible.
     """
     basis = rows.copy()
     used: list[int] = []

@@ -128,9 +128,8 @@ class Durations:
             self.measured, self.stride = self.measured[::2], 2 * self.stride
 
     def result(self, index: SurfaceIndex) -> Duration | None:
-        """Return the duration if it is significant, with the size that was fitted with it.
-
-        Else None.
+        """Return the duration if it is significant, with the size that was fitted with it;
+        else None.
         """
         if len(self.measured) < LEAST_SCANS or not self._significant(*self._mean()):
             return None

@@ -218,9 +218,8 @@ class Search(GlobalSearch):
 
     @cached_property
     def _square(self) -> Array:
-        """The rotations (24, 3, 3) of a cube along two directions of most of the faces.
-
-        None if they are not square.
+        """The rotations (24, 3, 3) of a cube along two directions of most of the faces; none
+        if they are not square.
         """
         normals = sample(self._target.surface, MODEL_POINTS // 3)[1]
         along = (np.abs(normals @ normals.T) > ALONG).sum(axis=1)

@@ -165,9 +165,8 @@ class GlobalSearch:
     """
 
     def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
-        """Sample the model and find its near-symmetries, or take both from ``kept``.
-
-        What is missing is added to it.
+        """Sample the model and find its near-symmetries, or take both from ``kept``; what is
+        missing is added to it.
         """
         self._target, self._params, self._sided, self.same_rad = (
             target,
@@ -278,9 +277,8 @@ class GlobalSearch:
     def _starts(
         self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array, thinned: int = 1
     ) -> Array:
-        """Every attitude with every camera direction and shift.
-
-        Centroid of the scan on that of the visible surface.
+        """Every attitude with every camera direction and shift: centroid of the scan on that
+        of the visible surface.
         """
         R_ca = geometry.matrix(attitudes(max(1, self._params.starts // thinned)))
         starts = np.tile(np.eye(4), (len(sights), len(shifts), len(R_ca), 1, 1))
@@ -335,9 +333,8 @@ class GlobalSearch:
     def _refined(
         self, some: Array, fine: Array, poses: list[Pose], facing: bool
     ) -> list[Candidate]:
-        """The poses measured on the model.
-
-        The best, and the very best by a near-symmetry, are registered to it.
+        """The poses measured on the model; the best, and the very best by a near-symmetry,
+        are registered to it.
         """
         width = MIDDLE_OF_EXTENT * self._extent
         found = [self._measured(some, T_ca, MIDDLE_OF_EXTENT) for T_ca in poses]
@@ -386,9 +383,8 @@ class GlobalSearch:
         ], least
 
     def _near_symmetries(self, points: Array) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself.
-
-        Different ones, not the identity.
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different
+        ones, not the identity.
         """
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
@@ -410,9 +406,8 @@ class GlobalSearch:
     def _ended(
         self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False
     ) -> Pose:
-        """The pose registered to the model.
-
-        The pose itself where the work of the round is spent.
+        """The pose registered to the model; the pose itself where the work of the round is
+        spent.
         """
         if self._spent >= self._most:
             return T_ca

@@ -31,9 +31,8 @@ LEAST_PRIMITIVES = 20_000  # a smaller model is indexed faster than its file is 
 
 
 def user_folder() -> Path | None:
-    """Return the cache folder of avsreplay for this user by the rules of the platform.
-
-    None where there is no home.
+    """Return the cache folder of avsreplay for this user by the rules of the platform; None
+    where there is no home.
     """
     given = {"win32": "LOCALAPPDATA", "darwin": ""}.get(sys.platform, "XDG_CACHE_HOME")
     base = Path(os.environ.get(given, "")) if given else Path()
@@ -97,9 +96,8 @@ def read(path: Path, checksum: Checksum) -> NDArray[np.uint8] | None:
 
 
 def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
-    """Return the arrays that ``write_arrays`` wrote by their names.
-
-    None without a complete, unchanged file.
+    """Return the arrays that ``write_arrays`` wrote by their names; none without a complete,
+    unchanged file.
     """
     payload = None if path is None else read(path, checksum)
     if payload is None:

@@ -247,8 +247,7 @@ def _moved(points: Array, T: Array) -> Array:
 
 
 def _uncarried(index: SurfaceIndex, points: Array, motions: Array, width: float) -> Array:
-    """Mean of min(1, squared distance) of points (n, 3) after each motion (k, 4, 4).
-
+    """Mean of min(1, squared distance) of points (n, 3) after each motion (k, 4, 4);
     ``width`` is over the extent.
     """
     width_m = min(width * index.extent_m, index.reach_m)

@@ -209,9 +209,8 @@ class ModelCheck:
         self._last = scan.t_ns, found.T_ac
 
     def scale(self) -> tuple[float, float] | None:
-        """Return the size of the target over that of the model and its standard error.
-
-        None with too few scans.
+        """Return the size of the target over that of the model and its standard error; None
+        with too few scans.
         """
         found = [each for each in (self._of_residuals(), self._of_places()) if each is not None]
         if len(found) < 2:
@@ -232,9 +231,8 @@ class ModelCheck:
         return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
 
     def _of_places(self) -> tuple[float, float] | None:
-        """Size and standard error (jackknife over blocks) from the places of the scans.
-
-        None if it explains little.
+        """Size and standard error (jackknife over blocks) from the places of the scans; None
+        if it explains little.
         """
         if len(self._places) < _LEAST_PLACES:
             return None
@@ -281,9 +279,8 @@ class ModelCheck:
         return float(weight @ values / weight.sum()), spread_of(without), weight
 
     def notes(self) -> tuple[str, ...]:
-        """Return the errors of the model that the run shows, one line each.
-
-        Empty if there are none.
+        """Return the errors of the model that the run shows, one line each; empty if there
+        are none.
         """
         if self._aligned:
             if mirror_image_fits(self._registrar, self._surface, self._seen):
@@ -339,9 +336,8 @@ class ModelCheck:
                 self._size_open = not abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
 
     def _on_model(self, scan: Scan, T_ac: Pose, count: int) -> Array | None:
-        """About ``count`` points (n, 3) in {C} at the instant of the scan.
-
-        None if their motion is unknown.
+        """About ``count`` points (n, 3) in {C} at the instant of the scan; None if their
+        motion is unknown.
         """
         kept = _some(scan.points, count)
         p = T_ac.inverse().apply(np.asarray(scan.points[kept], dtype=np.float64))

@@ -383,9 +383,8 @@ class Neighbourhood:
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:
-    """The pose moved by x = [L theta.
-
-    U] (6,) about a centre (3,) in {C} [m], with the rms radius L.
+    """The pose moved by x = [L theta; u] (6,) about a centre (3,) in {C} [m], with the rms
+    radius L.
     """
     turn = geometry.exp(x[:3] / radius_m)
     return Pose(turn, centre + x[3:] - geometry.matrix(turn) @ centre) @ T_ca

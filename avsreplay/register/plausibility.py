@@ -130,9 +130,8 @@ class Plausibility:
 
     @property
     def doubtful(self) -> bool:
-        """Whether a search goes on.
-
-        Of a body with a repeated pattern, a displaced pose can have so high a score.
+        """Whether a search goes on: of a body with a repeated pattern, a displaced pose can
+        have so high a score.
         """
         return self.contradicted > DOUBTFUL
 
@@ -196,9 +195,8 @@ class PlausibilityTest:
         return robust_noise(near if few and self.predicted(T_ca, guess) else distance)
 
     def predicted(self, T_ca: Pose, guess: Pose | None) -> bool:
-        """Return whether a pose T_ca agrees with the predicted T_ac ``guess``.
-
-        False where the camera is not known.
+        """Return whether a pose T_ca agrees with the predicted T_ac ``guess``; False where
+        the camera is not known.
         """
         if guess is None or not self._visibility.may_be_camera(T_ca):
             return False

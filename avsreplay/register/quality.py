@@ -278,9 +278,8 @@ def grade(
 
 
 def _other_size(found: PoseQuality) -> bool:
-    """Whether size is fitted.
-
-    The sums of patches suggest another size, or many points are not on the model.
+    """Whether size is fitted: the sums of patches suggest another size, or many points are
+    not on the model.
     """
     suggested = abs(found.size) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
     return found.inliers < MANY_INLIERS * found.points or suggested
@@ -304,9 +303,8 @@ def _grade(
     systematic: bool,
     simulated: bool,
 ) -> PoseQuality:
-    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}.
-
-    Directions of the test of halves.
+    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the
+    test of halves.
     """
     extent = index.extent_m
     camera = (visibility.faced(index, points, fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
@@ -349,8 +347,7 @@ def _observable_information(
 
 
 def left_undetermined(found: Alignment, motions: Array) -> Alignment:
-    """Return an alignment whose information is independent of motions d (6, k) of the model.
-
+    """Return an alignment whose information is independent of motions d (6, k) of the model:
     DEGENERATE.
     """
     N, D = found.info, motions / np.linalg.norm(motions, axis=0)
@@ -379,9 +376,8 @@ def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
 def view_directions(
     index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> Directions:
-    """Return the directions that a view determines at a pose, and the others.
-
-    Arguments as in ``evidence``.
+    """Return the directions that a view determines at a pose, and the others; arguments as in
+    ``evidence``.
     """
     return _directions(without_dominant_patches(evidence(index, visibility, points, T_ca, gate_m)))
 

@@ -1,6 +1,5 @@
-"""Registration of one scan from a guess, or without one.
-
-The only place where T_ac is converted to T_ca and back.
+"""Registration of one scan from a guess, or without one; the only place where T_ac is
+converted to T_ca and back.
 """
 
 from __future__ import annotations
@@ -194,9 +193,8 @@ class Registrar:
         rounds: int = MOST_ATTEMPTS,
         known: Pose | None = None,
     ) -> Alignment:
-        """The best plausible result of the searches that the budget allows, the first in any case.
-
-        ``known``: T_ca.
+        """The best plausible result of the searches that the budget allows, the first in any
+        case; ``known``: T_ca.
         """
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(sum(SCATTER_WORK[: 2 if len(target) < len(scan) else 1]) * len(scan))
@@ -333,9 +331,8 @@ class Registrar:
     def _verified(
         self, scan: NDArray[Any], target: Array, found: Alignment, budget: Budget, carried: bool
     ) -> Alignment:
-        """The result of a search.
-
-        AMBIGUOUS if a pose that it did not try explains the points on the model as well.
+        """The result of a search; AMBIGUOUS if a pose that it did not try explains the points
+        on the model as well.
         """
         symmetry, T_ca = self._symmetry, found.T_ac.inverse()
         partial = self._test.partial(target, T_ca)
@@ -359,9 +356,8 @@ class Registrar:
         covered: bool,
         budget: Budget,
     ) -> Alignment:
-        """The result of a search.
-
-        AMBIGUOUS with rivals, not accepted where the view shows faces of many bodies.
+        """The result of a search; AMBIGUOUS with rivals, not accepted where the view shows
+        faces of many bodies.
         """
         found = self._symmetry.rivalled(scan, found, rivals)
         if found.status is AlignStatus.AMBIGUOUS or covered or not self._visibility.sided:
@@ -407,8 +403,7 @@ class Registrar:
         carried: bool,
         unknown: Array | None,
     ) -> Alignment:
-        """The pose turned by a near-symmetry, if the points off the model decide for it.
-
+        """The pose turned by a near-symmetry, if the points off the model decide for it;
         DEGENERATE as of the guess.
         """
         unknown = motions_outside(
@@ -449,9 +444,8 @@ class Registrar:
         halves: bool,
         carried: bool,
     ) -> Alignment:
-        """The best of the minima around a pose of a part of the target.
-
-        Not accepted if another is as good.
+        """The best of the minima around a pose of a part of the target; not accepted if
+        another is as good.
         """
         best, status, doubt = self._neighbourhood.best(scan, guess, found, budget)
         if best is not None:
@@ -472,9 +466,8 @@ class Registrar:
     def _searched(
         self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget
     ) -> Alignment:
-        """The result of the global search if the budget allows it.
-
-        Otherwise the pose is not accepted.
+        """The result of the global search if the budget allows it; otherwise the pose is not
+        accepted.
         """
         if budget.allows(self._symmetry.search_work(len(scan), 0) + sum(SCATTER_WORK) * len(scan)):
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())

@@ -135,9 +135,8 @@ class Restarter:
     def measure(
         self, points: NDArray[Any], T_ca: Pose, budget: Budget, guess: Pose | None = None
     ) -> Restart:
-        """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``.
-
-        As of ``PlausibilityTest.noise``.
+        """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of
+        ``PlausibilityTest.noise``.
         """
         at, work = self._target.visibility.distances(self._target.index, points, T_ca, np.inf)
         budget.spend(work + CALL_WORK)

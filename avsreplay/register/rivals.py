@@ -75,9 +75,8 @@ class NearSymmetry:
     def __init__(
         self, target: Target, test: PlausibilityTest, search: Search, kept: dict[str, Array]
     ) -> None:
-        """Find the axis of revolution, if there is one, and sample the marks.
-
-        Or take both from ``kept``.
+        """Find the axis of revolution, if there is one, and sample the marks; or take both
+        from ``kept``.
         """
         self._target, self._test, self.search, self._gate = (
             target,
@@ -127,9 +126,8 @@ class NearSymmetry:
         return found, np.array([len(marks) / DENSE, stride * area / DENSE])
 
     def _carried_off(self, points: Array, most: float) -> NDArray[np.bool_]:
-        """Which points some near-symmetry does not carry onto the surface.
-
-        Ends when this share of them is exceeded.
+        """Which points some near-symmetry does not carry onto the surface; ends when this
+        share of them is exceeded.
         """
         moved, width = np.zeros(len(points), dtype=bool), OFF * self._gate
         for motions in self._kinds:
@@ -287,9 +285,8 @@ class NearSymmetry:
         return best.T_ca, rivals, work + compared
 
     def rivalled(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> Alignment:
-        """Return the alignment.
-
-        AMBIGUOUS with rivals that differ not only along its unobservable directions.
+        """Return the alignment; AMBIGUOUS with rivals that differ not only along its
+        unobservable directions.
         """
         at, target = found.T_ac.inverse(), self._target
         if rivals and found.status is AlignStatus.DEGENERATE:

@@ -1,6 +1,5 @@
-"""Points of a surface and parts of a scan.
-
-Evenly distributed, on a surface, and such as may be the target.
+"""Points of a surface and parts of a scan: evenly distributed, on a surface, and such as may
+be the target.
 """
 
 from __future__ import annotations
@@ -90,9 +89,8 @@ def sample_faces(
 
 
 def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:
-    """Return about ``count`` points and normals as :func:`sample`.
-
-    The points of a cloud are thinned to this number.
+    """Return about ``count`` points and normals as :func:`sample`; the points of a cloud are
+    thinned to this number.
     """
     points, normals = sample(surface, count)
     if len(surface.faces):
@@ -102,9 +100,8 @@ def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:
 
 
 def attitudes(count: int) -> Array:
-    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations.
-
-    Super-Fibonacci spiral (Alexa 2022).
+    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations:
+    super-Fibonacci spiral (Alexa 2022).
     """
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
@@ -143,9 +140,8 @@ def usable_points(points: NDArray[Any], voxel_m: float) -> NDArray[Any]:
 
 
 def thin_to(points: Array, count: int) -> Array:
-    """Return about ``count`` of the points.
-
-    The first of every voxel, whose size is found iteratively.
+    """Return about ``count`` of the points: the first of every voxel, whose size is found
+    iteratively.
     """
     if len(points) <= count:
         return points
@@ -225,9 +221,8 @@ def without_scattered_points(points: Array) -> Array:
 
 
 def scan_axes(points: Array) -> list[Array]:
-    """Return both directions of each principal axis of points (n, 3).
-
-    Without axes, those of the frame.
+    """Return both directions of each principal axis of points (n, 3); without axes, those of
+    the frame.
     """
     axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
     return [*axes, *-axes]

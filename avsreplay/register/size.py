@@ -89,9 +89,8 @@ class SizeError:
 
     @property
     def likely(self) -> bool:
-        """Whether delta is larger than 0.5 % and than two standard errors.
-
-        The pose is then uncertain by its shift.
+        """Whether delta is larger than 0.5 % and than two standard errors: the pose is then
+        uncertain by its shift.
         """
         return abs(self.delta) > max(LEAST_ERROR, LIKELY_SIGMAS * self.sigma)
 
@@ -249,9 +248,8 @@ def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> Rows | Non
 def _rounds(
     index: SurfaceIndex, p: Array, camera_c: Array | None, count: int
 ) -> tuple[float, Pose] | None:
-    """Size and motion after so many rounds, and more while they change the size.
-
-    Their rows are not needed.
+    """Size and motion after so many rounds, and more while they change the size; their rows
+    are not needed.
     """
     delta, moved = 0.0, Pose.identity()
     rule = (
@@ -401,9 +399,8 @@ def _effect(rows: Rows, B: Array) -> float:
 
 
 def spread_of(without: Array) -> float:
-    """Return the standard error of an estimate by the jackknife.
-
-    From its values (n,) without one of n parts each.
+    """Return the standard error of an estimate by the jackknife: from its values (n,) without
+    one of n parts each.
     """
     n = len(without)
     return float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))

@@ -91,9 +91,8 @@ class IcpParams(Settings):
 
 @value_class
 class Closest:
-    """Closest points of n queries.
-
-    Foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,) face or point, normal.
+    """Closest points of n queries: foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,)
+    face or point, normal.
     """
 
     foot: Array
@@ -326,9 +325,8 @@ class SurfaceIndex:
         threads: int = 1,
         facing: bool = False,
     ) -> NormalEquations:
-        """Point-to-plane sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4); ``facing``.
-
-        As in :class:`IcpParams`.
+        """Point-to-plane sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4); ``facing``: as
+        in :class:`IcpParams`.
         """
         gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
         return NormalEquations(
@@ -357,17 +355,15 @@ class SurfaceIndex:
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
     def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
-        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``.
-
-        As in ``kernel/grade.hpp``.
+        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in
+        ``kernel/grade.hpp``.
         """
         return tuple(self._index.grade(_points(points), T_ca.matrix, *rule))
 
     def distances(
         self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any
     ) -> tuple[Array, int]:
-        """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``.
-
+        """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``:
         ``kernel/evidence.hpp``.
         """
         at, work = self._index.distances(
@@ -376,9 +372,8 @@ class SurfaceIndex:
         return at, work
 
     def cast(self, eye_c: Array, directions: Array) -> tuple[Array, int]:
-        """Ranges (n,) [m] of the first faces of a mesh on rays (n, 3) from ``eye_c`` (3,), inf.
-
-        None; and the work.
+        """Ranges (n,) [m] of the first faces of a mesh on rays (n, 3) from ``eye_c`` (3,),
+        inf: none; and the work.
         """
         ranges, work = self._index.cast(eye_c.tolist(), np.ascontiguousarray(directions))
         return ranges, work
@@ -386,9 +381,8 @@ class SurfaceIndex:
     def size_step(
         self, points: Array, camera_c: Array | None, *rule: Any
     ) -> tuple[float, Array, Array] | None:
-        """Step of the size, pose d (6,) about a centre (3,), that (n, 3) in {C} ask for.
-
-        See ``kernel/size.hpp``.
+        """Step of the size, pose d (6,) about a centre (3,), that (n, 3) in {C} ask for; see
+        ``kernel/size.hpp``.
         """
         camera = None if camera_c is None else tuple(float(x) for x in camera_c)
         step: tuple[float, Array, Array] | None = self._index.size_step(

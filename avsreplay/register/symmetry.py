@@ -108,9 +108,8 @@ def distances(index: SurfaceIndex, points: Array, motions: Array, most_m: float)
 
 
 def revolved(axis: Array, centre: Array, count: int) -> Array:
-    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}.
-
-    The first is the identity.
+    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}; the
+    first is the identity.
     """
     R = geometry.matrix(geometry.exp(2.0 * np.pi / count * np.arange(count)[:, None] * axis))
     T = np.tile(np.eye(4), (count, 1, 1))
@@ -200,9 +199,8 @@ def _revolved(index: SurfaceIndex, points: Array, direction: Array, centre: Arra
 def _turns(
     index: SurfaceIndex, points: Array, direction: Array, centre: Array
 ) -> tuple[Array, float]:
-    """The turns (k, 4, 4) about an axis, the identity first: those of teeth, or else any.
-
-    The least of teeth [rad].
+    """The turns (k, 4, 4) about an axis, the identity first: those of teeth, or else any; the
+    least of teeth [rad].
     """
     width = 0.5 * REVOLVED * index.extent_m
     circle = distances(index, points, revolved(direction, centre, CIRCLE), width)
@@ -211,9 +209,8 @@ def _turns(
 
 
 def _teeth(cost: Array) -> int:
-    """The number of teeth by the cost (k,) of turns along a circle, low at each tooth.
-
-    The main frequency; or 0.
+    """The number of teeth by the cost (k,) of turns along a circle, low at each tooth: the
+    main frequency; or 0.
     """
     k, middle = len(cost), float(np.median(cost))
     power = np.abs(np.fft.rfft(cost - cost.mean())) ** 2

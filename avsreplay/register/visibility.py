@@ -108,9 +108,8 @@ class Visibility:
         return self.sided and math.hypot(*outside) >= self._clear
 
     def faced(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> bool:
-        """Return whether the test can apply to a scan (n, 3).
-
-        ``may_be_camera``, or nearly all its faces are seen.
+        """Return whether the test can apply to a scan (n, 3): ``may_be_camera``, or nearly
+        all its faces are seen.
         """
         if not self.sided or self.may_be_camera(T_ca):
             return self.sided
@@ -164,9 +163,8 @@ class Visibility:
         )
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
-        """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin.
-
-        None if the camera is not there.
+        """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin; None if the
+        camera is not there.
         """
         centre = np.median(points, axis=0).astype(np.float64)
         distance = float(np.linalg.norm(centre))

@@ -1,6 +1,5 @@
-"""The picture of the approach in the frame of the fixture {C}.
-
-Flown path, cones, target, begin and grasp point.
+"""The picture of the approach in the frame of the fixture {C}: flown path, cones, target,
+begin and grasp point.
 """
 
 from __future__ import annotations
@@ -136,9 +135,8 @@ def _outline(degrees: float, length: float, mouth: float) -> Array:
 
 
 def _triangles(points: Array, faces: Any) -> str:
-    """The path data of triangles of one orientation, whose fillings join.
-
-    Of small squares without faces.
+    """The path data of triangles of one orientation, whose fillings join; of small squares
+    without faces.
     """
     if not len(faces):
         return "".join(f"M{x:g} {y:g}h2v2h-2z" for x, y in points.tolist())

@@ -1,6 +1,5 @@
-"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``.
-
-Arrays as base64 text.
+"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``; arrays
+as base64 text.
 """
 
 from __future__ import annotations
@@ -216,9 +215,8 @@ def flight_charts(columns: Columns) -> list[Chart]:
 
 
 def _scaled(chart: Chart, columns: Columns) -> Chart:
-    """The chart with its axis.
-
-    Typical values in metres below 1 m are drawn in millimetres, as in the tables.
+    """The chart with its axis; typical values in metres below 1 m are drawn in millimetres,
+    as in the tables.
     """
     sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]
     typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)

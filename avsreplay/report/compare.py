@@ -16,9 +16,8 @@ from avsreplay.settings import dump, entries
 
 @value_class(eq=True)
 class Metric:
-    """One metric of a run.
-
-    Name with its unit as suffix, unit, meaning, function (None without a value).
+    """One metric of a run: name with its unit as suffix, unit, meaning, function (None
+    without a value).
     """
 
     name: str
@@ -268,9 +267,8 @@ def different_logs(base: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[s
 
 
 def _names(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[str, str]:
-    """Names of two different files.
-
-    Of equal names the first digits of the SHA-256 distinguish them.
+    """Names of two different files; of equal names the first digits of the SHA-256
+    distinguish them.
     """
     names = [str(given.get("name", "unknown")) for given in (first, second)]
     if names[0] == names[1]:

@@ -70,9 +70,8 @@ _BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
 def _scanwise(
     column: str, band: tuple[float, float] | None = None, *, healthy: bool = False
 ) -> Callable[[Sequence[Row]], Array]:
-    """A column squared, or whether it is inside a band.
-
-    NaN where a scan has no value or is not to count.
+    """A column squared, or whether it is inside a band; NaN where a scan has no value or is
+    not to count.
     """
 
     def value(rows: Sequence[Row]) -> Array:
@@ -103,9 +102,8 @@ _MEANS = {  # metrics that are a mean over scans
 
 
 class ComparedRun(Protocol):
-    """What a comparison needs of a saved result.
-
-    Its name, rows (one per scan), their summary and ``run.json``.
+    """What a comparison needs of a saved result: its name, rows (one per scan), their summary
+    and ``run.json``.
     """
 
     @property

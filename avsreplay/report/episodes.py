@@ -38,9 +38,8 @@ class Mark(NamedTuple):
 
 @value_class(eq=True)
 class Peak:
-    """Largest position and attitude error over some scans.
-
-    None without truth or without such a scan.
+    """Largest position and attitude error over some scans; None without truth or without such
+    a scan.
     """
 
     pos_err_m: float | None = None
@@ -210,9 +209,8 @@ def _labels_of(marks: Sequence[Mark]) -> list[Label]:
 
 
 def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
-    """Rows of each label.
-
-    Those of its kind to whose stamp its window is the nearest (a fault may shift stamps).
+    """Rows of each label: those of its kind to whose stamp its window is the nearest (a fault
+    may shift stamps).
     """
     out: list[list[int]] = [[] for _ in labels]
     kinds: dict[str | None, list[int]] = {}
@@ -281,9 +279,8 @@ def _episode(
 
 
 def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:
-    """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``.
-
-    None where none has it.
+    """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``; None
+    where none has it.
     """
     begin: Mark | None = None
     for place, mark in enumerate(marks):
@@ -294,9 +291,8 @@ def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None,
 
 
 def _until_next(marks: Iterable[Mark], next_ns: int | None) -> Iterable[Mark]:
-    """The first of ``marks`` up to a label.
-
-    One that begins at ``next_ns`` may have left no scan.
+    """The first of ``marks`` up to a label; one that begins at ``next_ns`` may have left no
+    scan.
     """
     return takewhile(lambda m: m.fault is None and (next_ns is None or m.t_ns < next_ns), marks)
 
@@ -309,9 +305,8 @@ def _nexts(labels: Sequence[Label]) -> list[int | None]:
 
 
 def coasts(marks: Sequence[Mark]) -> list[Coast]:
-    """Every run of scans with gamma 0.
-
-    Its duration is from the last healthy scan before it to its last scan.
+    """Every run of scans with gamma 0; its duration is from the last healthy scan before it
+    to its last scan.
     """
     out: list[Coast] = []
     begin: int | None = None

@@ -61,9 +61,8 @@ def stamp_text(t_ns: int) -> str:
 
 
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
-    """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m].
-
-    Return their number.
+    """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return
+    their number.
     """
     return _write_lines(
         path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses)
@@ -99,9 +98,8 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 
 
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
-    """Write all columns.
-
-    Their names (with units as suffixes) stand in the first line, null is an empty cell.
+    """Write all columns; their names (with units as suffixes) stand in the first line, null
+    is an empty cell.
     """
     names = [c.name for c in columns()]
     with output_text(path) as stream:
@@ -194,9 +192,8 @@ def _strict(value: Any) -> Any:
 
 
 def write_layout(path: str | Path) -> None:
-    """Write the layout with which Foxglove and Lichtblick show ``result.mcap``.
-
-    3D view, plots, diagnostics.
+    """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view,
+    plots, diagnostics.
     """
     with output_text(path) as stream:
         stream.write(

@@ -109,9 +109,8 @@ def read_golden(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20) -> GoldenResult:
-    """Compare the rows of two runs by the tolerances of golden files.
-
-    ``first`` differences are kept.
+    """Compare the rows of two runs by the tolerances of golden files; ``first`` differences
+    are kept.
     """
     return _compare(_table(expected), _table(got), first)
 

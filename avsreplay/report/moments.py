@@ -1,6 +1,5 @@
-"""The worst moments of a run, with their cause.
-
-Intervals without a used scan, scans whose error or NIS stands out.
+"""The worst moments of a run, with their cause: intervals without a used scan, scans whose
+error or NIS stands out.
 """
 
 from __future__ import annotations
@@ -40,9 +39,8 @@ class Moment:
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
-    """The five worst intervals: without a used scan, or with an error or NIS that stands out.
-
-    No two overlap.
+    """The five worst intervals: without a used scan, or with an error or NIS that stands out;
+    no two overlap.
     """
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
@@ -54,9 +52,8 @@ def worst_moments(rows: Sequence[Row]) -> list[Moment]:
 
 
 def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
-    """Candidates with a weight.
-
-    Flagged intervals and single scans whose error or NIS stands out.
+    """Candidates with a weight: flagged intervals and single scans whose error or NIS stands
+    out.
     """
     for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
         places = list(group)

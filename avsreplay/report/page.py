@@ -335,9 +335,8 @@ def build_flight_page(
 
 
 def _scene(flight: Flight) -> dict[str, Any]:
-    """Data for ``scene.js``.
-
-    The model at rest, the path in {C}, the gripper at every instant, the cones.
+    """Data for ``scene.js``: the model at rest, the path in {C}, the gripper at every
+    instant, the cones.
     """
     view = None if flight.surface is None else View(*thin_surface(flight.surface))
     still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(flight.t_s), 1))

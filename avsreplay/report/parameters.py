@@ -1,6 +1,5 @@
-"""Estimated parameters of the body.
-
-Those of the paper, and those that do not depend on the order of the axes.
+"""Estimated parameters of the body: those of the paper, and those that do not depend on the
+order of the axes.
 """
 
 from __future__ import annotations
@@ -69,9 +68,8 @@ def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
 
 
 def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
-    """Parameters that do not depend on the order of the axes.
-
-    Moments, and inertia, mass centre and rate in {C}.
+    """Parameters that do not depend on the order of the axes: moments, and inertia, mass
+    centre and rate in {C}.
     """
     moments = tensor = centre = rate = None
     if truth is not None:
@@ -99,9 +97,8 @@ def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
 
 
 def _moments(x: State) -> geometry.Array:
-    """Principal moments (3,) over their sum, from the inertia ratios.
-
-    I / tr I is 1 over the diagonal of B(sigma).
+    """Principal moments (3,) over their sum, from the inertia ratios: I / tr I is 1 over the
+    diagonal of B(sigma).
     """
     s1, s2 = float(x.sigma[0]), float(x.sigma[1])
     xx = 1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2)

@@ -130,9 +130,8 @@ def _label_record(label: Label) -> dict[str, Any]:
 
 
 def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
-    """Write ``run.json``.
-
-    ``record``, the number of rows, and size and SHA-256 of every file in the folder.
+    """Write ``run.json``: ``record``, the number of rows, and size and SHA-256 of every file
+    in the folder.
     """
     files = {
         path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)}
@@ -212,9 +211,8 @@ def _header(path: Path) -> dict[str, Any]:
 
 
 def _verify(folder: Path, header: Mapping[str, Any], names: Sequence[str] | None) -> str:
-    """Compare files with size and SHA-256 in run.json.
-
-    Return why this is not possible, or an empty string.
+    """Compare files with size and SHA-256 in run.json; return why this is not possible, or an
+    empty string.
     """
     files = header.get("files")
     if not isinstance(files, dict) or "rows.jsonl" not in files:

@@ -74,9 +74,8 @@ class Errors:
 
 @value_class(eq=True)
 class Share:
-    """A chi-square statistic.
-
-    Its median and the shares of scans inside and above the two-sided 95 % band.
+    """A chi-square statistic: its median and the shares of scans inside and above the
+    two-sided 95 % band.
     """
 
     count: int
@@ -89,9 +88,8 @@ class Share:
 
 @value_class(eq=True)
 class ObservabilitySummary:
-    """The Gramian at the last scan, and the time of the first scan at which its rank was 20 (None.
-
-    Never).
+    """The Gramian at the last scan, and the time of the first scan at which its rank was 20
+    (None: never).
     """
 
     log10_cond: float | None
@@ -102,9 +100,8 @@ class ObservabilitySummary:
 
 @value_class(eq=True)
 class ConvergenceSummary:
-    """t_1: time of the first scan whose estimate the planner may use; whether it holds at the end.
-
-    Times withdrawn.
+    """t_1: time of the first scan whose estimate the planner may use; whether it holds at the
+    end; times withdrawn.
     """
 
     t1_s: float | None

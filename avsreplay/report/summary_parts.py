@@ -99,9 +99,8 @@ class VelocityChange:
 
 @value_class(eq=True)
 class Drifting:
-    """A constant torque or force on the target.
-
-    Onset since the first scan and accelerations, with 1 sigma.
+    """A constant torque or force on the target: onset since the first scan and accelerations,
+    with 1 sigma.
     """
 
     onset_s: float

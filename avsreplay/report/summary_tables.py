@@ -95,9 +95,8 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
-    """Errors, injected faults, manoeuvres, parameters and consistency.
-
-    A table without content has no rows.
+    """Errors, injected faults, manoeuvres, parameters and consistency; a table without
+    content has no rows.
     """
     events = fault_table(summary, rows), manoeuvre_table(summary, rows)
     return error_table(summary), *events, parameter_table(summary), consistency_table(summary)
@@ -306,9 +305,8 @@ def _error_words(summary: Summary) -> list[str]:
 
 
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
-    """(name, value) of everything that takes one line.
-
-    Scans, faults, filter, plan, counts, speed.
+    """(name, value) of everything that takes one line: scans, faults, filter, plan, counts,
+    speed.
     """
     facts = [
         *_scan_facts(summary),

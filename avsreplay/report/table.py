@@ -126,9 +126,8 @@ def print_table(console: Console, table: Table, *, tight: bool = False) -> None:
 
 
 def _least_width(table: Table, gap: int) -> int:
-    """Width at which no column of one line is cut.
-
-    All columns have one where the gap between them is 1.
+    """Width at which no column of one line is cut; all columns have one where the gap between
+    them is 1.
     """
     columns_of_text = zip(
         table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True
@@ -284,9 +283,8 @@ def _ordinal(n: int) -> str:
 def scan_table(
     console: Console, rows: Sequence[Row], *, every: int | None = None, show_all: bool = False
 ) -> Table:
-    """The table of the chosen rows.
-
-    Columns that do not fit the console are left out and named in the note.
+    """The table of the chosen rows; columns that do not fit the console are left out and
+    named in the note.
     """
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
     plain = ascii_only(console)
@@ -315,9 +313,8 @@ def scan_table(
 
 
 def head(column: Column, shown: str = "") -> str:
-    """A heading of whole words with the unit on the last line.
-
-    ``shown`` is the unit of the printed numbers.
+    """A heading of whole words with the unit on the last line; ``shown`` is the unit of the
+    printed numbers.
     """
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
     name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
@@ -387,9 +384,8 @@ _LABEL = 32
 
 
 def spark(values: Sequence[float | None], width: int) -> str:
-    """At most ``width`` blocks from 0 to the largest value, each the largest of its part.
-
-    A blank for none.
+    """At most ``width`` blocks from 0 to the largest value, each the largest of its part; a
+    blank for none.
     """
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)

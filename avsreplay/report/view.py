@@ -41,9 +41,8 @@ Faces = NDArray[np.int32]
 
 @value_class
 class CloudView:
-    """Some points of scan ``seq``.
-
-    (n, 3) in {A} [m], distances to the model (n,) [m] and intensities (n,) or None.
+    """Some points of scan ``seq``: (n, 3) in {A} [m], distances to the model (n,) [m] and
+    intensities (n,) or None.
     """
 
     seq: int
@@ -54,9 +53,8 @@ class CloudView:
 
 @value_class
 class PathView:
-    """A planned path.
-
-    Time of planning, (n, 3) positions in {A} [m], distance to the true grasp point [m].
+    """A planned path: time of planning, (n, 3) positions in {A} [m], distance to the true
+    grasp point [m].
     """
 
     t_ns: int
@@ -96,9 +94,8 @@ def thin_cloud(
 
 
 def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
-    """At most ``most`` faces (vertices, for a bare cloud).
-
-    Vertices are merged on an ever coarser grid.
+    """At most ``most`` faces (vertices, for a bare cloud): vertices are merged on an ever
+    coarser grid.
     """
     vertices, faces = surface.vertices, surface.faces
     size = surface.extent / 256.0 or 1.0
@@ -109,9 +106,8 @@ def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, F
 
 
 def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces]:
-    """Replace the vertices of each grid cell by their mean.
-
-    Collapsed and duplicate faces are removed.
+    """Replace the vertices of each grid cell by their mean; collapsed and duplicate faces are
+    removed.
     """
     cells = np.floor((vertices - vertices.min(axis=0)) / size).astype(np.int64)
     member = np.unique(_numbers(cells), return_inverse=True)[1]
@@ -131,9 +127,8 @@ def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces
 
 
 def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers (n,) in the order of triples (n, 3) of integers from 0.
-
-    Equal triples have the same number.
+    """Numbers (n,) in the order of triples (n, 3) of integers from 0; equal triples have the
+    same number.
     """
     first, second, third = triples.T
     pairs = np.unique(first * (second.max(initial=0) + 1) + second, return_inverse=True)[1]
@@ -240,9 +235,8 @@ RING = 48  # lines of a cone
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
-    """Plain data for ``scene.js``.
-
-    Poses as columns x y z qx qy qz qw, points as 16-bit steps about a centre [m].
+    """Plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit steps
+    about a centre [m].
     """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack(
@@ -306,9 +300,8 @@ def _quantised(points: NDArray[np.float32]) -> tuple[NDArray[np.int16], NDArray[
 
 
 def _cap(residuals: Sequence[NDArray[np.float32]]) -> float | None:
-    """Residual at the top of the colour scale [m].
-
-    Twice the median over the scans of their 90 % points.
+    """Residual at the top of the colour scale [m]: twice the median over the scans of their
+    90 % points.
     """
     if not residuals:
         return None

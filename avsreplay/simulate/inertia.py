@@ -38,9 +38,8 @@ class Body:
 
     @property
     def c_b(self) -> Array:
-        """(3,) varrho, the fixture in {B} [m].
-
-        P_b = A(mu) p_c + varrho is zero at the mass centre.
+        """(3,) varrho, the fixture in {B} [m]: p_b = A(mu) p_c + varrho is zero at the mass
+        centre.
         """
         return -geometry.rotate(geometry.matrix(self.q_bc), self.centre_c)
 

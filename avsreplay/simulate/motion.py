@@ -291,9 +291,8 @@ def _gravity_gradient(params: MotionParams, t: float) -> list[Rows]:
 def _turning(
     now: _Instant, inertia: Rows, inverse: Rows, torque: Vector
 ) -> list[tuple[Vector, Vector]]:
-    """Taylor coefficients of attitude and rate.
-
-    A product of series is a sum over i of terms i and k - i.
+    """Taylor coefficients of attitude and rate; a product of series is a sum over i of terms
+    i and k - i.
     """
     qs, ws, hs = [now.q], [now.w], [_times(inertia, now.w)]
     for k in range(ORDER):

@@ -78,9 +78,8 @@ def ray_grid(
 def _direction(
     pattern: Pattern, halves: list[float], u: float, v: float
 ) -> tuple[float, float, float]:
-    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half angles.
-
-    Not of unit length.
+    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half
+    angles; not of unit length.
     """
     if pattern is Pattern.FLASH:
         return math.tan(halves[0]) * u, math.tan(halves[1]) * v, 1.0

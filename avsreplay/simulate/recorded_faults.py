@@ -157,9 +157,8 @@ class _Disturbance:
         return window.start_ns <= log_ns < window.end_ns
 
     def _points(self, scan: Scan, now: dict[int, RecordedFault]) -> Scan:
-        """The scan with its points changed.
-
-        Unchanged, bit for bit, where no fault changes points.
+        """The scan with its points changed; unchanged, bit for bit, where no fault changes
+        points.
         """
         changing = [(k, fault) for k, fault in now.items() if fault.kind in _ON_POINTS]
         if not changing or not len(scan.points):
@@ -295,9 +294,8 @@ def _occlude_ahead(
 def _clutter_around(
     returns: Returns, ratio: float, radius_m: float | None, rng: np.random.Generator
 ) -> Returns:
-    """``clutter`` about the median point.
-
-    Without a radius it is the 90 % quantile of the distances from it.
+    """``clutter`` about the median point; without a radius it is the 90 % quantile of the
+    distances from it.
     """
     if not len(returns.ranges):
         return returns

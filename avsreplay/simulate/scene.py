@@ -66,9 +66,8 @@ class Presence(Settings):
         )
 
     def label(self, epoch_ns: int) -> Label | None:
-        """Its label on a log clock that begins at ``epoch_ns``.
-
-        None where it stays to the end of the log.
+        """Its label on a log clock that begins at ``epoch_ns``; None where it stays to the
+        end of the log.
         """
         if self.duration_s is None:
             return None
@@ -254,9 +253,8 @@ class Limb(Presence):
 
 @dataclass(frozen=True, slots=True)
 class Appendage(Settings):
-    """One table [[appendage]].
-
-    A flexible part of the target, which swings about a hinge while the model is rigid.
+    """One table [[appendage]]: a flexible part of the target, which swings about a hinge
+    while the model is rigid.
     """
 
     name: str = setting(doc="Name of the part.")
@@ -315,9 +313,8 @@ def appendage_faces(surface: Surface, appendages: Sequence[Appendage]) -> NDArra
 
 @dataclass(frozen=True, slots=True)
 class CameraParams(Settings):
-    """The table [camera].
-
-    Motion of the camera in the fixed frame, which is {A} at the time 0 without vibration.
+    """The table [camera]: motion of the camera in the fixed frame, which is {A} at the time 0
+    without vibration.
     """
 
     velocity_mps: Triple = setting((0.0, 0.0, 0.0), "Velocity in the fixed frame.", unit="m/s")
@@ -383,9 +380,8 @@ class SceneBody:
 def scene_bodies(
     objects: Sequence[SceneObject], meshes: dict[str, Surface], engine: Engine
 ) -> list[SceneBody]:
-    """The objects of a scenario.
-
-    ``meshes`` has the surface of every ``model`` that one of them names.
+    """The objects of a scenario; ``meshes`` has the surface of every ``model`` that one of
+    them names.
     """
     bodies = []
     for params in objects:

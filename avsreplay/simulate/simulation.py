@@ -162,9 +162,8 @@ class Simulation:
         return scan
 
     def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault]) -> Returns:
-        """Ray casting, occlusion, noise, bias, clutter.
-
-        In the order in which they act on the light.
+        """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the
+        light.
         """
         noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
         bodies = [body for body in self._bodies if body.params.present(t_s)]

@@ -222,9 +222,8 @@ def frustum(x0: float, r0: float, x1: float, r1: float, sides: int = 24) -> Soli
 def shell(
     x0: float, r0: float, x1: float, r1: float, wall: float, floor: float, sides: int = 24
 ) -> Solid:
-    """An open cup about x.
-
-    Radius r0 at x0 and r1 at its opening x1, thickness ``wall``, bottom at x0 + floor [m].
+    """An open cup about x: radius r0 at x0 and r1 at its opening x1, thickness ``wall``,
+    bottom at x0 + floor [m].
     """
     outer0, outer1 = _ring(x0, r0, sides), _ring(x1, r1, sides)
     inner1, inner0 = _ring(x1, r1 - wall, sides), _ring(x0 + floor, r0 - wall, sides)
@@ -232,9 +231,8 @@ def shell(
 
 
 def adapter(r0: float, r1: float, half_height: float) -> Solid:
-    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m].
-
-    Wall 5 % of the smaller one.
+    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m]; wall 5 %
+    of the smaller one.
     """
     wall, low, high = 0.05 * min(r0, r1), -half_height, half_height
     outer, inner = _ring(low, r0, 48), _ring(low, r0 - wall, 48)
@@ -265,9 +263,8 @@ def _tube(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Solid:
 
 
 def _fixture() -> list[Solid]:
-    """The grapple fixture: base, pin along +x and three unequal cams.
-
-    The face of the base is x = 0.
+    """The grapple fixture: base, pin along +x and three unequal cams; the face of the base is
+    x = 0.
     """
     return [
         box((-0.06, -0.16, -0.16), (0.0, 0.16, 0.16)),

@@ -58,9 +58,8 @@ class Axis(Settings):
 
 @dataclass(frozen=True, slots=True)
 class CampaignCase(Settings):
-    """One table [[case]]: settings that go together.
-
-    Cases are alternatives, each combined with the grid.
+    """One table [[case]]: settings that go together; cases are alternatives, each combined
+    with the grid.
     """
 
     name: str = setting(doc="Name of the case in tables.")
@@ -73,9 +72,8 @@ class CampaignCase(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Draw(Settings):
-    """One table [[draw]].
-
-    A value drawn anew for every repeat, the same for all combinations of that repeat.
+    """One table [[draw]]: a value drawn anew for every repeat, the same for all combinations
+    of that repeat.
     """
 
     key: str = setting(doc="scenario.<key> or run.<key>.")
@@ -99,9 +97,8 @@ class Draw(Settings):
 
 @dataclass(frozen=True, slots=True)
 class SuccessCriterion(Settings):
-    """One table [[success]].
-
-    A run succeeds where the metric has a value and is within the limits.
+    """One table [[success]]: a run succeeds where the metric has a value and is within the
+    limits.
     """
 
     name: str = setting(doc="Name of the criterion in tables.")

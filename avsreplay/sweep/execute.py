@@ -92,9 +92,8 @@ def _replayed(task: Task, log: Path) -> RunResult:
 
 
 def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, Any]:
-    """How whole flights from the first converged scan on end, by name.
-
-    None where the estimate did not converge.
+    """How whole flights from the first converged scan on end, by name; none where the
+    estimate did not converge.
     """
     if not any(row.converged for row, _ in known):
         return {"flights.count": 0}
@@ -122,9 +121,8 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
 
 
 def flat_metrics(summary: Summary, last: Row | None) -> dict[str, Any]:
-    """A summary as flat values by dotted name.
-
-    Its single values, parameter errors, worst coasting, last row.
+    """A summary as flat values by dotted name: its single values, parameter errors, worst
+    coasting, last row.
     """
     plain = settings.dump(summary)
     flat = dict(_flat({k: v for k, v in plain.items() if k not in ("parameters", "coasts")}))
@@ -283,9 +281,8 @@ def _collected(future: Any) -> RunResult:
 
 
 def _crashed(task_id: str, error: BaseException | None) -> RunResult:
-    """The result of a run that raised.
-
-    Kind and first line of the error, without addresses that differ between runs.
+    """The result of a run that raised: kind and first line of the error, without addresses
+    that differ between runs.
     """
     if type(error).__name__ == "KilledWorker":
         return RunResult(task_id, "crashed", "the worker process died repeatedly")
@@ -367,9 +364,8 @@ def _kind(value: Any) -> str:
 def _write_runs(
     plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path
 ) -> None:
-    """One row per run.
-
-    A column is of truth values, float64 or text, anything mixed or nested as JSON text.
+    """One row per run; a column is of truth values, float64 or text, anything mixed or nested
+    as JSON text.
     """
     pa, _ = arrow()
     types = {"bool": pa.bool_(), "number": pa.float64(), "text": pa.string()}

@@ -59,9 +59,8 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One run.
-
-    Row number, number of the combination, repeat, seed (None for a log), values by key, and task.
+    """One run: row number, number of the combination, repeat, seed (None for a log), values
+    by key, and task.
     """
 
     index: int
@@ -89,9 +88,8 @@ class Expansion:
         return len(self.cells) * self.loaded.campaign.repeats
 
     def points(self) -> Iterator[Point]:
-        """The runs in the order of their rows.
-
-        Repeat by repeat, so that a stop leaves complete repeats.
+        """The runs in the order of their rows: repeat by repeat, so that a stop leaves
+        complete repeats.
         """
         campaign = self.loaded.campaign
         for repeat in range(campaign.repeats):

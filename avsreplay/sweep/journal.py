@@ -236,9 +236,8 @@ class Journal:
         return read_scans(part) if part.exists() else []
 
     def check_scans(self) -> int:
-        """Forget every run whose scans are missing or damaged, so that it is made again.
-
-        Return their number.
+        """Forget every run whose scans are missing or damaged, so that it is made again;
+        return their number.
         """
         bad = []
         for run_id in self.status:
@@ -338,9 +337,8 @@ class Journal:
 
 
 def _locked(path: Path) -> BinaryIO:
-    """The open lock file of a folder.
-
-    The system releases it when the process ends, however it ends.
+    """The open lock file of a folder; the system releases it when the process ends, however
+    it ends.
     """
     stream = path.open("a+b")
     try:

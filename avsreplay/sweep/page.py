@@ -256,9 +256,8 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
 
 
 def _roc(detector: Detector) -> Markup:
-    """Detected against false alarms.
-
-    The axis of false alarms is logarithmic, since what matters is below 1 %.
+    """Detected against false alarms; the axis of false alarms is logarithmic, since what
+    matters is below 1 %.
     """
     curves = [
         {"name": name, "colour": colour, "dash": dash, "points": _points(curve)}

@@ -41,9 +41,8 @@ class Quantiles:
 
 
 def quantiles(values: Sequence[float]) -> Quantiles | None:
-    """Quantiles by linear interpolation, the interval of the median by order statistics.
-
-    None without a value.
+    """Quantiles by linear interpolation, the interval of the median by order statistics; None
+    without a value.
     """
     if not len(values):
         return None
@@ -168,9 +167,8 @@ class ScoreHistogram:
         return int(other), int(harmful)
 
     def roc(self) -> Roc | None:
-        """The curve over the thresholds at which it changes.
-
-        None without harmful or without other scans.
+        """The curve over the thresholds at which it changes; None without harmful or without
+        other scans.
         """
         other, harmful = self.totals
         if not other or not harmful:

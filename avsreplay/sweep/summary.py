@@ -1,6 +1,5 @@
-"""The summary of a campaign.
-
-One entry per combination, the fault tests over all scans, and the worst runs.
+"""The summary of a campaign: one entry per combination, the fault tests over all scans, and
+the worst runs.
 """
 
 from __future__ import annotations
@@ -90,9 +89,8 @@ class Detector:
 
 @dataclass(frozen=True, slots=True)
 class WorstRun:
-    """A run to look at.
-
-    Its id, combination, repeat, seed, status, and the reason why it is listed.
+    """A run to look at: its id, combination, repeat, seed, status, and the reason why it is
+    listed.
     """
 
     id: str
@@ -105,9 +103,8 @@ class WorstRun:
 
 @dataclass(frozen=True, slots=True)
 class SweepSummary:
-    """A campaign.
-
-    Planned and finished runs, number of runs by status, combinations, fault tests, worst runs.
+    """A campaign: planned and finished runs, number of runs by status, combinations, fault
+    tests, worst runs.
     """
 
     name: str
@@ -248,9 +245,8 @@ class DetectorFold:
 
 
 def _score(name: str, value: float | None) -> float | None:
-    """The score of a test, larger for a worse scan.
-
-    The share of inliers is replaced by that of outliers.
+    """The score of a test, larger for a worse scan: the share of inliers is replaced by that
+    of outliers.
     """
     return 1.0 - value if value is not None and name == "outlier_ratio" else value
 

@@ -215,9 +215,8 @@ def probe(rng: np.random.Generator) -> list[Mesh]:
 
 
 def guitar(rng: np.random.Generator) -> list[Mesh]:
-    """An electric guitar.
-
-    A flat body with a horn, neck, head, strings, frets, pegs, pickups and knobs.
+    """An electric guitar: a flat body with a horn, neck, head, strings, frets, pegs, pickups
+    and knobs.
     """
     t, tilt = rng.uniform(0.035, 0.05), rng.uniform(15, 35)
     parts = [cylinder(rng.uniform(0.16, 0.19), t, sections=48), at(box((0.22, 0.2, t)), 0.11, 0, 0)]

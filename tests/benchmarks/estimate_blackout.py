@@ -28,9 +28,8 @@ EARLY = (10.0, 12.0), (15.0, 12.0), (20.0, 12.0), (20.0, 30.0)  # time with scan
 
 
 def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]]:
-    """Is it converged when the light goes out; per length.
-
-    Errors [m, deg], 1 sigma of both, chi-square of the pose.
+    """Is it converged when the light goes out; per length: errors [m, deg], 1 sigma of both,
+    chi-square of the pose.
     """
     world = tumbling.draw(seed, seconds=SEEN_S + LENGTHS[-1], hz=5.0)
     seen = int(np.searchsorted(world.times, SEEN_S, side="right"))
@@ -61,9 +60,8 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
 
 
 def early(seed: int, seen_s: float, gap_s: float) -> tuple[float, float]:
-    """NEES per degree of freedom at the end of a gap.
-
-    Of a propagation about the mean alone, and of the estimator.
+    """NEES per degree of freedom at the end of a gap: of a propagation about the mean alone,
+    and of the estimator.
     """
     world = tumbling.draw(seed, seconds=seen_s + gap_s, hz=2.0, sigma_max=0.85)
     seen = int(np.searchsorted(world.times, seen_s, side="right"))

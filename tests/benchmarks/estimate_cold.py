@@ -31,9 +31,8 @@ MARKS = (20.0, 40.0, 70.0, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One seed.
-
-    NEES at the marks, claims there by criterion, errors at the end, the mode, seconds spent.
+    """One seed: NEES at the marks, claims there by criterion, errors at the end, the mode,
+    seconds spent.
     """
 
     nees: tuple[float, ...]

@@ -59,9 +59,8 @@ attitude_std_deg = 0.5
 
 
 def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int, str]:
-    """Registration's errors and NEES (n, 3) [m, deg, 1] of healthy scans after five.
-
-    How many, of all; duration.
+    """Registration's errors and NEES (n, 3) [m, deg, 1] of healthy scans after five; how
+    many, of all; duration.
     """
     axis = np.array([0.60, 0.64, -0.48])
     x, y, z = axis / np.linalg.norm(axis) * rate

@@ -45,9 +45,8 @@ def tables(summary: dict[str, Any]) -> str:
 
 
 def table(cells: list[tuple[str, dict[str, Any]]]) -> str:
-    """One setting.
-
-    Its kinds of fault (false alarms first), each at the strengths in the campaign's order.
+    """One setting: its kinds of fault (false alarms first), each at the strengths in the
+    campaign's order.
     """
     names = {name for _, cell in cells for name in cell["kinds"]}
     rows = [HEADS, ("---",) * len(HEADS)]

@@ -93,9 +93,8 @@ def nees(x: Array, P: Array, v: Array) -> float:
 
 
 def in_use(x: Array, P: Array, w: Array) -> int:
-    """Index of the density whose velocity has the expected NEES 1 under the posterior w.
-
-    At most the rms density.
+    """Index of the density whose velocity has the expected NEES 1 under the posterior w; at
+    most the rms density.
     """
     v, C, most = x[:, 3:6], P[:, 3:6, 3:6], float(w @ DENSITIES**2) ** 0.5
     for k, (mean, own) in enumerate(zip(v, C, strict=True)):

@@ -92,9 +92,8 @@ def scenario(surface: Surface, noise: float, rays: int, seed: int, scans: int) -
 
 
 def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, Array]:
-    """(n, 6) whitened errors along one tumble, NaN where the view is degenerate.
-
-    (n,) inliers (rms / extent)^2.
+    """(n, 6) whitened errors along one tumble, NaN where the view is degenerate; (n,) inliers
+    (rms / extent)^2.
     """
     out, edge = [], []
     for scan in true_scans(simulate(scenario_of(toml_document.parse(text, "noise")), surface)):
@@ -108,9 +107,8 @@ def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, 
 
 
 def _root(C: Array) -> Array:
-    """Symmetric square root.
-
-    The same axes from scan to scan, which a Cholesky factor's are too but less evenly.
+    """Symmetric square root: the same axes from scan to scan, which a Cholesky factor's are
+    too but less evenly.
     """
     values, vectors = np.linalg.eigh(C)
     return (vectors * np.sqrt(values)) @ vectors.T

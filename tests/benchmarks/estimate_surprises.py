@@ -135,9 +135,8 @@ CASES = (
 
 @dataclass(slots=True)
 class Result:
-    """One body: per scan time, gamma, reason, converged, error and claimed sigma.
-
-    Manoeuvres at the end.
+    """One body: per scan time, gamma, reason, converged, error and claimed sigma; manoeuvres
+    at the end.
     """
 
     t: list[float] = field(default_factory=list)
@@ -426,9 +425,8 @@ def _scans_to_report(r: Result, first: int) -> int:
 
 
 def _drifts(results: list[Result]) -> str:
-    """Bodies with a drift at the end.
-
-    Its torque [rad/s2] with 1 sigma and its onset [s], medians.
+    """Bodies with a drift at the end; its torque [rad/s2] with 1 sigma and its onset [s],
+    medians.
     """
     found = [r.track.drift for r in results if r.track and r.track.drift]
     if not found:
@@ -446,9 +444,8 @@ def _middle(values: list[int]) -> str:
 
 
 def size_error(r: Result, event: Manoeuvre) -> float:
-    """Root of NEES of the size, of the rate in {C}.
-
-    The principal axes of the estimate may have another order.
+    """Root of NEES of the size, of the rate in {C}: the principal axes of the estimate may
+    have another order.
     """
     to_c = geometry.matrix(r.axes[event.detected_ns]).T
     whole = np.kron(np.diag([1.0, 0.0]), to_c) + np.diag([0.0] * 3 + [1.0] * 3)
@@ -457,9 +454,8 @@ def size_error(r: Result, event: Manoeuvre) -> float:
 
 
 def _sizes(results: list[Result], found: list[tuple]) -> str:
-    """Of the reported change nearest to the true one.
-
-    Size and time against the truth in sigma, and the time error.
+    """Of the reported change nearest to the true one: size and time against the truth in
+    sigma, and the time error.
     """
     off = []
     for r, events in zip(results, found, strict=True):

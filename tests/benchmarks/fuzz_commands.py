@@ -427,9 +427,8 @@ def line_changed(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged(data: bytes, name: str, rng: np.random.Generator) -> bytes:
-    """One mutated file.
-
-    Half of the time a valid one with other values, as far as that is possible.
+    """One mutated file: half of the time a valid one with other values, as far as that is
+    possible.
     """
     text = name.endswith(
         (".toml", ".jsonl", ".json", ".tum", ".kitti", ".csv", ".txt", ".obj", ".off", ".ascii.stl")
@@ -449,9 +448,8 @@ def damaged(data: bytes, name: str, rng: np.random.Generator) -> bytes:
 
 
 def prepare(seed: str, seeds: Path, place: Path, rng: np.random.Generator) -> Path:
-    """Copy a seed to ``place`` and damage it, or one of its files.
-
-    The manifest of a result is renewed mostly.
+    """Copy a seed to ``place`` and damage it, or one of its files; the manifest of a result
+    is renewed mostly.
     """
     path = place / f"in-{Path(seed).name}"
     if (seeds / seed).is_file():

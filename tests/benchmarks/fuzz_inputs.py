@@ -1,6 +1,5 @@
-"""Seeds and mutations of the fuzz campaigns.
-
-Input i of a campaign depends only on (campaign, i).
+"""Seeds and mutations of the fuzz campaigns: input i of a campaign depends only on (campaign,
+i).
 """
 
 from __future__ import annotations
@@ -217,9 +216,8 @@ def _poses() -> dict[str, bytes]:
 
 
 def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
-    """One to eight mutations.
-
-    An uncompressed MCAP's chunks are given checksums that hold again half of the time.
+    """One to eight mutations; an uncompressed MCAP's chunks are given checksums that hold
+    again half of the time.
     """
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 9))):
@@ -231,9 +229,8 @@ def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
 
 
 def in_place(data: bytes, rng: np.random.Generator) -> bytes:
-    """One to three changes that keep the length.
-
-    The checksums of an uncompressed MCAP hold again.
+    """One to three changes that keep the length; the checksums of an uncompressed MCAP hold
+    again.
     """
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 4))):

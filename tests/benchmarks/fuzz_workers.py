@@ -1,6 +1,5 @@
-"""The processes of the campaigns.
-
-Workers of fuzz_logs.py and fuzz_commands.py, commands of outputs.py.
+"""The processes of the campaigns: workers of fuzz_logs.py and fuzz_commands.py, commands of
+outputs.py.
 """
 
 from __future__ import annotations
@@ -175,9 +174,8 @@ class Done:
 
 
 class Command:
-    """A command in a fork of this process, which has imported the package.
-
-    It starts in milliseconds.
+    """A command in a fork of this process, which has imported the package: it starts in
+    milliseconds.
     """
 
     def __init__(
@@ -231,9 +229,8 @@ class Command:
 
 
 def report(campaign: int, count: int, result: Campaign) -> int:
-    """Print the result of a campaign as one JSON document.
-
-    Return the exit code, 1 on any finding.
+    """Print the result of a campaign as one JSON document; return the exit code, 1 on any
+    finding.
     """
     tally, findings, peak = result
     spent = sum(

@@ -135,9 +135,8 @@ def cell(
 
 
 def main() -> int:
-    """Print the matrix.
-
-    Exit 1 where an intact scan is not recovered, one is wrong, or a loss is not told.
+    """Print the matrix; exit 1 where an intact scan is not recovered, one is wrong, or a loss
+    is not told.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)

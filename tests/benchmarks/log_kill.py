@@ -80,9 +80,8 @@ def _read(path: Path) -> dict[str, object]:
 
 
 def main() -> int:
-    """Run the campaign and print one JSON document.
-
-    Exit 1 where a recording lost more than its open chunk.
+    """Run the campaign and print one JSON document; exit 1 where a recording lost more than
+    its open chunk.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)

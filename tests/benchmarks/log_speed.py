@@ -26,9 +26,8 @@ SECOND = 1_000_000_000
 
 
 def scan(i: int) -> Scan:
-    """A scan as a sensor gives it.
-
-    A surface with noise, so that it does not compress to nothing.
+    """A scan as a sensor gives it: a surface with noise, so that it does not compress to
+    nothing.
     """
     rng = np.random.Generator(np.random.PCG64(i % 16))
     points = (rng.normal(size=(10_000, 3)) * 2.0).astype(np.float32)

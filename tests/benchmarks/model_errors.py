@@ -96,9 +96,8 @@ def model_and_target(
 def measured(
     case: str, ranges: np.ndarray, rows: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Ranges (n,) with the errors of a sensor, NaN for points that are lost; ``rows``.
-
-    Numbers of the rays.
+    """Ranges (n,) with the errors of a sensor, NaN for points that are lost; ``rows``:
+    numbers of the rays.
     """
     noise = 0.002 * rng.normal(size=len(ranges))
     if case == "mixed":

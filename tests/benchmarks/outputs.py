@@ -236,9 +236,8 @@ def output_of(case: tuple[str, str], place: Path) -> Path:
 
 
 def finished(line: list[str], place: Path, file_bytes: int | None = None) -> Done:
-    """Run a command to its end.
-
-    With ``file_bytes`` no file may become larger, as on a full disk.
+    """Run a command to its end; with ``file_bytes`` no file may become larger, as on a full
+    disk.
     """
     return Command(line, place, file_bytes).wait()
 
@@ -257,9 +256,8 @@ def contents(path: Path) -> dict[str, bytes]:
 
 
 def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
-    """Write an output where no file may become larger than it, in steps.
-
-    The old output must stay as it is.
+    """Write an output where no file may become larger than it, in steps; the old output must
+    stay as it is.
     """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
@@ -282,9 +280,8 @@ def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
 
 
 def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
-    """Two processes write the same output at the same time.
-
-    It must be complete, and nothing else may be left.
+    """Two processes write the same output at the same time; it must be complete, and nothing
+    else may be left.
     """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)

@@ -44,9 +44,8 @@ TOLERANCE = Tolerance(position_m=0.02, speed_mps=0.01, angle_deg=2.0)
 
 
 def bodies(rng):
-    """A body of random principal moments, tumbling at 0.05-0.15 rad/s some 5 m away.
-
-    State by time.
+    """A body of random principal moments, tumbling at 0.05-0.15 rad/s some 5 m away: state by
+    time.
     """
     J = rng.uniform(1.0, 3.0, 3)
     while np.max(J) > 0.95 * (np.sum(J) - np.max(J)):

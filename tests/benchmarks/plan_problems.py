@@ -1,6 +1,5 @@
-"""Seeded rendezvous problems.
-
-A grasp point on a torque-free tumbling body, integrated by DOP853 and tabulated.
+"""Seeded rendezvous problems: a grasp point on a torque-free tumbling body, integrated by
+DOP853 and tabulated.
 """
 
 from __future__ import annotations
@@ -11,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 
 class Table:
-    """Position, velocity, acceleration on a grid joined by quintic pieces.
-
-    As exact as the integration, and cheap.
+    """Position, velocity, acceleration on a grid joined by quintic pieces: as exact as the
+    integration, and cheap.
     """
 
     def __init__(self, step, position, velocity, acceleration):
@@ -62,9 +60,8 @@ def tumbling(rng, rate_radps, arm_m, distance_m, horizon_s=125.0, step_s=0.05):
 
 
 def problems(count, hard, seed=1):
-    """(goal, a_max) pairs: hard is 0.1-0.35 rad/s, 1.5 m arm, 0.02-0.1 m/s2.
-
-    Ordinary half the rate and 1 m.
+    """(goal, a_max) pairs: hard is 0.1-0.35 rad/s, 1.5 m arm, 0.02-0.1 m/s2; ordinary half
+    the rate and 1 m.
     """
     rng = np.random.default_rng(seed)
     for _ in range(count):

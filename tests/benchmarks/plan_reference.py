@@ -110,9 +110,8 @@ class Transcription:
         self.options = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-5}
 
     def solved(self, t_end, positions, thrust=None, margins=0.0):
-        """Reference from an initial path, positions (n + 1, 3) and thrust (n, 3).
-
-        None where IPOPT fails.
+        """Reference from an initial path, positions (n + 1, 3) and thrust (n, 3); None where
+        IPOPT fails.
         """
         times, opti = np.linspace(0.0, t_end, self.n + 1), self.opti
         barrier = {
@@ -155,9 +154,8 @@ def flown(reference, times):
 
 
 def refined(grid, draft, violation):
-    """The draft on the fine grid, with margins at the nodes.
-
-    None where IPOPT fails or the excess remains.
+    """The draft on the fine grid, with margins at the nodes; None where IPOPT fails or the
+    excess remains.
     """
     n, found = grid.n, draft
     margins, thrust = np.zeros(n - 1), np.repeat(draft.u, n // len(draft.u), axis=0)

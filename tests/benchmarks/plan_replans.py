@@ -24,9 +24,8 @@ module = importlib.import_module("avsreplay.plan.constrained")
 
 
 def measured(log: Path, assignments: list[str]) -> tuple[list, float, float, int]:
-    """For each replan (time [s], milliseconds, searched).
-
-    Processor time of guidance and of the run [s]; scans.
+    """For each replan (time [s], milliseconds, searched); processor time of guidance and of
+    the run [s]; scans.
     """
     replans, spent, searched = [], [0.0], [False]
     plan, step, references = Guidance._capture_plan, Guidance.step, module.initial_references

@@ -93,9 +93,8 @@ def read(name: str, folder: Path) -> RobotParams:
 
 
 def placed(robot: RobotParams, problem) -> RobotParams:
-    """The arm with its base beside the target.
-
-    At half a metre more than the sphere that contains the body.
+    """The arm with its base beside the target: at half a metre more than the sphere that
+    contains the body.
     """
     centre = problem.scene.goal(np.zeros(1))[0][0] + Rotation.from_quat(
         problem.scene.attitude(np.zeros(1))[0]

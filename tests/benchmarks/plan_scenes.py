@@ -46,9 +46,8 @@ def box_surface(centre, half):
 
 
 def problem(rng, rate=(0.02, 0.1)):
-    """Return one problem.
-
-    Box of 1.2 to 3 m, fixture in the middle of the +x face, robot at rest 3 to 8 m away.
+    """Return one problem: box of 1.2 to 3 m, fixture in the middle of the +x face, robot at
+    rest 3 to 8 m away.
     """
     half = rng.uniform(0.6, 1.5, 3)
     J = np.array(

@@ -78,9 +78,8 @@ HEADS = (
 
 
 def spacecraft(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A body with two panels, a dish and a boom.
-
-    Parts overlap, so that the mesh has interior faces.
+    """A body with two panels, a dish and a boom; parts overlap, so that the mesh has interior
+    faces.
     """
     x, y, z = rng.uniform([0.9, 0.8, 1.0], [1.4, 1.2, 1.8])
     parts = [trimesh.creation.box((x, y, z))]
@@ -232,9 +231,8 @@ def cast(
 
 @contextmanager
 def recorded(path: Path) -> Iterator[Callable[[float, np.ndarray, np.ndarray, np.ndarray], None]]:
-    """A ROS 2 bag; the function writes a scan and its true pose.
-
-    Time [s], points, rotation and position.
+    """A ROS 2 bag; the function writes a scan and its true pose: time [s], points, rotation
+    and position.
     """
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)

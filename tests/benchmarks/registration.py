@@ -247,9 +247,8 @@ def _median(x: Array) -> str:
 
 
 def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """Six meshes.
-
-    Index, one searched pass, and the whole of Registrar.register against the peers' registration.
+    """Six meshes: index, one searched pass, and the whole of Registrar.register against the
+    peers' registration.
     """
     for mesh in [*real_meshes(surface, args), stage()]:
         one_mesh(mesh, args)
@@ -410,9 +409,8 @@ def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 
 def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
-    """The parts of `register` in tracking.
-
-    The quality of the pose also without the neighbours that `align` kept.
+    """The parts of `register` in tracking; the quality of the pose also without the
+    neighbours that `align` kept.
     """
     for mesh in [*real_meshes(surface, args), stage()]:
         one = Registrar(mesh, RegisterParams(index_cache=False))

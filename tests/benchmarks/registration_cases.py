@@ -1,6 +1,5 @@
-"""Shared parts of the benchmarks of registration.
-
-Scans, meshes, candidates that run in turn, and the peers.
+"""Shared parts of the benchmarks of registration: scans, meshes, candidates that run in turn,
+and the peers.
 """
 
 from __future__ import annotations
@@ -25,9 +24,8 @@ NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 def sample(surface: Surface, n: int, seed: int) -> Surface:
-    """A cloud of n points on the surface, spread evenly over its area.
-
-    Coordinates rounded to single precision.
+    """A cloud of n points on the surface, spread evenly over its area; coordinates rounded to
+    single precision.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     corners = surface.vertices[surface.faces]
@@ -107,9 +105,8 @@ def trimesh_rays(surface: Surface) -> Cast:
 
 
 def off(T_ca: Pose, deg: float, metres: float, seed: int) -> Pose:
-    """T_ca with its error.
-
-    `deg` about the target's middle and `metres` of shift, in random directions.
+    """T_ca with its error: `deg` about the target's middle and `metres` of shift, in random
+    directions.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     a, b = rng.standard_normal(3), rng.standard_normal(3)
@@ -127,9 +124,8 @@ def error(T_ca: Array, truth: Pose) -> tuple[float, float]:
 def determined_error(
     T_ca: Array, truth: Pose, free: Array | None, extent: float
 ) -> tuple[float, float]:
-    """As `error`, without the part along the motions d = [turn.
-
-    Shift] in {C} of ``free`` (6, k), None: none.
+    """As `error`, without the part along the motions d = [turn; shift] in {C} of ``free`` (6,
+    k), None: none.
     """
     d = Pose.from_matrix(T_ca) @ truth.inverse()
     lengths = np.concatenate([2 * np.arcsin(np.clip(d.q[:3], -1.0, 1.0)) * extent, d.t])
@@ -143,9 +139,8 @@ def determined_error(
 
 @dataclass
 class Case:
-    """One candidate.
-
-    What it does, how long each turn took [s], by the clock and by the processor, where it ended.
+    """One candidate: what it does, how long each turn took [s], by the clock and by the
+    processor, where it ended.
     """
 
     run: Callable[[], tuple[Array, int]]

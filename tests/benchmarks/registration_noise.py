@@ -123,9 +123,8 @@ def of_bodies(args: argparse.Namespace) -> None:
 
 
 def _claims(found: object, truth: geometry.Pose) -> tuple[float, float, float]:
-    """Normalised error squared over 6, claimed deviation and error of the attitude [deg]; NaN.
-
-    Not accepted.
+    """Normalised error squared over 6, claimed deviation and error of the attitude [deg];
+    NaN: not accepted.
     """
     if found.status is not AlignStatus.ALIGNED or found.covariance is None:
         return np.nan, np.nan, np.nan

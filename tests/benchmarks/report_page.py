@@ -78,9 +78,8 @@ def clouds(rows: list[Row], poses: list[tuple[int, Pose]], surface: Surface) -> 
 
 
 def opened(path: Path, times: int) -> tuple[float, float] | None:
-    """Medians [ms] until the page answers and from a slider move to its frame.
-
-    None without a browser.
+    """Medians [ms] until the page answers and from a slider move to its frame; None without a
+    browser.
     """
     if not (shutil.which("chromium") and shutil.which("chromedriver")):
         return None

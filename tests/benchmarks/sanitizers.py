@@ -43,9 +43,8 @@ ENDS = np.array([0, 1, 2, -1, 7, 2**20, 2**31 - 1, -(2**31)], dtype=np.int64)
 
 
 def build(folder: Path) -> dict[str, str]:
-    """Build the extensions in a copy of the sources.
-
-    The environment for processes that load them.
+    """Build the extensions in a copy of the sources; the environment for processes that load
+    them.
     """
     for name in ("avsreplay", "tests", "fixtures"):
         shutil.copytree(

@@ -90,9 +90,8 @@ class View:
 
 @dataclass(frozen=True)
 class Case:
-    """What is registered: points, the guess (None: global search), and the true pose (None.
-
-    Nothing is right).
+    """What is registered: points, the guess (None: global search), and the true pose (None:
+    nothing is right).
     """
 
     points: Array
@@ -130,9 +129,8 @@ def _surface(shape: trimesh.Trimesh, name: str) -> Surface:
 
 
 def cast(surfaces: list[tuple[Surface, Pose]], directions: Array) -> tuple[Array, Array]:
-    """Range (n,) of the first hit (inf.
-
-    None) and which surface was hit (n,), from the origin of {A}.
+    """Range (n,) of the first hit (inf: none) and which surface was hit (n,), from the origin
+    of {A}.
     """
     best, which = np.full(len(directions), np.inf), np.full(len(directions), -1)
     for k, (surface, T_ac) in enumerate(surfaces):
@@ -309,9 +307,8 @@ def _noisy(noise: float) -> Maker:
 
 
 def _close(distance: float, degrees: float) -> Maker:
-    """A camera next to the target, with a quarter of the noise.
-
-    The smallest error is that of a prediction.
+    """A camera next to the target, with a quarter of the noise; the smallest error is that of
+    a prediction.
     """
 
     def make(surface: Surface, count: int, seed: int) -> Case:

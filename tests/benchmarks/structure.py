@@ -182,9 +182,8 @@ def names(root: Path) -> dict:
 
 
 def docstrings(root: Path) -> dict:
-    """Docstrings of public functions and methods.
-
-    Present, with Args, with Raises where they raise.
+    """Docstrings of public functions and methods: present, with Args, with Raises where they
+    raise.
     """
     rows = list(documentation(root))
     takes, exported = (
@@ -334,9 +333,8 @@ def scan_path(root: Path) -> dict:
 
 
 def calls_of_next(rows, package: str):
-    """Files, functions, calls and depth of the package while the next row is made.
-
-    None at the end.
+    """Files, functions, calls and depth of the package while the next row is made; None at
+    the end.
     """
     files: set[str] = set()
     functions: set[tuple[str, int]] = set()

@@ -116,9 +116,8 @@ def pushed(seed: int, torque: float, *, seconds: float, hz: float) -> World:
 
 
 def near(x: State, seed: int, wide: float = 1.0) -> Belief:
-    """A belief drawn about a state, ``wide`` times ``NEAR_1S`` wide.
-
-    Attitude 0.29 deg, sigma 0.025, mu 0.57 deg.
+    """A belief drawn about a state, ``wide`` times ``NEAR_1S`` wide: attitude 0.29 deg, sigma
+    0.025, mu 0.57 deg.
     """
     drawn = wide * NEAR_1S * np.random.Generator(np.random.PCG64([seed, 8])).normal(size=20)
     return Belief(0, boxplus(x, drawn), np.diag((wide * NEAR_1S) ** 2))
@@ -127,9 +126,8 @@ def near(x: State, seed: int, wide: float = 1.0) -> Belief:
 def alignment(
     truth: Pose, rng: np.random.Generator, pos_m: float, rot_rad: float, reported: float = 1.0
 ) -> Alignment:
-    """A pose with isotropic noise (per axis, in {C}).
-
-    ``reported`` scales the covariance it claims.
+    """A pose with isotropic noise (per axis, in {C}); ``reported`` scales the covariance it
+    claims.
     """
     theta, v = rng.normal(size=3) * rot_rad, rng.normal(size=3) * pos_m
     C = np.diag(np.repeat([rot_rad**2, pos_m**2], 3)) * reported

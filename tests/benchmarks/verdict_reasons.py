@@ -175,9 +175,8 @@ def expected(run: Run) -> bool:
 
 
 def changed(run: Run, change: Callable[[Pose, float], Pose]) -> list[Row]:
-    """Rows whose errors refer to changed true poses.
-
-    ``change`` has the true pose and the share of the time.
+    """Rows whose errors refer to changed true poses; ``change`` has the true pose and the
+    share of the time.
     """
     out, count = [], len(run.rows)
     for k, (row, pose) in enumerate(zip(run.rows, run.truth, strict=True)):
@@ -206,9 +205,8 @@ def another_frame(run: Run, seed: int, size: tuple[float, float]) -> list[Row]:
 
 
 def growing(run: Run, seed: int, size: tuple[float, float]) -> list[Row]:
-    """The rows with an error in proportion to the time.
-
-    ``size`` is the median of its last third.
+    """The rows with an error in proportion to the time; ``size`` is the median of its last
+    third.
     """
     scale = 6.0 / 5.0  # the median of the last third of a line from 0 to 1 is 5/6
 

@@ -26,9 +26,8 @@ def fold(
     rng: np.random.Generator,
     noise: tuple[float, float],
 ) -> Iterator[tuple[float, State, Track, list[ConvergenceTrack]]]:
-    """Every scan healthy, with white noise [m, rad]: instant, truth, track, each test's word.
-
-    The first one decides.
+    """Every scan healthy, with white noise [m, rad]: instant, truth, track, each test's word;
+    the first one decides.
     """
     watch, words = Consistency(ConsistencyParams()), [test.initial() for test in tests]
     seen_so_far = watch.initial()

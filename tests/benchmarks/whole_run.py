@@ -37,9 +37,8 @@ from avsreplay.run import Job, Run
 
 
 def timed(log: Path, n_scans: int | None, prefetch: int) -> tuple[int, float, float, float, float]:
-    """Scans; processor and elapsed time of the run [s].
-
-    Processor time of its registrations and of ``step`` [s].
+    """Scans; processor and elapsed time of the run [s]; processor time of its registrations
+    and of ``step`` [s].
     """
     spent, originals = [0.0], {name: getattr(Registrar, name) for name in ("register", "acquire")}
     depth, chain, step = [0], [0.0], pipeline.step

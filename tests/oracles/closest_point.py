@@ -112,9 +112,8 @@ class OracleIndex:
         )
 
     def _near(self, p: Array, camera_c: Array | None) -> tuple[Array, Array, NDArray[np.int32]]:
-        """Closest point, squared distance and index into the primitives.
-
-        -1 at the reach or farther.
+        """Closest point, squared distance and index into the primitives; -1 at the reach or
+        farther.
         """
         if camera_c is None or self._corners is None:
             foot, d2, i = self._search(p)
@@ -224,9 +223,8 @@ def cloud_normals(points: Array, neighbours: int = NORMAL_NEIGHBOURS) -> Array:
 
 
 def _horn_step(p: Array, foot: Array) -> tuple[Array, float, float]:
-    """Horn's closed form, section 6: the best D with D p = foot.
-
-    Its angle [rad] and the centroid's move [m].
+    """Horn's closed form, section 6: the best D with D p = foot; its angle [rad] and the
+    centroid's move [m].
     """
     pc, fc = p.mean(axis=0), foot.mean(axis=0)
     N = (p - pc).T @ (foot - fc) / len(p)

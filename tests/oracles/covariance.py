@@ -36,9 +36,8 @@ def _error_of_one(A: Array) -> float:
 
 
 def sandwich_covariance(normals: Array, gradients: Array) -> tuple[Array, float]:
-    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise.
-
-    Its degrees of freedom.
+    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise;
+    its degrees of freedom.
     """
     values, vectors = np.linalg.eigh(normals.sum(axis=0))
     kept = values > len(values) * np.finfo(float).eps * values[-1]
@@ -179,9 +178,8 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
 
 
 def _pseudo_inverse(N: Array) -> Array:
-    """Pseudo-inverse of a symmetric positive semidefinite matrix.
-
-    Np.linalg.pinv takes eight times as long.
+    """Pseudo-inverse of a symmetric positive semidefinite matrix; np.linalg.pinv takes eight
+    times as long.
     """
     values, vectors = np.linalg.eigh(N)
     kept = values > len(N) * np.finfo(float).eps * values[-1]
@@ -207,9 +205,8 @@ def _strains(found: Evidence, errors: Systematic) -> Array:
 
 
 def _coupling(found: Evidence, errors: Systematic) -> Array:
-    """A (m, 6, 7).
-
-    Sums over each patch of J times the residual per amplitude of strain and offset.
+    """A (m, 6, 7): sums over each patch of J times the residual per amplitude of strain and
+    offset.
     """
     return np.concatenate(
         [found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2
@@ -217,9 +214,8 @@ def _coupling(found: Evidence, errors: Systematic) -> Array:
 
 
 def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
-    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k).
-
-    Their basis (7, k-6).
+    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k);
+    their basis (7, k-6).
     """
     T, A = _strains(found, errors), _coupling(found, errors)
     m, turned = len(T), T.transpose(0, 2, 1)
@@ -289,9 +285,8 @@ def _block_variance(
 
 
 def _common_variance(values: Array, P: Array) -> float:
-    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments.
-
-    0 if not significant.
+    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments; 0 if
+    not significant.
     """
     if not len(values):
         return 0.0

@@ -19,9 +19,8 @@ from avsreplay.register.visibility import Visibility
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Inliers at a pose.
-
-    J (k, 6) rows [p x n, n], e (k,) n . (p - closest point) [m], patch (k,), points p (k, 3).
+    """Inliers at a pose: J (k, 6) rows [p x n, n], e (k,) n . (p - closest point) [m], patch
+    (k,), points p (k, 3).
     """
 
     J: Array
@@ -54,9 +53,8 @@ def residuals(
 def summed(
     J: Array, e: Array, patch: NDArray[np.intp], noise_m: float = 0.3, p: Array | None = None
 ) -> Evidence:
-    """The evidence of given residuals; patch (k,) numbers from 0.
-
-    Points p (k, 3), all at the origin if None.
+    """The evidence of given residuals; patch (k,) numbers from 0; points p (k, 3), all at the
+    origin if None.
     """
     counts = np.bincount(patch)
     normals, gradients = np.zeros((len(counts), 6, 6)), np.zeros((len(counts), 6))

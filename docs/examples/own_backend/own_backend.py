@@ -1,6 +1,5 @@
-"""A registration back end of one's own.
-
-Point-to-point ICP with SciPy's solution of the rotation.
+"""A registration back end of one's own: point-to-point ICP with SciPy's solution of the
+rotation.
 """
 
 from __future__ import annotations
