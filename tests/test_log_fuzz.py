@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.binary_files import BadFile
+from avsreplay.read_budget import BadFile
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.ply import read_ply

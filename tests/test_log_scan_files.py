@@ -15,7 +15,7 @@ from fuzz_inputs import seeds
 from true_scans import true_scans
 
 from avsreplay import geometry
-from avsreplay.binary_files import BadFile
+from avsreplay.read_budget import BadFile
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source, parse_surface, read_surface

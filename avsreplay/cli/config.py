@@ -296,14 +296,11 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
         )
 
 
-def _own_table(log: Path) -> dict[str, Any]:
-    import tomllib
-
+def _own_table(log: Path) -> Mapping[str, Any]:
     from avsreplay.log import SourceOptions, open_source
 
     with open_source(log, SourceOptions()) as source:
-        table: dict[str, Any] = tomllib.loads(source.header.scenario).get("run", {})
-    return table
+        return toml_document.own_settings(source.header.scenario, str(log))
 
 
 def reference_page() -> str:

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
-from avsreplay.binary_files import BadFile, read_limited
+from avsreplay.binary_files import read_limited
+from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.binary_files import BadFile
+from avsreplay.read_budget import BadFile
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
