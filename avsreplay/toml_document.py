@@ -28,7 +28,7 @@ MAX_BYTES = 1 << 20
 _SIMILAR = 0.7  # similarity from which a known key is suggested in place of an unknown one
 _LONGEST = 200  # characters of an unknown key that are compared with the known ones
 _BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
-# Three and more keys joined by dots: each part is tried at one place only, so that the time is linear.
+# Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")

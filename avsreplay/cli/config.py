@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -299,6 +299,7 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
 
 
 def _own_table(log: Path) -> Mapping[str, Any]:
+    from avsreplay import toml_document
     from avsreplay.log import SourceOptions, open_source
 
     with open_source(log, SourceOptions()) as source:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.errors import value_class
+from avsreplay.read_budget import BadFile, ReadBudget
 
 _TYPES = {
     "char": "i1",

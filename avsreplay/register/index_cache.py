@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from avsreplay.binary_files import parse_npy, read_members
 from avsreplay.geometry import Array
+from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Surface
-from avsreplay.read_budget import ReadBudget
 
 MAGIC = b"AVSINDEX"
 HEADER = 64  # the arrays of the payload are aligned to this in the file and in memory
