@@ -178,8 +178,8 @@ def wound(surface: Surface) -> Surface:
     """Return a surface with its closed parts wound outwards, as a reader of models winds them.
 
     Args:
-        surface: from a reader (``Surface.reversed`` is known), or made otherwise. One of a reader is
-            wound again only if its faces enclose a negative volume.
+        surface: from a reader (``Surface.reversed`` is known), or made otherwise. One of a reader
+            is wound again only if its faces enclose a negative volume.
     """
     examined = surface.reversed is not None
     if examined and mesh.signed_volume(surface.vertices, surface.faces) >= 0.0:
