@@ -429,7 +429,9 @@ def _deskewed(
 
 
 Forecaster = Callable[[Array], Forecast]
-"""Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point without measurements."""
+"""Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point
+without measurements.
+"""
 
 
 def target_scene(

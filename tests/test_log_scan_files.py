@@ -338,7 +338,7 @@ def test_quads_and_mixed_polygons_become_triangles() -> None:
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
 
 
-# --- the real data ---------------------------------------------------------------------------------------------------
+# --- the real data ---
 
 
 @pytest.mark.parametrize(

@@ -232,13 +232,15 @@ INTRODUCTION = """# Settings
 
 This page is generated from the declarations in the code by `avsreplay config --markdown`.
 
-A setting without a default applies as stated in its description. The target's extent is the diagonal of the bounding
-box of its model, so that the defaults suit a target of any size. A value outside its range, an unknown key or a wrong
-type is an error that names the file and the line.
+A setting without a default applies as stated in its description. The target's extent is the
+diagonal of the bounding box of its model, so that the defaults suit a target of any size. A value
+outside its range, an unknown key or a wrong type is an error that names the file and the line.
 
-Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an environment variable
-(`AVSREPLAY_RUN_POLICY`, `AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
-`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config` reads.
+Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an
+environment variable (`AVSREPLAY_RUN_POLICY`,
+`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
+`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config`
+reads.
 """
 
 SECTIONS = (
