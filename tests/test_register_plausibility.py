@@ -4,7 +4,6 @@ scan may cost.
 
 from __future__ import annotations
 
-
 import numpy as np
 import pytest
 import trimesh
