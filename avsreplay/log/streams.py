@@ -14,7 +14,6 @@ from queue import Empty, Full, Queue
 from typing import TypeVar
 
 from avsreplay import geometry
-from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
@@ -26,6 +25,7 @@ from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer
 from avsreplay.log.raw_cloud import RawCloud, of_points
 from avsreplay.log.scan_files import read_points
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
+from avsreplay.read_budget import BadFile
 from avsreplay.records import LogHeader
 
 T = TypeVar("T")
