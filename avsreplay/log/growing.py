@@ -102,8 +102,8 @@ class GrowingLog:
         self._used.append((replace(scan, points=_NO_POINTS, times_s=None, places=None), truth))
 
     def outdated(self) -> bool:
-        """Return whether the finished log gives another meaning, time, note or truth for a scan than was
-        used.
+        """Return whether the finished log gives another meaning, time, note or truth for a scan
+        than was used.
         """
         if len(self._used) != len(self.source):
             return True
