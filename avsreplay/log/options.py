@@ -161,8 +161,8 @@ class SourceOptions(Settings):
     point_time: str | None = setting(
         None,
         "Times of the points as FIELD:UNIT:ORIGIN: a unit of s, ms, us or ns, and an origin of"
-        " stamp, clock (that of the stamps), first or last (point, at the stamp), or the offset of another"
-        " clock in seconds; 'none' ignores them.",
+        " stamp, clock (that of the stamps), first or last (point, at the stamp), or the offset of"
+        " another clock in seconds; 'none' ignores them.",
         unset="inferred from the values",
     )
     no_return: str | None = setting(
