@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
+from avsreplay.register.backend import Backend
 from avsreplay.register.contract import example_pose, plate_scan, view
 from avsreplay.register.covariance import systematic_errors, without_dominant_patches
 from avsreplay.register.degenerate import Directions
-from avsreplay.register.backend import Backend
 from avsreplay.register.params import Camera, RegisterParams
 from avsreplay.register.peers import best_motion, horn_matrix
 from avsreplay.register.quality import evidence, grade
