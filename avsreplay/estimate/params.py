@@ -57,10 +57,9 @@ class EstimatorParams(Settings):
 
     method: str = setting(
         OWN,
-        "Estimator: the program's own (own), the filter as printed in the paper (paper), a plain"
-        " extended Kalman filter (ekf), or a plug-in by its entry-point name ('avsreplay estimators'"
-        " lists them). A plug-in uses the settings of the start and of R0 and has its own for the"
-        " rest.",
+        "Estimator: the program's own (own), the filter as printed in the paper (paper), or a"
+        " plug-in by its entry-point name ('avsreplay estimators' lists them), for example a plain"
+        " extended Kalman filter (ekf). A plug-in uses the settings of the start and of R0.",
     )
     torque_noise_radps15: float | None = setting(
         None,
@@ -288,10 +287,12 @@ class EstimatorParams(Settings):
         return replace(self, start_rate_1s_radps=rate, start_vel_1s_mps=speed)
 
     def as_printed(self) -> EstimatorParams:
-        """Return the settings with start, noise and gain as printed in the paper."""
+        """Return the settings with start, noise and gain as printed in the paper; a near start that
+        is requested is kept.
+        """
         return replace(
             self,
-            start=Start.PAPER,
+            start=self.start if self.start is Start.NEAR else Start.PAPER,
             constraint=Constraint.GAIN,
             noise=NoiseSource.R0,
             adapt=Adaptation.MATRIX,

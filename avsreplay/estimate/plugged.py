@@ -1,8 +1,8 @@
 """The stage of the processing chain around an estimator that is a plug-in of five functions.
 
 It has the functions of ``Estimator`` that the chain calls. What a plug-in does not do, such as a
-correction of the measured pose for errors of the model, is left out; what it does not state, such as
-the transition of the Gramian, follows from the motion of a free body along its mean.
+correction of the measured pose for errors of the model, is left out; what it does not state, such
+as the transition of the Gramian, follows from the motion of a free body along its mean.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Estimators as plug-ins: the protocol, and how a name becomes an estimator.
 
-An estimator of another package is a class with five functions, registered in the entry-point group
-``avsreplay.estimators``. The program predicts, converts frames, tests each pose (gamma) and computes
-the observability in the same way for every estimator, so that estimators can be compared.
+An estimator of another package is a class with five functions, registered in the entry-point
+group ``avsreplay.estimators``. The program tests each pose (gamma), computes the observability and
+plans in the same way for every estimator, so that estimators can be compared.
 """
 
 from __future__ import annotations
@@ -74,6 +74,15 @@ class Method(Protocol[State]):
 def names() -> tuple[str, ...]:
     """The names of the installed estimators, sorted."""
     return tuple(sorted({OWN, PRINTED, *(e.name for e in metadata.entry_points(group=GROUP))}))
+
+
+def about(name: str) -> str:
+    """Return one line about an estimator, from the attribute ``about`` of its class."""
+    built_in = {
+        OWN: "batch fit and noise-adaptive constrained filter, with tests of hypotheses",
+        PRINTED: "the noise-adaptive constrained filter as printed in the paper",
+    }
+    return built_in.get(name) or str(getattr(load_method(name), "about", ""))
 
 
 def load_method(name: str) -> Callable[[Context], Method[Any]]:
