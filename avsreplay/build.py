@@ -11,8 +11,8 @@ import numpy as np
 
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
+from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
@@ -63,7 +63,7 @@ def stages(
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
+        estimator=estimator_of(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
             Consistency(config.consistency), Convergence(config.convergence, surface.extent)
