@@ -205,11 +205,23 @@ class NoParameters(Settings):
     """The parameter class of a part without parameters."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """The parameters of parts that were given, each a pair of the name and the parameters."""
+    """The parameters of parts that were given, each a pair of the name and the parameters.
+
+    Tables with the same effect are equal: parameters that are the defaults count as not given.
+    """
 
     given: tuple[tuple[str, Settings], ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tables) and self._changed() == other._changed()
+
+    def __hash__(self) -> int:
+        return hash(self._changed())
+
+    def _changed(self) -> tuple[tuple[str, Settings], ...]:
+        return tuple((name, part) for name, part in self.given if part != type(part)())
 
     def of(self, name: str, kind: type[S]) -> S:
         """Return the parameters of a part; the defaults where none were given.

@@ -255,13 +255,12 @@ class _Builder:
         """The tables of a field that belong to installed parts."""
         parts = typing.cast(Parts, declared_of(field).parts)
         kinds = {name: parts.parameters(name) for name in table if name in parts.names()}
-        return Tables(
-            tuple(
-                (name, self.table(kind, table[name], (*path, name)))
-                for name, kind in sorted(kinds.items())
-                if kind is not None
-            )
-        )
+        given = [
+            (name, self.table(kind, table[name], (*path, name)))
+            for name, kind in sorted(kinds.items())
+            if kind is not None
+        ]
+        return Tables(tuple(given))
 
     def value(self, hint: Any, value: Any, path: _Path) -> Any:
         """A value of the type that a field declares."""
