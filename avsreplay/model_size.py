@@ -145,12 +145,15 @@ def compare_sizes(
         )
         return [Advice("check", "background", text)]
     units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
-    if not units:
-        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
-            ratio > MOST_OF_MODEL
-        )
-        return [Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")]
-    return _unit_advice(units, clouds, surface, options, said)
+    return _unit_advice(units, clouds, surface, options, said) or [_unexplained(said, ratio)]
+
+
+def _unexplained(said: str, ratio: float) -> Advice:
+    """Sizes that no unit explains."""
+    hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
+        ratio > MOST_OF_MODEL
+    )
+    return Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")
 
 
 def _no_points(options: SourceOptions) -> Advice:
@@ -335,6 +338,8 @@ def _unit_advice(
     ones. If no scan fits it, the text says so, because an object of another size fits some unit,
     too.
     """
+    if not units:
+        return []
     few, given = _few(clouds), options.model_unit.metres
     once = RegisterParams(index_cache=False)  # most of the units are wrong
     fits = {each: _fitting(few, Registrar(scaled(surface, each / given), once)) for each in units}
