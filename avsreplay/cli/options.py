@@ -96,6 +96,7 @@ run_source_options = added(
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--scan-duration", "scan_duration_s", type=float),
+    source_setting("--intrinsics", type=str),
     source_setting("--rate", "rate_hz", type=float),
     source_setting("--every-scan", "every", type=int),
     source_setting("--end", "end_s", type=float),

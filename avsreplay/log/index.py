@@ -11,15 +11,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
-from avsreplay.log.cdr import Cursor
+from avsreplay.log.camera import CAMERA_INFO
+from avsreplay.log.cloud_messages import LAYOUTS, message_stamp
+from avsreplay.log.depth_image import IMAGE_TYPES
 from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, decode_cloud
+from avsreplay.log.point_cloud2 import Cloud, decode_layout
 
 MAX_NS = (
     2**31 - 2
 ) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
-CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
+CLOUD_TYPES = tuple(LAYOUTS)
 POSE_NAMES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -29,7 +31,7 @@ POSE_NAMES = (
 """Types that hold one stamped pose."""
 _COMPRESSIONS = ("", "zstd", "lz4", "bz2")
 _KEPT = 2  # decompressed chunks held in memory
-_INDEXED = (*CLOUD_TYPES, *POSE_NAMES)
+_INDEXED = (*CLOUD_TYPES, *POSE_NAMES, *IMAGE_TYPES, CAMERA_INFO)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
 
@@ -40,8 +42,8 @@ def _column() -> array[int]:
 
 @dataclass(slots=True)
 class CloudIndex:
-    """The messages of one cloud or pose topic in file order; one entry for each message in every
-    array.
+    """The messages of one cloud, image or pose topic in file order; each array has one entry for
+    each message.
 
     Attributes:
         log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
@@ -117,7 +119,7 @@ class MessageTable:
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
         if known.type in _INDEXED:
-            clocks = (log_ns, times[1], _stamp(payload, known.encoding))
+            clocks = (log_ns, times[1], message_stamp(known.type, payload, known.encoding))
             self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
         if topic in self._sinks:
             self._sinks[topic](known.type, known.encoding, log_ns, payload)
@@ -133,17 +135,6 @@ class MessageTable:
     def clouds(self, topic: str) -> CloudIndex:
         """Return the index of a cloud topic."""
         return self._clouds.get(topic) or CloudIndex()
-
-
-def _stamp(payload: memoryview, encoding: str) -> int:
-    """Return the header stamp of a message [ns], 0 if the message is too short."""
-    try:
-        cursor = Cursor(payload, encoding)
-        if cursor.ros1:
-            cursor.u32()
-        return cursor.stamp()
-    except BadMessage:
-        return 0
 
 
 class ChunkStore:
@@ -261,6 +252,7 @@ class MessageClouds:
     Attributes:
         kind: the format in words.
         topic: the cloud topic, None if there is none to read.
+        type: message type of the topic.
         log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
             [ns], one per cloud.
     """
@@ -269,7 +261,9 @@ class MessageClouds:
         self.kind, self.topic, self._recording = recording.kind, topic, recording
         index = recording.clouds(topic or "")
         self._places = index.order()
-        self._encoding = next((t.encoding for t in recording.topics() if t.name == topic), "cdr")
+        self.type, self._encoding = next(
+            ((t.type, t.encoding) for t in recording.topics() if t.name == topic), ("", "cdr")
+        )
         self.log_ns = [index.log_ns[i] for i in self._places]
         self.publish_ns = [index.publish_ns[i] for i in self._places]
         self.header_ns = [index.header_ns[i] for i in self._places]
@@ -281,7 +275,7 @@ class MessageClouds:
 
     def load(self, place: int) -> Cloud:
         """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
-        return decode_cloud(*self.payload(place))
+        return decode_layout(LAYOUTS[self.type](*self.payload(place)))
 
     def payload(self, place: int) -> tuple[bytes | memoryview, str]:
         """Return the serialised message and its encoding.

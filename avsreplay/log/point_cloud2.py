@@ -160,7 +160,14 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     Raises:
         BadMessage: the message is malformed; the text states why.
     """
-    layout = read_layout(payload, encoding)
+    return decode_layout(read_layout(payload, encoding))
+
+
+def decode_layout(layout: Layout) -> Cloud:
+    """Return the cloud of a checked layout, as ``decode_cloud``.
+
+    Raises BadMessage if a coordinate is missing.
+    """
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
     points, times, intensities = _points(layout), _times(layout), _intensities(layout)
@@ -206,7 +213,7 @@ def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
         row_step = width * point_step
     layout = Layout(stamp_ns, frame, (height, width), fields, order, point_step, row_step, data)
     if height and width:
-        _check(layout)
+        check_layout(layout)
     return layout
 
 
@@ -223,7 +230,8 @@ def _fields(cursor: Cursor) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _check(layout: Layout) -> None:
+def check_layout(layout: Layout) -> None:
+    """Raise BadMessage if a layout with points contradicts itself or its data."""
     height, width = layout.shape
     if layout.row_step < width * layout.point_step:
         raise BadMessage(

@@ -20,8 +20,10 @@ from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.camera import Camera
+from avsreplay.log.depth_image import read_png, view_of
 from avsreplay.log.header import with_vertices
-from avsreplay.log.index import MessageClouds, Recording, Sink
+from avsreplay.log.index import MessageClouds, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
 from avsreplay.log.point_cloud2 import Cloud, usable
 from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
@@ -39,14 +41,7 @@ EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero
 class PoseMessages(MessageClouds):
     """The measured poses of one topic; same interface as MessageClouds, with poses in place of
     points.
-
-    Attributes:
-        type: message type of the topic.
     """
-
-    def __init__(self, recording: Recording, topic: str | None) -> None:
-        super().__init__(recording, topic)
-        self.type = next((t.type for t in recording.topics() if t.name == topic), "")
 
     def load(self, place: int) -> Cloud:
         """Return the decoded pose. Raises BadMessage if it cannot be decoded or is not valid."""
@@ -106,14 +101,20 @@ class FolderClouds(_Files):
         rate_hz: scans per second, used if ``times_ns`` is not given.
         limit: largest file that is read [bytes].
         times_ns: time of each file [ns].
+        camera: of the files, if they are depth images.
     """
 
     kind = "folder"
 
     def __init__(
-        self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None
+        self,
+        files: list[Path],
+        rate_hz: float,
+        limit: int,
+        times_ns: list[int] | None = None,
+        camera: Camera | None = None,
     ) -> None:
-        self._files, self._limit = files, limit
+        self._files, self._limit, self._camera = files, limit, camera
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
 
@@ -124,6 +125,8 @@ class FolderClouds(_Files):
             size = path.stat().st_size
             if size > self._limit:
                 raise BadFile(f"{size} bytes are over the limit of {self._limit}")
+            if self._camera is not None:
+                return self._depths(path.read_bytes(), self._camera, place)
             points = read_points(path, self._limit)
         except OSError as error:
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None
@@ -132,6 +135,11 @@ class FolderClouds(_Files):
         chosen = usable(points)
         kept = points if chosen is None else points[chosen]
         return Cloud(self.header_ns[place], "", kept, None, len(points) - len(kept))
+
+    def _depths(self, data: bytes, camera: Camera, place: int) -> Cloud:
+        values = read_png(data, self._limit)
+        points = view_of(values, camera).points
+        return Cloud(self.header_ns[place], "", points, None, values.size - len(points))
 
 
 CloudStream = MessageClouds | FolderClouds | PoseFile
