@@ -58,7 +58,7 @@ def test_a_folder_without_scans(cli, tmp_path):
 
 def test_a_log_without_a_cloud_topic(cli, shared_data):
     bag = shared_data / "mcap-rosbag2" / "cdr_test"
-    check_one_line(cli("run", bag), 3, "PointCloud2")
+    check_one_line(cli("run", bag), 3, "cloud topic")
 
 
 def test_no_model(cli, shared_data, tmp_path):
