@@ -21,9 +21,10 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.camera import Camera, distorted, rays
+from avsreplay.log.canonical import coordinates
 from avsreplay.log.cloud_messages import read_foxglove, read_livox, read_point_cloud
-from avsreplay.log.depth_image import read_png, view_of
-from avsreplay.log.point_cloud2 import decode_layout
+from avsreplay.log.depth_image import DepthImage, depth_cloud, read_png
+from avsreplay.log.point_cloud2 import of_layout
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
 LIMIT, SECOND = 1 << 26, 1_000_000_000
@@ -259,7 +260,8 @@ def test_rays_of_any_lens_are_those_that_it_images_at_the_pixels(data):
     lens = data.draw(st.sampled_from(sorted(LENSES)))
     d = tuple(v * data.draw(st.floats(-2.0, 2.0)) for v in LENSES[lens])
     camera = Camera((20.0, 22.0), (7.5, 6.0), None, lens, d)
-    found = rays(camera, 16, 12).reshape(-1, 2)
+    unit = rays(camera, 16, 12)[1]
+    found = unit[:, :2] / unit[:, 2:]
     known = np.isfinite(found[:, 0])
     u, v = np.meshgrid(np.arange(16), np.arange(12))
     pixels = distorted(camera, found[known]) * camera.focal + camera.centre
@@ -269,21 +271,22 @@ def test_rays_of_any_lens_are_those_that_it_images_at_the_pixels(data):
 
 def test_pixels_beyond_the_fold_of_a_lens_give_no_point():
     camera = Camera((10.0, 10.0), (16.0, 12.0), None, "plumb_bob", (-0.6, 0.0, 0.0, 0.0, 0.0))
-    view = view_of(np.full((H, W), 1000, np.uint16), camera)
-    assert 0 < len(view.points) < W * H
-    assert not len(view.lost)
+    raw = depth_cloud(DepthImage(0, "", np.full((H, W), 1000, np.uint16)), camera)
+    seen = np.isfinite(raw.column("x"))
+    assert 0 < np.count_nonzero(seen) < W * H
+    np.testing.assert_array_equal(np.isfinite(raw.rays).all(axis=1), seen)
 
 
 def test_missing_returns_are_the_rays_of_the_empty_pixels():
     values = np.full((H, W), 1500, np.uint16)
     values[5, 7] = values[20, 3] = 0
     camera = Camera((30.0, 31.0), (15.2, 11.7))
-    view = view_of(values, camera)
+    raw = depth_cloud(DepthImage(0, "", values), camera)
     rays_3d = np.array(
         [[(7 - 15.2) / 30, (5 - 11.7) / 31, 1], [(3 - 15.2) / 30, (20 - 11.7) / 31, 1]]
     )
     truth = rays_3d / np.linalg.norm(rays_3d, axis=1)[:, None]
-    np.testing.assert_allclose(view.missing(), truth, atol=1e-7)
+    np.testing.assert_allclose(raw.rays[np.isnan(raw.column("z"))], truth, atol=1e-7)
 
 
 def test_a_rectified_image_uses_the_projection_and_a_raw_one_the_lens(tmp_path):
@@ -556,8 +559,8 @@ def test_a_foxglove_cloud_of_each_encoding_is_read_with_its_pose(tmp_path, encod
     assert scan.frame == "lidar"
     np.testing.assert_allclose(scan.points, MOVED, atol=1e-6)
     np.testing.assert_allclose(scan.times_s, TIMES * 1e-9, rtol=1e-6)
-    unmoved = decode_layout(read_foxglove(foxglove(encoding, (0.0,) * 6 + (1.0,)), encoding))
-    np.testing.assert_array_equal(unmoved.points, POINTS)
+    unmoved = of_layout(read_foxglove(foxglove(encoding, (0.0,) * 6 + (1.0,)), encoding))
+    np.testing.assert_array_equal(coordinates(unmoved), POINTS)
     assert unmoved.stamp_ns == 5 * SECOND + 7
 
 
@@ -574,7 +577,7 @@ def test_a_damaged_foxglove_cloud_is_refused_or_read_but_raises_nothing_else(enc
     cut = data.draw(st.integers(0, len(whole)))
     try:
         layout = read_foxglove(bytes(whole[:cut]), encoding)
-        decode_layout(layout)
+        of_layout(layout)
     except BadMessage:
         return
     assert layout.shape[1] * layout.point_step <= 2 * len(whole)

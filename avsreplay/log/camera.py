@@ -95,7 +95,8 @@ def distorted(camera: Camera, xy: Array) -> Array:
         angle = np.arctan(r)
         a2 = angle * angle
         seen = angle * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
-        return xy * np.divide(seen, r, out=np.ones_like(r), where=r > 0.0)[:, None]
+        shrunk: Array = xy * np.divide(seen, r, out=np.ones_like(r), where=r > 0.0)[:, None]
+        return shrunk
     radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     radial /= 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
     prism = r2 * (k[8] + r2 * k[9]), r2 * (k[10] + r2 * k[11])
@@ -109,8 +110,10 @@ def distorted(camera: Camera, xy: Array) -> Array:
 
 
 @lru_cache(maxsize=4)
-def rays(camera: Camera, width: int, height: int) -> NDArray[np.float64]:
-    """Return the direction of each pixel as (x / z, y / z); NaN where the lens has none.
+def rays(
+    camera: Camera, width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return the direction of each pixel; NaN where the lens has none.
 
     Args:
         camera: the camera.
@@ -118,14 +121,18 @@ def rays(camera: Camera, width: int, height: int) -> NDArray[np.float64]:
         height: of the image [pixel].
 
     Returns:
-        (height, width, 2), read-only.
+        x / z and y / z, (height, width, 2), and unit vectors row by row, (height * width, 3); both
+        read-only.
     """
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     seen = (np.stack([u.ravel(), v.ravel()], axis=1) - camera.centre) / camera.focal
     found: Array = seen if not any(camera.coefficients) else _undistorted(camera, seen)
-    out = found.reshape(height, width, 2)
-    out.setflags(write=False)
-    return out
+    unit = np.concatenate([found, np.ones((len(found), 1))], axis=1)
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    slopes = found.reshape(height, width, 2).astype(np.float32)
+    for out in (slopes, unit):
+        out.setflags(write=False)
+    return slopes, unit
 
 
 def _undistorted(camera: Camera, seen: Array) -> Array:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
-from avsreplay.log.point_cloud2 import Field, Layout, check_layout, read_layout
+from avsreplay.log.point_cloud2 import Field, Layout, check_layout, of_layout, read_layout
+from avsreplay.log.raw_cloud import RawCloud
 
 FOXGLOVE, FOXGLOVE_ROS = "foxglove.PointCloud", "foxglove_msgs/msg/PointCloud"
 LayoutReader = Callable[[bytes | memoryview, str], Layout]
@@ -107,6 +108,20 @@ LAYOUTS: dict[str, LayoutReader] = {
 """Reader of each type of message that holds points."""
 
 
+def raw_message(kind: str, payload: bytes | memoryview, encoding: str) -> RawCloud:
+    """Decode a message of ``LAYOUTS`` to the fields that it declares.
+
+    Args:
+        kind: type of the message.
+        payload: the message.
+        encoding: of the message.
+
+    Raises:
+        BadMessage: the message is malformed, or has no coordinates; the text states why.
+    """
+    return of_layout(LAYOUTS[kind](payload, encoding))
+
+
 def message_stamp(kind: str, payload: bytes | memoryview, encoding: str) -> int:
     """Return the stamp of a message [ns], 0 if it cannot be read.
 
@@ -155,7 +170,10 @@ def _posed(layout: Layout, values: Sequence[float]) -> Layout:
     if length < 0.5:
         raise BadMessage("a cloud whose pose has no unit quaternion")
     pose = Pose(np.array(values[3:]) / length, np.array(values[:3]))
-    points = np.stack([layout.column(axis)[0].astype(np.float64) for axis in "xyz"], axis=1)
+    named = {f.name: f for f in layout.fields}
+    if not {"x", "y", "z"} <= named.keys():
+        raise BadMessage("a cloud without x, y and z")
+    points = np.stack([layout.view(named[k])[0].astype(np.float64) for k in "xyz"], axis=1)
     step, count = layout.point_step, layout.shape[1]
     table = np.zeros((count, step + 24), np.uint8)
     table[:, :step] = np.ndarray((count, step), np.uint8, layout.data, 0, (step, 1))

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.camera import Camera, rays
 from avsreplay.log.cdr import Cursor
+from avsreplay.log.raw_cloud import RawCloud
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
@@ -46,25 +46,6 @@ class DepthImage:
     stamp_ns: int
     frame: str
     values: NDArray[Any]
-
-
-@value_class
-class View:
-    """The rays of a depth image; they begin at the origin of the frame of the camera.
-
-    Attributes:
-        points: (n, 3) of the pixels with a return [m], float32, row by row.
-        lost: (m, 2) directions (x / z, y / z) of the pixels without a return.
-    """
-
-    points: NDArray[np.float32]
-    lost: Array
-
-    def missing(self) -> NDArray[np.float32]:
-        """Return the unit directions (m, 3) of the pixels without a return."""
-        out = np.concatenate([self.lost, np.ones((len(self.lost), 1))], axis=1)
-        out /= np.linalg.norm(out, axis=1)[:, None]
-        return out.astype(np.float32)
 
 
 def is_depth(kind: str, topic: str, payload: bytes | memoryview, encoding: str) -> bool:
@@ -184,29 +165,28 @@ def read_png(data: bytes, limit: int) -> NDArray[np.uint16]:
     return values.astype(np.uint16, copy=False)
 
 
-def view_of(values: NDArray[Any], camera: Camera) -> View:
-    """Return the points of a depth image and its rays without a return.
+def depth_cloud(image: DepthImage, camera: Camera) -> RawCloud:
+    """Return a depth image as a cloud with a row for each row of pixels, and the ray of each pixel.
 
     Args:
-        values: (height, width), unsigned 16-bit in units of the camera, or 32-bit float [m].
+        image: the image.
         camera: its camera.
+
+    Returns:
+        The cloud; the coordinates of a pixel without a return are not a number.
 
     Raises:
         BadMessage: the image has another size than the camera.
     """
-    height, width = values.shape
+    height, width = shape = image.values.shape
     if camera.size is not None and camera.size != (width, height):
         other = " x ".join(map(str, camera.size))
         raise BadMessage(f"an image of {width} x {height} pixels, its camera has {other}")
-    if values.dtype.kind == "f":
-        seen = np.isfinite(values) & (values > 0.0)
-        unit = 1.0
+    if image.values.dtype.kind == "f":
+        unit_m, seen = 1.0, np.isfinite(image.values) & (image.values > 0.0)
     else:
-        seen = ~np.isin(values, _NO_RETURN)
-        unit = camera.unit_m
-    directions = rays(camera, width, height)
-    known = np.isfinite(directions[:, :, 0])
-    with_return = seen & known
-    z: Array = values[with_return].astype(np.float64)[:, None] * unit
-    points = np.concatenate([directions[with_return] * z, z], axis=1)
-    return View(points.astype(np.float32), directions[known & ~seen])
+        unit_m, seen = camera.unit_m, ~np.isin(image.values, _NO_RETURN)
+    z = np.where(seen, image.values, np.nan).astype(np.float32)
+    slopes, directions = rays(camera, width, height)
+    fields = {"x": slopes[:, :, 0] * z, "y": slopes[:, :, 1] * z, "z": z}
+    return RawCloud(image.stamp_ns, image.frame, fields, shape, None, directions, unit_m)

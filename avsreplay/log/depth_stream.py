@@ -10,10 +10,10 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.camera import CAMERA_INFO, Camera, read_camera_info
 from avsreplay.log.cdr import Cursor
-from avsreplay.log.depth_image import IMAGE_TYPES, decode_depth, is_depth, view_of
+from avsreplay.log.depth_image import IMAGE_TYPES, decode_depth, depth_cloud, is_depth
 from avsreplay.log.index import MessageClouds, Recording
 from avsreplay.log.options import TopicInfo
-from avsreplay.log.point_cloud2 import Cloud
+from avsreplay.log.raw_cloud import RawCloud
 
 _EXAMINED = 3  # messages of a topic of images that are examined: one may be damaged
 _RECTIFIED = re.compile(r"(?<!un)rect", re.IGNORECASE)
@@ -67,13 +67,11 @@ class DepthImages(MessageClouds):
             what = f"depth images on {shown(topic)} and no CameraInfo"
             raise UnreadableInput(what, where=shown(recording.path), hint=hint)
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Return the points of an image. Raises BadMessage if it cannot be decoded."""
         payload, encoding = self.payload(place)
         image = decode_depth(self.type, payload, encoding, self._limit)
-        view = view_of(image.values, self._stated or self._camera(image.stamp_ns))
-        lost = image.values.size - len(view.points)
-        return Cloud(image.stamp_ns, image.frame, view.points, None, lost)
+        return depth_cloud(image, self._stated or self._camera(image.stamp_ns))
 
     def _camera(self, stamp_ns: int) -> Camera:
         """Return the camera of the CameraInfo nearest to a stamp."""

@@ -12,11 +12,12 @@ from pathlib import Path
 
 from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
 from avsreplay.log.camera import CAMERA_INFO
-from avsreplay.log.cloud_messages import LAYOUTS, message_stamp
+from avsreplay.log.cloud_messages import LAYOUTS, message_stamp, raw_message
 from avsreplay.log.depth_image import IMAGE_TYPES
 from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, decode_layout
+from avsreplay.log.point_cloud2 import Layout
+from avsreplay.log.raw_cloud import RawCloud
 
 MAX_NS = (
     2**31 - 2
@@ -273,9 +274,17 @@ class MessageClouds:
         """Parts of the log that could not be read."""
         return self._recording.losses
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
-        return decode_layout(LAYOUTS[self.type](*self.payload(place)))
+        return raw_message(self.type, *self.payload(place))
+
+    def layout(self, place: int) -> Layout | None:
+        """Return the layout of a message of points, None if the topic has other messages.
+
+        Raises BadMessage if it is malformed.
+        """
+        reader = LAYOUTS.get(self.type)
+        return None if reader is None else reader(*self.payload(place))
 
     def payload(self, place: int) -> tuple[bytes | memoryview, str]:
         """Return the serialised message and its encoding.
