@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from avsreplay import arithmetic, pipeline, settings
-from avsreplay.binary_files import pack_state, unpack
 from avsreplay.build import first_state, stages
+from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
@@ -254,7 +254,7 @@ class Run:
         """
         own = (self._state, self.done, self._fold, self.model_check, self._end, self._scored)
         motion = None if self._scored is None else self._scored.motion
-        return pack_state((*own, self._fixes, self._reference_instants, more), self._named(motion))
+        return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
     def restore(self, path: Path, more: Any = None) -> Any:
         """Continue from a checkpoint; returns what was stored with it.
@@ -267,13 +267,14 @@ class Run:
             UnreadableInput: the file is missing or damaged.
         """
         scored = self._scorer()
-        like: Any = (None, 0, self._fold, self.model_check, None, scored, [], [], more)
+        motion, scored.motion = scored.motion, None  # it is named and not stored
+        like: Any = (self._state, 0, self._fold, self.model_check, None, scored, [], [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
         self._fixes, self._reference_instants, stored = rest
         if self._fixes:
             self._reference = reference_motion(self._fixes, self.estimator)
-        self._scored.motion = self._scorer().motion if self._fixes else scored.motion
+        self._scored.motion = self._scorer().motion if self._fixes else motion
         return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
