@@ -96,6 +96,7 @@ run_source_options = added(
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--scan-duration", "scan_duration_s", type=float),
+    source_setting("--intrinsics", type=str),
     source_setting("--scan-unit"),
     source_setting("--point-time", metavar="FIELD:UNIT:ORIGIN"),
     source_setting("--no-return", metavar="CODES"),
