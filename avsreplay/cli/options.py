@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from avsreplay.cli import interrupts
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output, is_stream
@@ -343,6 +344,8 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
     asked: list[int] = []
 
     def ask(number: int, _frame: object) -> None:
+        if not interrupts.counts():
+            return
         asked.append(number)
         stop()
         if not rows or len(asked) > 1:
