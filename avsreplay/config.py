@@ -20,6 +20,7 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import SupervisorParams
 from avsreplay.register.params import RegisterParams
+from avsreplay.task import TaskParams
 from avsreplay.settings import SettingError, Settings, is_unit, setting
 from avsreplay.toml_document import Document, build, load, override, toml_value
 
@@ -71,6 +72,7 @@ class RunConfig(Settings):
     faults: FaultParams = setting(FaultParams, "Fault detection.")
     consistency: ConsistencyParams = setting(ConsistencyParams, "Consistency of the innovations.")
     convergence: ConvergenceParams = setting(ConvergenceParams, "Convergence.")
+    task: TaskParams = setting(TaskParams, "The task of the capture.")
     plan: PlanParams = setting(PlanParams, "Planning.")
     robot: RobotParams = setting(RobotParams, "The robot.")
     limits: Limits = setting(Limits, "Constraints of every capture plan.")
@@ -83,16 +85,7 @@ class RunConfig(Settings):
     @property
     def robot_line(self) -> str:
         """The assumed robot in one line."""
-        return self.robot.described(self.plan, self.limits)
-
-    def approach_limits(self, extent_m: float) -> Limits:
-        """Return the limits of every plan with those of the robot.
-
-        Args:
-            extent_m: diagonal of the target's bounding box [m]; lengths that are not set are
-                proportional to it.
-        """
-        return self.robot.limited(self.limits).resolved(extent_m)
+        return self.task.with_gripper(self.robot).described(self.plan, self.limits)
 
     def check(self) -> None:
         """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an
