@@ -29,13 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
+from avsreplay.read_budget import BadFile, ReadBudget, check_declared
 
 _MAX_NPY_HEADER = 4096
 _MOST_STATE = 16 << 30
-_LEAST_ARRAYS, _MAX_RATIO = (
-    96 << 20,
-    8,
-)  # arrays may take 96 MiB, or eight times the size of their archive
 _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
@@ -50,10 +47,6 @@ _ZIP_ERRORS = (
     OSError,
     ValueError,
 )
-
-
-class BadFile(ValueError):
-    """A file whose bytes do not match its header or its name."""
 
 
 def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> bytes:
@@ -113,31 +106,34 @@ def parse_npy(data: bytes) -> NDArray[Any]:
         raise BadFile("an npy file that is not an array of numbers")
     shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
     dtype, count = np.dtype(header["descr"]), math.prod(shape)
-    if count * dtype.itemsize > len(data) - start - size:
-        raise BadFile(f"an array of shape {str(shape)[:60]}, which its bytes do not contain")
+    check_declared(count, dtype.itemsize, len(data) - start - size, "numbers")
     array = np.frombuffer(data, dtype, count, start + size)
     return array.reshape(shape, order="F" if header["fortran"] == "True" else "C")
 
 
-def read_members(data: bytes, limit: int) -> dict[str, bytes]:
+def read_members(data: bytes, budget: ReadBudget) -> dict[str, bytes]:
     """Return the members of a zip archive by name.
 
     Args:
         data: the bytes of the archive.
-        limit: largest total size of the members after decompression [bytes].
+        budget: what the members may take; their declared sizes are taken from it before any is
+            decompressed.
 
     Raises:
-        BadFile: the archive is malformed, or its members are larger.
+        BadFile: the archive is malformed, or its members are larger than they declare.
+        OverBudget: there are too many members, or they are too large.
     """
     out: dict[str, bytes] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for info in archive.infolist():
+            found = archive.infolist()
+            budget.take_records(len(found), "arrays")
+            budget.take_bytes(sum(info.file_size for info in found), "arrays")
+            for info in found:
                 with archive.open(info) as member:
-                    out[info.filename] = member.read(limit + 1)
-                limit -= len(out[info.filename])
-                if limit < 0:
-                    raise BadFile("its arrays are over the size limit")
+                    out[info.filename] = member.read(info.file_size + 1)
+                if len(out[info.filename]) > info.file_size:
+                    raise BadFile(f"the array '{info.filename[:40]}' is larger than it declares")
     except BadFile:
         raise
     except _ZIP_ERRORS as error:
@@ -172,7 +168,7 @@ def read_npz(
     """
     data = read_limited(path, limit, hint)
     try:
-        members = read_members(data, max(_LEAST_ARRAYS, _MAX_RATIO * len(data)))
+        members = read_members(data, ReadBudget(len(data)))
         wanted = [name for name in shapes if name not in optional or f"{name}.npy" in members]
         return {name: _declared(members, name, *shapes[name]) for name in wanted}
     except BadFile as error:

@@ -116,7 +116,9 @@ PAPER = (
     "deskew=false",
     "reacquire=false",
 )
-"""Settings of the method as printed: start, noise adaptation, gain constraint, fault rule and convergence."""
+"""Settings of the method as printed: start, noise adaptation, gain constraint, fault rule and
+convergence.
+"""
 
 
 def parse_pose(text: str) -> Pose:

@@ -40,9 +40,9 @@ from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segme
 from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
 from avsreplay.register.backend import measured_alignment
-from avsreplay.register.budget import effort_after
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
+from avsreplay.register.shown import Effort, effort_for, shown
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -196,7 +196,7 @@ class PipelineState:
         guidance: plan in force and robot.
         track: the estimate.  Both are None before the first scan.
         last_pose: last healthy measured pose, None before one.
-        failed: scans with points before that pose.
+        failed: what the scans showed before that pose whose searches found none.
         origin: where the first pose came from.
         start_ns: instant of the first scan.
     """
@@ -207,7 +207,7 @@ class PipelineState:
     last_pose: Pose | None = None
     origin: str = ""
     start_ns: int = 0
-    failed: int = 0
+    failed: tuple[Array, ...] = ()
 
     @property
     def captured_ns(self) -> int | None:
@@ -276,7 +276,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         plan=guidance.plan,
     )
     pose = measurement.alignment.T_ac if gamma else state.last_pose
-    failed = state.failed + (measurement.alignment.points > 0) if pose is None else 0
+    failed = _failed(state, scan) if pose is None else ()
     return (
         PipelineState(monitors, guidance, track, pose, state.origin, state.start_ns, failed),
         outcome,
@@ -342,7 +342,7 @@ def _register(
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
-    effort, carried = effort_after(state.failed), points is not scan.points
+    effort, carried = _effort(state, scan), points is not scan.points
     unknown = (
         None
         if state.track is None
@@ -358,8 +358,19 @@ def _acquire(
     stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str
 ) -> Measurement:
     """Register the scan without a guess."""
-    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, effort_after(state.failed))
+    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, _effort(state, scan))
     return _measurement(stages, scan, points, found, origin)
+
+
+def _effort(state: PipelineState, scan: Scan) -> Effort:
+    return effort_for(shown(scan.points), state.failed)
+
+
+def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:
+    """What the scans without an accepted pose showed whose searches found none, with this scan."""
+    seen = shown(scan.points)
+    searched = seen is not None and effort_for(seen, state.failed) is Effort.FULL
+    return (*state.failed, seen) if searched and seen is not None else state.failed
 
 
 def _measurement(
@@ -422,7 +433,9 @@ def _deskewed(
 
 
 Forecaster = Callable[[Array], Forecast]
-"""Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point without measurements."""
+"""Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point
+without measurements.
+"""
 
 
 def target_scene(

@@ -21,7 +21,9 @@ from avsreplay.simulate.simulation import EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
 
 Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
-"""Shows progress: (scans, expected number or 0 if unknown) -> a context manager that yields the scans."""
+"""Shows progress: (scans, expected number or 0 if unknown) -> a context manager that yields the
+scans.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -99,7 +99,7 @@ class Surface:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices, int32; outwards where they form a closed part.
         name, sha256, data: of the file.
-        reversed: faces that were reversed on reading.
+        reversed: faces that were reversed so that they point outwards; None: not yet examined.
     """
 
     vertices: Array
@@ -107,7 +107,7 @@ class Surface:
     name: str
     sha256: str
     data: bytes = b""
-    reversed: int = 0
+    reversed: int | None = None
 
     @property
     def extent(self) -> float:

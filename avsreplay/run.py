@@ -4,8 +4,7 @@ scans and scores them.
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -36,6 +35,7 @@ from avsreplay.register.registrar import Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
+from avsreplay.toml_document import own_settings
 
 if TYPE_CHECKING:
     from avsreplay.reconstruct.model import Reconstruction
@@ -126,9 +126,7 @@ class Run:
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
-            own: Mapping[str, Any] = (
-                tomllib.loads(header.scenario).get("run", {}) if header.scenario else {}
-            )
+            own = own_settings(header.scenario, str(job.source))
             self.config: RunConfig = load_config(
                 job.config_file, own, job.assignments, job.source.parent
             )

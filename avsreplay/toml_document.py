@@ -19,12 +19,18 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from avsreplay.errors import UnreadableInput, UsageError, value_class
+from avsreplay.read_budget import ReadBudget
 from avsreplay.settings import Entry, SettingError, dump, entries
 
 T = TypeVar("T")
 _Path = tuple[str | int, ...]
 MAX_BYTES = 1 << 20
 _SIMILAR = 0.7  # similarity from which a known key is suggested in place of an unknown one
+_LONGEST = 200  # characters of an unknown key that are compared with the known ones
+_BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
+# Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
@@ -93,12 +99,42 @@ def parse(text: str, name: str) -> Document:
         UsageError: the text is not TOML.
     """
     try:
-        return Document(name, tomllib.loads(text), text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        message = str(error) or "nested too deeply"
+        return Document(name, _loads(text), text)
+    except (ValueError, RecursionError) as error:
+        message = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise UsageError(
             f"not valid TOML: {message}", where=name, hint="correct the syntax"
         ) from None
+
+
+def _loads(text: str) -> dict[str, Any]:
+    """Parse TOML whose keys are not nested deeply; the time of the parser grows with the square
+    of their depth.
+
+    Raises ValueError, which includes OverBudget, or RecursionError.
+    """
+    budget = ReadBudget(len(text))
+    budget.take_bytes(_BYTES_PER_CHARACTER * len(text), "values")
+    for found in _DOTTED.finditer(text):
+        budget.check_depth(found[0].count(".") + 1, "keys")
+    return tomllib.loads(text)
+
+
+def own_settings(scenario: str, log: str) -> Mapping[str, Any]:
+    """Return the table ``[run]`` of the scenario that a log contains; an empty one if there is
+    none.
+
+    Args:
+        scenario: TOML text from the log, "" for none.
+        log: name of the log in error messages.
+
+    Raises:
+        UsageError: the text is not TOML, or ``run`` is not a table.
+    """
+    table = parse(scenario, f"{log} (its scenario)").table.get("run", {})
+    if not isinstance(table, Mapping):
+        raise UsageError("'run' must be a table", where=f"{log} (its scenario)", hint="record anew")
+    return table
 
 
 class Assignment(str):
@@ -140,8 +176,8 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
                 f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint
             )
         try:
-            value = tomllib.loads(f"v = {raw}")["v"]
-        except (tomllib.TOMLDecodeError, RecursionError):
+            value = _loads(f"v = {raw}")["v"]
+        except (ValueError, RecursionError):
             value = raw.strip()
         path = tuple(key.strip().split("."))
         node = table
@@ -276,7 +312,7 @@ class _Builder:
         ):  # an unknown table: its content determines the suggestion
             name, value = next(iter(value.items()))
             inside = (*inside, name)
-        whole, leaf = _dotted((*path, *inside)), str(inside[-1])
+        whole, leaf = _dotted((*path, *inside))[:_LONGEST], str(inside[-1])[:_LONGEST]
 
         def likeness(entry: str) -> tuple[float, float]:
             in_full = difflib.SequenceMatcher(None, whole, entry).ratio()

@@ -77,7 +77,10 @@ def screen(text: Text, columns: int, lines: int, to: Path, folder: Path, command
     for line in text.split("\n")[:lines]:
         console.print(line, no_wrap=True, crop=True)
     page = folder / "terminal.html"
-    style = "<style>body{background:#14181d!important;color:#e6e6e6!important;margin:14px}pre{font-size:14px}</style>"
+    style = (
+        "<style>body{background:#14181d!important;color:#e6e6e6!important;margin:14px}"
+        "pre{font-size:14px}</style>"
+    )
     page.write_text(
         console.export_html(inline_styles=True).replace("</head>", style + "</head>"),
         encoding="utf-8",

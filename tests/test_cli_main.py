@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from avsreplay import arithmetic, cli
+from avsreplay import arithmetic
 from avsreplay.__main__ import main
+from avsreplay.cli import main as cli
 
 posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
 AVSREPLAY = [sys.executable, "-m", "avsreplay"]

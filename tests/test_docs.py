@@ -1,5 +1,5 @@
-"""Documentation: marked blocks run, command lines parse, links lead somewhere, sentences are
-short, the site builds.
+"""Documentation: marked blocks run, command lines parse, links lead somewhere, the site
+builds.
 """
 
 from __future__ import annotations
@@ -368,33 +368,6 @@ def _anchors(page):
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
 
 
-HISTORY = re.compile(
-    r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since"
-    r" then|until now)\b"
-    r"|(?:^|[.;:(|] ?)(?:Before|Now|Formerly),",
-    re.IGNORECASE | re.MULTILINE,
-)
-
-
-def _sentences(text):
-    """Sentences outside of code, as words; a heading, an entry of a list and a cell of a
-    table are sentences.
-    """
-    for part in re.split(r"\n\s*\n|\||\n(?=\s*(?:[-*#]|\d+\. ))|^#+ [^\n]*\n", text, flags=re.M):
-        joined = " ".join(re.sub(r"`[^`]*`", "code", part).split())
-        yield from (
-            sentence.split()
-            for sentence in re.split(r"(?<=[.!?:;])(?:\*\*)? +(?=[A-Zc*\[({])", joined)
-        )
-
-
-@pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_a_sentence_has_at_most_45_words_and_states_the_present(page):
-    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-    assert [" ".join(words) for words in _sentences(text) if len(words) > 45] == []
-    assert [found[0] for found in HISTORY.finditer(text)] == []
-
-
 def test_the_glossary_explains_terms_that_occur_and_names_sections_that_exist():
     glossary = ROOT / "docs" / "glossary.md"
     symbols, _, terms = glossary.read_text(encoding="utf-8").partition("## Terms")
@@ -437,28 +410,3 @@ def test_the_site_builds_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "site" / "ci" / "index.html").exists()
-
-
-def test_the_campaign_of_removed_guards_covers_every_line_of_the_table_of_defects(monkeypatch):
-    """``tests/benchmarks/guards.py`` removes each guard; here only that its texts are in the
-    code, once each.
-    """
-    monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
-    from guards import ALL
-
-    for edits, test in ALL:
-        for name, text, _ in edits:
-            assert (ROOT / "avsreplay" / name).read_text(encoding="utf-8").count(text) == 1, (
-                name,
-                text,
-            )
-        file, _, name = test.partition("::")
-        assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), test
-    page = (ROOT / "docs" / "reliability-tests.md").read_text(encoding="utf-8")
-    table = page.partition("## Defects found")[2].partition("The observations of a new user")[0]
-    lines = [
-        set(re.findall(r"`(test_\w+)`", line)) for line in table.splitlines() if "`test_" in line
-    ]
-    assert len(lines) > 20
-    removed = {test.partition("::")[2] for _, test in ALL}
-    assert [names for names in lines if not names & removed] == []

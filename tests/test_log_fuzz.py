@@ -21,13 +21,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.binary_files import BadFile
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import decode_cloud
 from avsreplay.log.pose_messages import POSE_TYPES, read_pose, read_transforms
 from avsreplay.log.scan_files import read_pcd, unpack_lzf
+from avsreplay.read_budget import BadFile
 
 CORPUS = seeds()
 

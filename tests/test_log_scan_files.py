@@ -15,13 +15,13 @@ from fuzz_inputs import seeds
 from true_scans import true_scans
 
 from avsreplay import geometry
-from avsreplay.binary_files import BadFile
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source, parse_surface, read_surface
 from avsreplay.log.header import surface_bytes
 from avsreplay.log.ply import read_ply
 from avsreplay.log.scan_files import read_pcd, unpack_lzf
+from avsreplay.read_budget import BadFile
 from avsreplay.records import Scan, ScanStatus
 
 SECOND = 1_000_000_000
@@ -338,7 +338,7 @@ def test_quads_and_mixed_polygons_become_triangles() -> None:
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
 
 
-# --- the real data ---------------------------------------------------------------------------------------------------
+# --- the real data ---
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_a_small_error_that_all_innovations_share_is_inconsistent() -> None:
     assert held == 40
 
 
-def test_errors_that_near_views_have_in_common_shift_the_innovations_without_an_error_of_the_estimate() -> (
+def test_errors_common_to_near_views_shift_the_innovations_without_an_error_of_the_estimate() -> (
     None
 ):
     wrong, allowed, n, share = 0, 0, 50, 0.1

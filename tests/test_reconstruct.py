@@ -685,7 +685,7 @@ def test_the_plane_of_the_nearest_points_uses_those_of_the_same_side_only():
     assert not alone[0].any()
 
 
-def test_the_equations_of_pairs_are_the_derivatives_of_the_distances_and_pairs_are_kept_while_they_stand_still():
+def test_the_equations_of_pairs_are_derivatives_of_the_distances_and_pairs_at_rest_are_kept():
     scans, truth = turning(4, 20.0)
     survey = Survey(tuple(range(4)), 4, 1.5, np.zeros(3), False)
     views = [thinned_view(scan, survey, 0.03) for scan in scans]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from oracles.closest_point import OracleIndex
 
+from avsreplay import register
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
 from avsreplay.register.params import RegisterParams
@@ -466,7 +467,7 @@ def test_threads_that_the_system_refuses_do_not_end_the_process() -> None:
         "import resource\n"
         "import numpy as np\n"
         "from avsreplay.register.surface_index import SurfaceIndex\n"
-        "from avsreplay.simulate import builtin_surface\n"
+        "from avsreplay.simulate.target import builtin_surface\n"
         "surface, points = builtin_surface(), np.random.default_rng(1).normal(size=(2000, 3))\n"
         "index = SurfaceIndex.build(surface, 1.0)\n"
         "alone = index.closest(points).d2\n"
@@ -818,7 +819,7 @@ def signatures(space: object) -> dict[str, list[list[tuple[str, bool]]]]:
 
 
 def test_the_stub_states_the_functions_and_arguments_of_the_extension() -> None:
-    stub = ast.parse(Path(kernel.__file__).with_name("_kernel.pyi").read_text())
+    stub = ast.parse(Path(register.__file__).with_name("_kernel.pyi").read_text())
     spaces = {"": (stub.body, kernel)}
     spaces |= {
         c.name: (c.body, getattr(kernel, c.name)) for c in stub.body if isinstance(c, ast.ClassDef)

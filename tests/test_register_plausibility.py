@@ -4,8 +4,6 @@ scan may cost.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,11 +11,12 @@ import trimesh
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register.budget import HEALTHY_SCANS, Budget, Effort, effort_after, healthy_work
+from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import segments, without_scattered_points
+from avsreplay.register.shown import Effort, effort_for, shown
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 from avsreplay.register.visibility import Visibility
 
@@ -280,20 +279,42 @@ def test_an_ordinary_registration_costs_about_what_is_assumed(
     assert 0.8 < spent[0] / healthy_work(len(scan), registrar._target.near_work) < 2.0
 
 
-def test_searches_become_rare_where_none_finds_a_pose() -> None:
-    """Five in a row, then after delays of at most half of the scans so far: 13 in 100 scans."""
-    searched = [failed for failed in range(100) if effort_after(failed) is Effort.FULL]
-    assert searched == [0, 1, 2, 3, 4, 6, 9, 13, 19, 28, 42, 63, 94]
+def _searched(scans: list[Array]) -> list[int]:
+    """The numbers of the scans that are searched if no search finds a pose."""
+    failed, searched = tuple[Array, ...](), list[int]()
+    for k, scan in enumerate(scans):
+        seen = shown(scan)
+        if effort_for(seen, failed) is Effort.FULL:
+            searched.append(k)
+            failed += () if seen is None else (seen,)
+    return searched
 
 
-def test_guesses_are_tried_more_rarely_where_none_leads_to_a_pose() -> None:
-    """On all of the first 50 scans; after n scans again after 2 + n / 25 scans at most; on
-    few of 2000.
+def test_a_scan_is_searched_again_where_it_shows_something_else() -> None:
+    """Not after a number of scans: the same view is searched once, and again when it is no
+    longer hidden, or nearer.
     """
-    tried = [failed for failed in range(2000) if effort_after(failed) is not Effort.NONE]
-    assert tried[:50] == list(range(50))
-    assert all(after - before <= 2 + before / 25 for before, after in itertools.pairwise(tried))
-    assert len(tried) < 300
+    rng = np.random.default_rng(SEED)
+    scan = rng.normal(size=(1000, 3)) * [1.0, 0.6, 0.2] + [0.0, 0.0, 9.0]
+    turned = exp([0.0, 0.0, 0.7])
+    same = [Pose(turned, np.zeros(3)).apply(scan) for _ in range(50)]
+    assert _searched([scan, *same]) == [0]
+    part = scan[scan[:, 0] < -0.3]
+    assert _searched([part, *[part] * 20, scan, *same]) == [0, 21]
+    nearer = [scan[: int(30 * 1.05**k)] for k in range(70)]
+    found = _searched(nearer)
+    assert 5 <= len(found) <= 25
+    assert found[-1] > 50
+
+
+def test_searches_of_a_tumbling_body_with_a_wrong_model_end() -> None:
+    """The difference that is required grows with the number of failed searches."""
+    rng = np.random.default_rng(SEED)
+    scans = [
+        rng.normal(size=(int(800 * s), 3)) * [1.0, s, 0.2 * s] + [0.0, 0.0, 9.0]
+        for s in 0.75 + 0.25 * np.sin(0.1 * np.arange(1000))
+    ]
+    assert len(_searched(scans)) < 20
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.006])
@@ -309,7 +330,6 @@ def test_a_guess_that_few_points_confirm_gets_the_full_effort(
     found = registrar.register(scan, guess, effort=Effort.GUESS)
     assert found.status is AlignStatus.ALIGNED
     assert np.degrees(geometry.angle((T_ac.inverse() @ found.T_ac).q)) < 1.0
-    assert not registrar.register(scan, guess, effort=Effort.NONE).measured
     ball = rng.standard_normal((3000, 3))
     ball *= 0.3 * surface.extent / np.linalg.norm(ball, axis=1)[:, None]
     ball = ball[ball[:, 2] < 0.0] + T_ac.apply(surface.vertices).mean(axis=0)

@@ -15,13 +15,14 @@ from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import neighbourhood, quality
-from avsreplay.register.budget import Budget, Effort
+from avsreplay.register.budget import Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.neighbourhood import Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import Restarter
+from avsreplay.register.shown import Effort
 from avsreplay.simulate.scenario import scenario_of
 from avsreplay.simulate.simulation import simulate
 from avsreplay.simulate.target import builtin_surface

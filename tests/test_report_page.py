@@ -785,7 +785,8 @@ def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
     script = """const c = document.querySelector('#chart-fit canvas');
     const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
     let n = 0;
-    for (let i = 0; i < d.length; i += 4) if (d[i] < 40 && d[i + 1] > 80 && d[i + 2] > 140 && d[i + 3] > 200) n++;
+    for (let i = 0; i < d.length; i += 4)
+        if (d[i] < 40 && d[i + 1] > 80 && d[i + 2] > 140 && d[i + 3] > 200) n++;
     return n;"""
     assert browser.execute_script(script) > 4
 
@@ -793,10 +794,12 @@ def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
 @pytest.mark.slow
 def test_on_a_narrow_screen_a_wide_table_scrolls_and_keeps_the_names_of_its_rows(opened):
     browser = opened(width=390)
-    script = """const box = [...document.querySelectorAll('.scroll')].find((b) => b.scrollWidth > b.clientWidth + 40);
+    script = """const boxes = [...document.querySelectorAll('.scroll')];
+    const box = boxes.find((b) => b.scrollWidth > b.clientWidth + 40);
     box.scrollLeft = 1e6;
     const at = box.getBoundingClientRect(), row = box.querySelector('tbody tr');
-    const head = row.firstElementChild.getBoundingClientRect(), last = row.lastElementChild.getBoundingClientRect();
+    const head = row.firstElementChild.getBoundingClientRect();
+    const last = row.lastElementChild.getBoundingClientRect();
     return [head.left - at.left, at.right - last.right, getComputedStyle(box).backgroundImage,
             document.documentElement.scrollWidth];"""
     name, end, shadow, width = browser.execute_script(script)
@@ -823,9 +826,10 @@ def test_zoom_and_scan_are_in_the_address(opened):
 @pytest.mark.slow
 def test_a_bar_has_a_tooltip_and_hovering_moves_the_3d_view(opened):
     browser = opened()
-    script = """const over = document.querySelector('#chart-state .u-over'), r = over.getBoundingClientRect();
-    const x = r.width * 22 / 59, y = r.height / 6;
-    over.dispatchEvent(new MouseEvent('mousemove', { clientX: r.left + x, clientY: r.top + y, bubbles: true }));
+    script = """const over = document.querySelector('#chart-state .u-over');
+    const r = over.getBoundingClientRect(), x = r.width * 22 / 59, y = r.height / 6;
+    const at = { clientX: r.left + x, clientY: r.top + y, bubbles: true };
+    over.dispatchEvent(new MouseEvent('mousemove', at));
     return over.title;"""
     assert browser.execute_script(script).startswith("flagged: no scan, 4.00 s to 5.00 s")
     _settled(browser)
@@ -861,9 +865,11 @@ def test_the_tables_and_figures_of_a_campaign_can_be_read_at_every_width(browser
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         browser.get((tmp_path / "page.html").as_uri())
-        script = """return [document.documentElement.scrollWidth,
-            Math.max(...[...document.querySelectorAll('.scroll')].map((b) => b.scrollWidth - b.clientWidth)),
-            Math.min(...[...document.querySelectorAll('.figure text')].map((t) => t.getBoundingClientRect().height))]"""
+        script = """const boxes = [...document.querySelectorAll('.scroll')];
+            const labels = [...document.querySelectorAll('.figure text')];
+            return [document.documentElement.scrollWidth,
+                Math.max(...boxes.map((b) => b.scrollWidth - b.clientWidth)),
+                Math.min(...labels.map((t) => t.getBoundingClientRect().height))]"""
         page, hidden, text = browser.execute_script(script)
         assert page <= width
         assert text >= 10  # pixels

@@ -77,10 +77,8 @@ def test_a_healthy_scan_has_no_message():
         assert [row.message for row in run.rows()] == [None] * 2
 
 
-def test_a_wrong_model_is_searched_for_ever_more_rarely(monkeypatch, tmp_path):
-    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans;
-    the rows say so.
-    """
+def test_a_wrong_model_is_searched_where_the_scans_show_something_else(monkeypatch, tmp_path):
+    """Without a pose of the log; the rows say so."""
     made = []
     search = Registrar._acquire
     monkeypatch.setattr(
@@ -94,5 +92,5 @@ def test_a_wrong_model_is_searched_for_ever_more_rarely(monkeypatch, tmp_path):
     points = [row for row in rows if row.points]
     postponed = [row for row in points if row.message == POSTPONED]
     assert not any(row.gamma for row in rows)
-    assert len(made) == len(points) - len(postponed) == 9
+    assert 1 <= len(made) == len(points) - len(postponed) <= 9
     assert {row.status for row in postponed} == {"budget_exhausted"}

@@ -33,8 +33,9 @@ Examples:
   avsreplay backends --check horn
 
 \b
-"On other processors": the same bytes on every x86-64 Linux machine with the same libraries, or how far a pose can
-differ: libraries that stop by their own rules may take another number of iterations. See docs/ci.md."""
+"On other processors": the same bytes on every x86-64 Linux machine with the
+same libraries, or how far a pose can differ: libraries that stop by their own
+rules may take another number of iterations. See docs/ci.md."""
 
 
 @click.command("backends", epilog=EPILOG)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -232,13 +232,15 @@ INTRODUCTION = """# Settings
 
 This page is generated from the declarations in the code by `avsreplay config --markdown`.
 
-A setting without a default applies as stated in its description. The target's extent is the diagonal of the bounding
-box of its model, so that the defaults suit a target of any size. A value outside its range, an unknown key or a wrong
-type is an error that names the file and the line.
+A setting without a default applies as stated in its description. The target's extent is the
+diagonal of the bounding box of its model, so that the defaults suit a target of any size. A value
+outside its range, an unknown key or a wrong type is an error that names the file and the line.
 
-Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an environment variable
-(`AVSREPLAY_RUN_POLICY`, `AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
-`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config` reads.
+Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an
+environment variable (`AVSREPLAY_RUN_POLICY`,
+`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
+`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config`
+reads.
 """
 
 SECTIONS = (
@@ -296,14 +298,12 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
         )
 
 
-def _own_table(log: Path) -> dict[str, Any]:
-    import tomllib
-
+def _own_table(log: Path) -> Mapping[str, Any]:
+    from avsreplay import toml_document
     from avsreplay.log import SourceOptions, open_source
 
     with open_source(log, SourceOptions()) as source:
-        table: dict[str, Any] = tomllib.loads(source.header.scenario).get("run", {})
-    return table
+        return toml_document.own_settings(source.header.scenario, str(log))
 
 
 def reference_page() -> str:

@@ -33,8 +33,9 @@ EPILOG = """\b
 Examples:
   avsreplay model tumble.mcap -o model.ply
   avsreplay model scans/ -o model.ply --every-scan 2
-  avsreplay model tumble.mcap -o model.ply --against cad.obj    deviations from a CAD model
-  avsreplay run tumble.mcap --model auto                        build the model and replay against it"""
+  avsreplay model tumble.mcap -o model.ply --against cad.obj
+                                            deviations from a CAD model
+  avsreplay run tumble.mcap --model auto    build the model and use it"""
 
 
 @click.command("model", cls=SectionedCommand, epilog=EPILOG)
@@ -254,7 +255,8 @@ LEAST_M, MOST_M = 1e-6, 1e6  # size of a target
 ODOMETRY_EPILOG = """\b
 Examples:
   avsreplay odometry scans.mcap -o poses.tum --crop-range 2,4
-  avsreplay run poses.tum --backend poses --extent 1.5        estimate the motion from these poses"""
+  avsreplay run poses.tum --backend poses --extent 1.5
+                                            the motion from these poses"""
 
 
 @click.command("odometry", cls=SectionedCommand, epilog=ODOMETRY_EPILOG)

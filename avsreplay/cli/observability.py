@@ -32,10 +32,12 @@ Examples:
   avsreplay observability y.mcap --model m.ply --init truth --json
 
 \b
-The log is replayed, one motion is fitted to all healthy poses, and the observability Gramian is summed along that
-motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known.
-The columns ogm_rank and ogm_log10_cond of 'run' are the same Gramian along the motion fitted to the poses up to that
-scan, and agree with these once that fit has converged. The keys of the JSON document end in _fitted_motion.
+The log is replayed, one motion is fitted to all healthy poses, and the
+observability Gramian is summed along that motion: with sigma1 and sigma2 as
+parameters, with three independent sigma, and with all parameters known.
+The columns ogm_rank and ogm_log10_cond of 'run' are the same Gramian along
+the motion fitted to the poses up to that scan, and agree with these once that
+fit has converged. The keys of the JSON document end in _fitted_motion.
 
 \b
 Below the table are the directions that are not observed, each once with its

@@ -105,9 +105,13 @@ run_source_options = added(
     source_setting("--max-message-mib", type=int),
     source_setting("--strict", is_flag=True),
 )
-"""Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None by default."""
+"""Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None
+by default.
+"""
 source_options = added(source_setting("--start", "start_s", type=float), run_source_options)
-"""The same with the begin; the ``--start`` of ``run`` also takes the initialisation of the estimate."""
+"""The same with the begin; the ``--start`` of ``run`` also takes the initialisation of the
+estimate.
+"""
 pose_options = added(
     source_setting("--pose-sigma", type=Numbers(2), metavar="MM,DEG"),
     source_setting("--grasp", type=Numbers(3), metavar="X,Y,Z"),

@@ -51,7 +51,8 @@ Examples:
   avsreplay plan results/                          from t_1 on, with the run's settings
   avsreplay plan results/ --at 10 --a-max 0.02
   avsreplay plan results/ --cone-deg 30 --final-deg 8 --speed-max 0.4
-  avsreplay plan results/ --final-deg 15 --clearance 0.1 --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
+  avsreplay plan results/ --final-deg 15 --clearance 0.1 \\
+      --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
   avsreplay plan results/ --robot robot.toml
   avsreplay plan results/ --export plan.csv --json
   avsreplay plan results/ --animate flight.html    the flight in 3D, with a slider

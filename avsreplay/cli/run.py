@@ -43,7 +43,8 @@ GRADES = click.Choice(["pass", "check"], case_sensitive=False)
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
-  avsreplay run y.mcap --model m.ply --topic /points --truth-topic /truth/pose --init truth -o results/
+  avsreplay run y.mcap --model m.ply --topic /points -o results/ \\
+      --truth-topic /truth/pose --init truth
   avsreplay record scenario.toml -o - | avsreplay run -
   avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
   avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json

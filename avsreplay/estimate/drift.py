@@ -49,7 +49,8 @@ _ONSETS, _FINER = (
 )  # number of onsets tried, the first at the epoch, and around the most likely one
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
-# log odds over one step of the velocity and random disturbances: 3 less 0.5, the likeliest's gain by Wilks' theorem
+# log odds over one step of the velocity and random disturbances: 3 less 0.5, the gain of the
+# likeliest by Wilks' theorem
 _CONSTANT = 2.5
 _ROUNDS = 3  # largest number of joint fits with another onset or kind
 _LEAST_GAIN = (

@@ -39,7 +39,9 @@ _QUIETER = (
 )
 
 Windowed = Callable[[tuple[Epoch, ...], int], Window]
-"""Scans, of which as many as stated are accepted, about the motion predicted from before (``window_of``)."""
+"""Scans, of which as many as stated are accepted, about the motion predicted from before
+(``window_of``).
+"""
 Compare = Callable[[tuple[Epoch, ...], int], Ranked]
 """The hypotheses about scans, of which as many as stated are accepted (``hypotheses.explain``)."""
 

@@ -26,13 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
-from avsreplay.binary_files import BadFile, read_limited
+from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
+from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
@@ -296,9 +297,8 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
             f"'{shown(suffix)}' is not a known model format", where=where, hint=hint
         )
     try:
-        vertices, faces = (
-            _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
-        )
+        reader, budget = _OWN_READERS.get(suffix), ReadBudget(len(data))
+        vertices, faces = reader(data, budget) if reader else _trimesh(data, suffix)
     except _FOREIGN as error:
         reason = shown(str(error) or type(error).__name__)[:120]
         raise UnreadableInput(
@@ -315,14 +315,14 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data, reversed_)
 
 
-def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
-    ply = read_ply(data)
+def _ply(data: bytes, budget: ReadBudget) -> tuple[Array, NDArray[np.int64]]:
+    ply = read_ply(data, budget)
     return ply.points().astype(np.float64), ply.faces
 
 
-def _pcd(data: bytes) -> tuple[Array, NDArray[Any]]:
+def _pcd(data: bytes, budget: ReadBudget) -> tuple[Array, NDArray[Any]]:
     """A PCD file is a point-cloud model; points without a return are left out."""
-    points = read_pcd(data).astype(np.float64)
+    points = read_pcd(data, budget).astype(np.float64)
     return points[np.isfinite(points).all(axis=1)], np.zeros((0, 3), np.int32)
 
 

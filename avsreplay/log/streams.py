@@ -16,7 +16,6 @@ from typing import TypeVar
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
@@ -28,6 +27,7 @@ from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
 from avsreplay.log.scan_files import read_points
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
+from avsreplay.read_budget import BadFile
 from avsreplay.records import LogHeader
 
 T = TypeVar("T")

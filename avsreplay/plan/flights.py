@@ -99,7 +99,9 @@ __all__ = [
 ]
 
 Motion = Callable[[Array], tuple[Array, Array, Array]]
-"""Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4) of {C} in {A}."""
+"""Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4)
+of {C} in {A}.
+"""
 
 
 @value_class(eq=True)

@@ -4,8 +4,6 @@ machine.
 
 from __future__ import annotations
 
-from enum import Enum
-
 import numpy as np
 
 from avsreplay.geometry import Pose
@@ -57,8 +55,6 @@ LAST_WORK = (
 )
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work
-# after so many scans without an accepted pose, the guess is tested on every second scan, and so on
-SPARED = 50
 
 
 def healthy_work(points: int, near: float) -> int:
@@ -96,33 +92,6 @@ def grade_work(points: int, noisy: bool = False) -> int:
     """
     simulated = SIMULATED_WORK[0] + SIMULATED_WORK[1] * min(points, MOST_SIMULATED) if noisy else 0
     return GRADE_WORK + points // POINTS_GRADED + simulated
-
-
-class Effort(Enum):
-    """What is done for a scan of a run without an accepted pose."""
-
-    FULL = "registration, restarts and searches"
-    GUESS = "the same if few points confirm the guess"
-    NONE = "nothing"
-
-
-def effort_after(failed: int) -> Effort:
-    """Return what is done for a scan before the first accepted pose.
-
-    Restarts and searches are made on the first five scans and then after delays of at most half of
-    the scans so far. On the scans between the guess is tested, after n scans on one in 1 + n /
-    ``SPARED`` of them. The total work therefore stays small with a wrong model, of which no pose
-    explains any scan.
-
-    Args:
-        failed: scans before this one on which no pose was accepted.
-    """
-    due = 0
-    while due < failed:
-        due += max(1, due // 2)
-    if due == failed:
-        return Effort.FULL
-    return Effort.NONE if failed % (1 + failed // SPARED) else Effort.GUESS
 
 
 class Budget:

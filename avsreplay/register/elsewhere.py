@@ -34,7 +34,7 @@ from avsreplay.register.global_search import (
     GlobalSearch,
     best_of,
 )
-from avsreplay.register.sampling import sample, thin_to
+from avsreplay.register.sampling import sample_evenly, thin_to
 
 OFF = 2.0  # a point farther from the model than this many widths is off it
 CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
@@ -221,7 +221,7 @@ class Search(GlobalSearch):
         """The rotations (24, 3, 3) of a cube along two directions of most of the faces; none
         if they are not square.
         """
-        normals = sample(self._target.surface, MODEL_POINTS // 3)[1]
+        normals = sample_evenly(self._target.surface, MODEL_POINTS // 3)[1]
         along = (np.abs(normals @ normals.T) > ALONG).sum(axis=1)
         first = normals[np.argmax(along)]
         across = np.where(np.abs(normals @ first) < SQUARE, along, 0)

@@ -39,7 +39,6 @@ from avsreplay.register.backend import (
     available,
     measured_alignment,
 )
-from avsreplay.register.budget import Effort, effort_after
 from avsreplay.register.duration import (
     BIAS_SCANS,
     BLOCKS,
@@ -75,7 +74,6 @@ __all__ = [
     "POSES",
     "Availability",
     "Backend",
-    "Effort",
     "ModelCheck",
     "RegisterParams",
     "Registrar",
@@ -83,7 +81,6 @@ __all__ = [
     "SensorFrame",
     "Target",
     "available",
-    "effort_after",
     "measured_alignment",
 ]
 

@@ -23,7 +23,6 @@ from avsreplay.register.budget import (
     SCATTER_WORK,
     TEST_WORK,
     Budget,
-    Effort,
     healthy_work,
     near_work,
 )
@@ -47,6 +46,7 @@ from avsreplay.register.sampling import (
     usable_points,
     without_scattered_points,
 )
+from avsreplay.register.shown import Effort
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -138,9 +138,7 @@ class Registrar:
             seq % self.params.split_every == 0,
             Budget(healthy_work(len(scan), self._target.near_work)),
         )
-        if effort is Effort.NONE or (
-            effort is Effort.GUESS and not self._restarter.hopeful(scan, guess, budget)
-        ):
+        if effort is Effort.GUESS and not self._restarter.hopeful(scan, guess, budget):
             return replace(
                 quality.not_measured(len(scan), AlignStatus.BUDGET_EXHAUSTED, guess),
                 message=POSTPONED,

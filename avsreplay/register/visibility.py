@@ -60,8 +60,8 @@ class Visibility:
 
     Attributes:
         sided: the faces of this surface have a known outer side.
-        surface: the surface; where it is sided, faces of open parts towards the side that is seen,
-            or with both sides.
+        surface: the surface with its closed parts wound outwards; where it is sided, faces of open
+            parts towards the side that is seen, or with both sides.
     """
 
     def __init__(
@@ -74,6 +74,7 @@ class Visibility:
         self.sided, self.surface = False, surface
         if camera is Camera.NONE:
             return
+        self.surface = surface = wound(surface)
         found, outward = seen_sides(surface, cache_dir)
         self.sided = camera is Camera.ORIGIN or outward
         if self.sided:
@@ -171,6 +172,20 @@ class Visibility:
         if not self._known or distance < FAR_OF_EXTENT * self._extent:
             return None
         return frozen(-centre / distance)
+
+
+def wound(surface: Surface) -> Surface:
+    """Return a surface with its closed parts wound outwards, as a reader of models winds them.
+
+    Args:
+        surface: from a reader (``Surface.reversed`` is known), or made otherwise. One of a reader
+            is wound again only if its faces enclose a negative volume.
+    """
+    examined = surface.reversed is not None
+    if examined and mesh.signed_volume(surface.vertices, surface.faces) >= 0.0:
+        return surface
+    faces, count = mesh.outward(surface.vertices, surface.faces)
+    return replace(surface, faces=faces, reversed=count)
 
 
 def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface, bool]:

@@ -203,16 +203,17 @@ def write_layout(path: str | Path) -> None:
 
 _HEAD = """# Columns of a row
 
-Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. A value is null where it does not apply, for example
-an error without ground truth. Frames, units and symbols are defined under [conventions](conventions.md), terms in the
-[glossary](glossary.md).
+Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. A value is null where it does
+not apply, for example an error without ground truth. Frames, units and symbols are defined under
+[conventions](conventions.md), terms in the [glossary](glossary.md).
 
-The tables state the tolerance of a [golden file](ci.md) for each column: a value passes if it differs from the expected
-one by at most the absolute tolerance plus the relative tolerance times the expected value; *exact* columns are equal.
-[rows.schema.json](rows.schema.json) is the JSON schema of a row.
+The tables state the tolerance of a [golden file](ci.md) for each column: a value passes if it
+differs from the expected one by at most the absolute tolerance plus the relative tolerance times
+the expected value; *exact* columns are equal. [rows.schema.json](rows.schema.json) is the JSON
+schema of a row.
 
-`python -m avsreplay.report.export` makes this page (with `--schema` the schema) from `avsreplay/rows.py` and
-`avsreplay/columns.toml`; a test compares them.
+`python -m avsreplay.report.export` makes this page (with `--schema` the schema) from
+`avsreplay/rows.py` and `avsreplay/columns.toml`; a test compares them.
 """
 
 

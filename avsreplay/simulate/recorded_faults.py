@@ -107,7 +107,9 @@ _RECORDED_ONLY: dict[str, tuple[float | None, bool]] = {
     "frame_rate": (2.0, False),
 }
 RECORDED_KINDS = {kind.value: default for kind, default in DEFAULTS.items()} | _RECORDED_ONLY
-"""Kinds of fault for recorded scans: default strength (None: the kind has none), and whether it is harmful."""
+"""Kinds of fault for recorded scans: default strength (None: the kind has none), and whether it is
+harmful.
+"""
 
 
 def _fits_recorded(kind: str, value: float) -> bool:

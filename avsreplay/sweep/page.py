@@ -37,11 +37,13 @@ KIND_PARTS = (
     (0, 1, 2, 3, 4, 5, 6, 7),
     (0, 1, 8, 9, 10),
 )  # columns: what was found and when; errors
-_KINDS_TEXT = """No.: the combination. None: the scans outside every window; what is flagged there is a false alarm.
-~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap. Delay: from a window's first
-scan to its first flagged one [s], median and worst. Recovery: from the first scan after it to the first healthy one
-[s], where there was something to recover from. Lost: windows after which no scan was healthy. Worst: errors of the
-estimate [mm, deg] over the window's flagged scans, over its used ones, and over the used ones after it up to the next
+_KINDS_TEXT = """\
+No.: the combination. None: the scans outside every window; what is flagged there is a false
+alarm. ~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap.
+Delay: from a window's first scan to its first flagged one [s], median and worst. Recovery: from
+the first scan after it to the first healthy one [s], where there was something to recover from.
+Lost: windows after which no scan was healthy. Worst: errors of the estimate [mm, deg] over the
+window's flagged scans, over its used ones, and over the used ones after it up to the next
 window."""
 
 _WORST_TEXT = """A run is made again, with its own report, by:

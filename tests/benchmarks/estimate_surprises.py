@@ -401,11 +401,14 @@ def line(case: Case, results: list[Result]) -> str:
         _claims(results),
         ", ".join(f"{v:.2f}" for v in np.mean([r.nees for r in results], axis=(0, 1))),
         ", ".join(f"{v:.0%}" for v in inside_band(np.array([r.nees for r in results]))),
-        (
-            f"{np.median([r.t[r.converged.index(True)] if any(r.converged) else np.inf for r in results]):.1f}"
-        ),
+        f"{np.median([_converged_s(r) for r in results]):.1f}",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def _converged_s(result: Result) -> float:
+    """Time of the first converged estimate [s], infinite without one."""
+    return result.t[result.converged.index(True)] if any(result.converged) else float("inf")
 
 
 def _claims(results: list[Result]) -> str:

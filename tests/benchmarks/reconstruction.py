@@ -134,11 +134,8 @@ def beside(log: Path, options: SourceOptions) -> None:
     clouds = [np.asarray(scan.points, dtype=np.float64) for scan in scans]
     extent = float(np.median([extent_of(cloud[:: max(1, len(cloud) // 3000)]) for cloud in clouds]))
     for name, odometry in (("KISS-ICP", kiss_poses), ("small_gicp, scan to scan", gicp_poses)):
-        poses = odometry(clouds, extent)
-        print(
-            f"  {name}:"
-            f" {_errors([(true, T) for true, T in zip(truth, poses, strict=True) if true is not None])}"
-        )
+        pairs = zip(truth, odometry(clouds, extent), strict=True)
+        print(f"  {name}: {_errors([(true, T) for true, T in pairs if true is not None])}")
     for name, model in (("CAD model", options.model), ("model auto", Path("auto"))):
         begun = time.process_time()
         with Run(Job(source=log, options=replace(options, model=model))) as run:

@@ -97,7 +97,8 @@ def opened(path: Path, times: int) -> tuple[float, float] | None:
         options.add_argument(flag)
     service = webdriver.ChromeService(shutil.which("chromedriver"))
     browser = webdriver.Chrome(options=options, service=service)
-    move = """const done = arguments[1], s = document.getElementById('slider'), t = performance.now();
+    move = """const done = arguments[1], s = document.getElementById('slider');
+    const t = performance.now();
     s.value = arguments[0]; s.dispatchEvent(new Event('input'));
     requestAnimationFrame(() => requestAnimationFrame(() => done(performance.now() - t)))"""
     ready, moves = [], []
