@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.assessment import Assessment, Chance, InFact, chance_of, errors_text
@@ -68,6 +69,7 @@ _COORDINATES = (
     *((k, "the inertia") for k in range(INERTIA.start, INERTIA.stop)),
     *((ARM.start + k, f"the mass centre along {a}") for k, a in enumerate(_AXES)),
 )
+Flags = NDArray[np.bool_]
 _QUANTITIES = ("position", "speed", "attitude")
 
 
@@ -278,7 +280,7 @@ def _closed(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any
     inside, touched = (sizes <= setup.limits).all(axis=1), _touched_by_draws(setup, log, end_ns)
     at_s = setup.at_s(end_ns)
     late = at_s > setup.task.deadline_s
-    good = inside & ~(False if touched is None else touched) & (not late)
+    good: Flags = np.asarray(inside if touched is None else inside & ~touched) & np.bool_(not late)
     found = _probability(good)
     largest = np.quantile(sizes, 0.95, axis=0)
     worst = int(np.argmax(largest / setup.limits))
@@ -320,9 +322,7 @@ def _aborted(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, An
     }
 
 
-def _at_rest(
-    setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief
-) -> dict[str, Any]:
+def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief) -> dict[str, Any]:
     """The robot waits or holds without a plan: the estimate does not suffice, or no capture
     exists.
     """
@@ -493,7 +493,7 @@ def drawn_beliefs(
     if isinstance(belief, DrivenBelief):
         P = np.block([[belief.P, belief.cross], [belief.cross.T, belief.P_u]])
     errors = draws(P, count, rng)
-    steps = np.linalg.solve(to_errors(chart), errors[:, :n].T).T
+    steps: Array = np.asarray(np.linalg.solve(to_errors(chart), errors[:, :n].T).T, np.float64)
     out: list[Belief] = []
     for y, d in zip(steps, errors, strict=True):
         x: State = to_state(chart.moved(y))
@@ -502,7 +502,7 @@ def drawn_beliefs(
     return steps, out
 
 
-def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Array | None:
+def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None:
     """Return for each of ``DRAWS`` targets (n,) whether the flown path touches it; None where
     contact is not checked.
 
@@ -521,7 +521,7 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Array | None
         if stop_ns <= begin_ns:
             continue
         instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
-        times = (instants - leg.belief.t_ns) * 1e-9
+        times: Array = np.asarray((instants - leg.belief.t_ns) * 1e-9, np.float64)
         rho = setup.estimator.motion(leg.belief)(times)[0] if len(times) else r
         if not len(r) or float(np.linalg.norm(r - rho, axis=1).min()) > 1.5 * reach:
             continue
@@ -535,9 +535,7 @@ def _seen_by_draws(setup: Setup, belief: Belief, times: Array, d: Array, z: Arra
     """Positions (m, n, 3) in {C} of the robot, displaced by ``d`` (n, 3) from the predicted grasp
     point, about m targets whose poses differ by ``z`` (m, 6) standard normal numbers.
     """
-    root = np.linalg.cholesky(
-        setup.estimator.pose_covariance(belief) + 1e-18 * np.eye(6)
-    )
+    root = np.linalg.cholesky(setup.estimator.pose_covariance(belief) + 1e-18 * np.eye(6))
     errors = z @ root.T
     R_ac = geometry.matrix(setup.estimator.attitude(belief)(times))
     y = np.einsum("nji,mnj->mni", R_ac, d[None] - errors[:, None, :3])
@@ -546,9 +544,7 @@ def _seen_by_draws(setup: Setup, belief: Belief, times: Array, d: Array, z: Arra
     return np.asarray(np.einsum("mij,mnj->mni", turns, y))
 
 
-def _in_fact(
-    setup: Setup, log: FlightLog, state: GuidanceState, truth: Motion
-) -> InFact | None:
+def _in_fact(setup: Setup, log: FlightLog, state: GuidanceState, truth: Motion) -> InFact | None:
     """What happened by the true motion; None where it is not known at the end of the flight."""
     closed = state.decision.action is Action.CAPTURE
     if not closed and state.decision.action is not Action.ABORT:
@@ -580,7 +576,7 @@ def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -
         stop_ns = min(next_ns, end_ns)
         if stop_ns > begin_ns:
             instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
-            rho, _, q = truth((instants - setup.since_ns) * 1e-9)
+            rho, _, q = truth(np.asarray((instants - setup.since_ns) * 1e-9, np.float64))
             known = np.isfinite(rho).all(axis=1)
             turned = np.einsum("nji,nj->ni", geometry.matrix(q[known]), (r - rho)[known])
             parts.append(turned)
@@ -588,7 +584,7 @@ def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -
     return bool(setup.contact.touched(y[None])[0])
 
 
-def _probability(good: Array) -> dict[str, Any]:
+def _probability(good: Any) -> dict[str, Any]:
     count, number = len(good), int(np.count_nonzero(good))
     probability = number / count
     return {
@@ -627,9 +623,7 @@ def _predicted(setup: Setup, belief: Belief, after_s: float) -> tuple[int, float
     return worst, float(sizes[worst]), _cause(steps, errors, worst)
 
 
-def _cause(
-    steps: Array, errors: Array, worst: int, pushed: Array | None = None
-) -> str:
+def _cause(steps: Array, errors: Array, worst: int, pushed: Array | None = None) -> str:
     """The quantity that explains most of an error.
 
     Args:

@@ -80,6 +80,11 @@ class Assessment:
     in_fact: InFact | None = None
 
     @property
+    def succeeds(self) -> bool:
+        """Whether a capture is likely, and did not fail where the true motion is known."""
+        return self.ok and (self.in_fact is None or self.in_fact.captured)
+
+    @property
     def ok(self) -> bool:
         """Whether a capture is likely."""
         return self.chance is Chance.LIKELY
@@ -179,11 +184,11 @@ class Assessment:
         if record is None:
             return None
         fact, interval = record["in_fact"], record["probability_95"]
-        numbers = {
+        more: dict[str, Any] = {
             name: None if record[name] is None else float(record[name])
             for name in ("probability", "at_s", "contact", "known_s")
         }
-        texts = {name: str(record[name]) for name in ("basis", "limit", "change", "task")}
+        more |= {name: str(record[name]) for name in ("basis", "limit", "change", "task")}
         tolerance = _errors_of(record["tolerance"])
         assert tolerance is not None
         return cls(
@@ -199,8 +204,7 @@ class Assessment:
                 None if fact["touched"] is None else bool(fact["touched"]),
                 str(fact["text"]),
             ),
-            **numbers,
-            **texts,
+            **more,
         )
 
 
@@ -244,4 +248,5 @@ def _errors_of(record: Mapping[str, Any] | None) -> CaptureError | None:
     if record is None:
         return None
     names = ("distance_m", "speed_mps", "angle_deg")
-    return CaptureError(*(math.nan if record[name] is None else float(record[name]) for name in names))
+    values = (math.nan if record[name] is None else float(record[name]) for name in names)
+    return CaptureError(*values)

@@ -240,7 +240,9 @@ class Replanning:
         futures = [self._scene(b) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
-        return spread(path, futures, planner, self.tolerance, aimed, disturbance, self._setup(0, 0).contact)
+        return spread(
+            path, futures, planner, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
+        )
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
         """Return the error of a plan made at scan ``index`` against the truth; None without

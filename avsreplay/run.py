@@ -10,10 +10,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from avsreplay import arithmetic, pipeline, settings
-from avsreplay.binary_files import pack_state, unpack
-from avsreplay.assess import FLIGHTS, FlightLog, Setup, assess
+from avsreplay.assess import FlightLog, Setup, assess
 from avsreplay.assessment import Assessment
+from avsreplay.binary_files import pack_state, unpack
 from avsreplay.build import first_state, grasp_advice, stages, task_and_target
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError, value_class
@@ -155,6 +157,7 @@ class Run:
         self._scored: Scorer | None = None
         self._end: tuple[Belief, State] | None = None
         self.flight = FlightLog()
+        self._assessed: tuple[int, Assessment] | None = None
 
     def __enter__(self) -> Run:
         return self
@@ -334,15 +337,19 @@ class Run:
         }
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         text = acceleration_text(self.config.estimator, self.acceleration)
-        return replace(self._fold.result(self.truth), counts=counts, acceleration=text)
+        found = self._fold.result(self.truth)
+        return replace(found, counts=counts, acceleration=text, assessment=self.assessment)
 
-    def assess(self, flights: int = FLIGHTS, seed: int = 0) -> Assessment:
-        """Return whether the robot would have captured the target, by the scans so far.
-
-        Args:
-            flights: number of simulated flights where the log ends before the capture.
-            seed: of all draws.
+    @property
+    def assessment(self) -> Assessment:
+        """Whether the robot would have captured the target, by the scans so far; it is computed
+        once.
         """
+        if self._assessed is None or self._assessed[0] != self.done:
+            self._assessed = self.done, self._assess()
+        return self._assessed[1]
+
+    def _assess(self) -> Assessment:
         surface, robot = self.surface, self.config.task.with_gripper(self.config.robot)
         motion = None if self._scored is None else self._scored.motion
         first_ns = self.flight.stamps[0] if self.flight.stamps else 0
@@ -356,8 +363,6 @@ class Run:
             since_ns=first_ns,
             thrust_noise_mps2=robot.thrust_noise * self._stages.guidance.params.a_max_mps2,
             noise=self.flight.noise,
-            flights=flights,
-            seed=seed,
             advice=grasp_advice(self.task, surface, self.config.fixture_axis_c),
         )
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
@@ -454,7 +459,7 @@ class Run:
                 t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns
             ]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
-        point = Pose([0.0, 0.0, 0.0, 1.0], self.task.grasp_c)
+        point = Pose(np.array([0.0, 0.0, 0.0, 1.0]), self.task.grasp_c)
         return [(t_ns, pose @ point) for t_ns, pose in poses]
 
     def _truth_of(self, scan: Scan) -> Truth:

@@ -85,7 +85,7 @@ class Saved:
         """
         if len(self.poses) < 4:
             return None
-        point = Pose([0.0, 0.0, 0.0, 1.0], grasp_c)
+        point = Pose(np.array([0.0, 0.0, 0.0, 1.0]), grasp_c)
         return interpolated(self.times_s, [pose @ point for pose in self.poses])
 
     @property
@@ -205,8 +205,9 @@ def task_settings(record: Mapping[str, Any]) -> TaskParams:
         record: as ``Task.record`` makes it.
     """
     names = {f.name for f in dataclasses.fields(TaskParams)}
-    known = {k: v for k, v in record.items() if k in names and v is not None}
-    return TaskParams(**{k: tuple(v) if isinstance(v, list) else v for k, v in known.items()})
+    known: dict[str, Any] = {k: v for k, v in record.items() if k in names and v is not None}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in known.items()}
+    return TaskParams(**values)
 
 
 def _noise(header: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -217,7 +218,7 @@ def _noise(header: Mapping[str, Any]) -> tuple[float, float] | None:
 
 
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
-    known = {k: v for k, v in config.get(name, {}).items() if v is not None}
+    known: dict[str, Any] = {k: v for k, v in config.get(name, {}).items() if v is not None}
     return toml_document.build(cls, toml_document.Document("run.json", {name: known}), (name,))
 
 

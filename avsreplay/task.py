@@ -140,6 +140,7 @@ class Task:
         mouth_m: distance from the grasp point, along the axis, at which the gripper is past the
             part that it encloses.
         deadline_s: latest time of the capture after the first scan; infinite without.
+        corridor_m: length of a corridor that ends where the clearance is kept; 0: the usual one.
         assumed: names of the values that were not given.
         problem: why the grasp point cannot be used, "" where it can.
     """
@@ -151,16 +152,20 @@ class Task:
     radius_m: float
     mouth_m: float
     deadline_s: float
+    corridor_m: float = 0.0
     assumed: tuple[str, ...] = ()
     problem: str = ""
 
     @property
     def text(self) -> str:
         """The task in one line, with the values that are assumed."""
-        p, t = self.tolerance, [
-            f"grasp at ({', '.join(f'{x:.4g}' for x in self.grasp_c)}) m",
-            f"along ({', '.join(f'{x:.3g}' for x in self.axis_c)}) in {{C}}",
-        ]
+        p, t = (
+            self.tolerance,
+            [
+                f"grasp at ({', '.join(f'{x:.4g}' for x in self.grasp_c)}) m",
+                f"along ({', '.join(f'{x:.3g}' for x in self.axis_c)}) in {{C}}",
+            ],
+        )
         t.append(
             f"within {1e3 * p.position_m:.3g} mm, {1e3 * p.speed_mps:.3g} mm/s and"
             f" {p.angle_deg:.3g} deg"
@@ -196,7 +201,7 @@ class Task:
         """
         if limits.final_deg is None or limits.final_range_m is not None:
             return limits
-        return replace(limits, final_range_m=self.mouth_m) if self.mouth_m > 0.0 else limits
+        return replace(limits, final_range_m=self.corridor_m) if self.corridor_m > 0.0 else limits
 
 
 @value_class(eq=True)
@@ -281,8 +286,9 @@ def task_of(
         tolerance,
         params.opening_m or 2.0 * half,
         radius,
-        mouth if begin <= least else begin,
+        mouth,
         math.inf if params.deadline_s is None else params.deadline_s,
+        1.2 * begin if 1.2 * begin > least else 0.0,
         tuple(assumed),
         problem,
     )

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
@@ -415,7 +416,9 @@ def closed_loop(
     return Ended(*decided, end_s, found, touched)
 
 
-def flown_positions(segment: Segment, begin_ns: int, end_ns: int) -> tuple[Array, Array]:
+def flown_positions(
+    segment: Segment, begin_ns: int, end_ns: int
+) -> tuple[NDArray[np.int64], Array]:
     """Return ten instants (n,) [ns] from ``begin_ns`` on before ``end_ns``, and the positions
     (n, 3) in {A}, up to the end of the segment.
 

@@ -92,9 +92,7 @@ class Spread:
             ("angle over belief", _text(self.angle_deg, 1.0, "deg", 3)),
             (
                 "plan flown blind",
-                (
-                    f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws"
-                ),
+                (f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws"),
             ),
         ]
         if self.contact >= 0.0:
