@@ -99,6 +99,7 @@ class FlightLog:
         converged: whether it may be used for planning.
         gammas: of all scans.
         stamps: of all scans [ns].
+        failing_ns: since when no capture is planned; None where one is.
         noises: (6,) variances of the last measured poses, metres and half angles.
     """
 
@@ -110,6 +111,7 @@ class FlightLog:
         self.gammas: list[int] = []
         self.stamps: list[int] = []
         self.noises: list[Array] = []
+        self.failing_ns: int | None = None
 
     def take(
         self,
@@ -135,6 +137,10 @@ class FlightLog:
         if self.ended or guidance is None:
             return
         self.state, self.belief, self.converged = guidance, belief, converged
+        if converged and guidance.plan is not None and guidance.plan.found:
+            self.failing_ns = None
+        elif self.failing_ns is None and converged:
+            self.failing_ns = belief.t_ns
         if guidance.supervisor.moving:
             decided = guidance.decision
             self.legs.append(Leg(belief, guidance.segment, decided.action, decided.rule))
@@ -340,7 +346,7 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
                 f"no capture within {params.horizon_s:g} s with {params.a_max_mps2:g} m/s2"
                 f" ({'proven impossible' if words == 'proven' else 'none found'})"
             ),
-            "known_s": setup.at_s(plan.t_ns),
+            "known_s": setup.at_s(log.failing_ns or plan.t_ns),
             "change": "more thrust or a longer horizon; 'avsreplay plan' names the settings",
         }
     after = _planned_s(setup, belief)

@@ -27,7 +27,14 @@ from avsreplay.plan.flights import Ended, Execution, Miss, miss
 from avsreplay.plan.flights import execute as plan_execute
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
-from avsreplay.plan.limits import CONSTRAINTS, Scene, in_fixture_axes, margin, margins
+from avsreplay.plan.limits import (
+    CONSTRAINTS,
+    Scene,
+    TargetGeometry,
+    in_fixture_axes,
+    margin,
+    margins,
+)
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
@@ -75,7 +82,11 @@ class Replanning:
                 "the result contains no model", where=saved.name, hint="plan without a clearance"
             )
         surface, axis = saved.surface or _NO_MODEL, saved.task.axis or (1.0, 0.0, 0.0)
-        target = target_geometry(surface, axis)
+        target = (
+            target_geometry(surface, axis)
+            if saved.surface is not None
+            else TargetGeometry(np.array(axis), np.zeros((1, 3)), lambda y: (y, np.zeros(len(y))))
+        )
         assert target.surface is not None
         self.task = task_of(
             saved.task,

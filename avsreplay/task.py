@@ -239,7 +239,8 @@ def task_of(
 
     Args:
         params: as configured.
-        supervisor, robot: parameters that apply where the task gives nothing.
+        supervisor: its parameters, which apply where the task gives nothing.
+        robot: the robot, likewise.
         axis_c: axis where the task gives none.
         surface: model of the target.
         closest: its closest points.

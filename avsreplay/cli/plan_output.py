@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from avsreplay.errors import value_class
 
 if TYPE_CHECKING:
-    from avsreplay.outcome import Plan
     from avsreplay.assessment import Assessment
+    from avsreplay.outcome import Plan
     from avsreplay.plan.flights import Execution, Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread

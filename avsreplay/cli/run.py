@@ -61,7 +61,10 @@ class Requirement(click.ParamType[str | float]):
     name = "pass|check|any|capture=P"
 
     def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+        self,
+        value: Any,
+        param: click.Parameter | None,
+        ctx: click.Context | None,  # noqa: ARG002 -- the signature of click
     ) -> str | float:
         """Return the name of a grade, or the probability."""
         text = str(value).lower()

@@ -59,9 +59,9 @@ __all__ = [
     "CostatePath",
     "Decision",
     "Disturbance",
+    "Ended",
     "Execution",
     "Facts",
-    "Ended",
     "Guidance",
     "GuidanceState",
     "Limits",
@@ -427,7 +427,8 @@ def flown_positions(
         begin_ns: First instant.
         end_ns: End of the interval.
     """
-    instants = np.linspace(begin_ns, end_ns, PATH_INSTANTS, endpoint=False).astype(np.int64)
+    steps = np.arange(PATH_INSTANTS, dtype=np.int64)
+    instants = begin_ns + steps * (end_ns - begin_ns) // PATH_INSTANTS
     if segment.path is not None:
         instants = instants[instants <= segment.end_ns]
     return instants, np.array([segment.at(int(t))[0] for t in instants]).reshape(-1, 3)
@@ -442,7 +443,8 @@ def relative_path(
         scene: The target.
         segment: What the robot flies.
         start_ns: Instant from which the times of the scene count.
-        begin_ns, end_ns: The two scans.
+        begin_ns: First scan.
+        end_ns: The other scan.
     """
     instants, r = flown_positions(segment, begin_ns, end_ns)
     if not len(r) or scene.attitude is None:

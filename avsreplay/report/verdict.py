@@ -30,6 +30,7 @@ INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
 FALSE_ALARMS = 0.05  # share of the scans without a fault
 ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
+SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 GROWTH, GROWTH_SCANS = (
     3.0,
     30,
@@ -364,6 +365,30 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(
             Grade.CHECK,
             f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
+        )
+    if summary.assessment is None:  # else it states whether the estimate suffices
+        yield from _convergence(rows, summary)
+
+
+def _convergence(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Whether the estimate converged, and still is."""
+    t1 = summary.convergence
+    if rows and t1.t1_s is None:
+        blocks = (
+            f" (not converged: {rows[-1].unconverged_blocks})"
+            if rows[-1].unconverged_blocks
+            else ""
+        )
+        yield Concern(
+            Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}"
+        )
+    elif (
+        rows
+        and rows[-1].t_s - (held := max(row.t_s for row in rows if row.converged)) > SHORT_LAPSE_S
+    ):
+        yield Concern(
+            Grade.CHECK,
+            f"convergence, reached at {t1.t1_s:.1f} s, does not hold after {held:.1f} s",
         )
 
 
