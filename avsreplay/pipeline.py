@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Estimator, Prediction, Track, in_doubt, with_change
+from avsreplay.estimate import Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
@@ -96,7 +97,7 @@ class Monitors:
     def observe(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         innovation: Innovation | None,
         gamma: int,
@@ -149,7 +150,7 @@ class Monitors:
     def _gramian(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         healthy: Innovation | None,
         track: Track,
@@ -176,7 +177,7 @@ class Stages:
     """
 
     registrar: Registrar
-    estimator: Estimator
+    estimator: AnyEstimator
     faults: FaultDetector
     monitors: Monitors
     guidance: Guidance
@@ -439,7 +440,7 @@ without measurements.
 
 
 def target_scene(
-    estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
+    estimator: AnyEstimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
 ) -> Scene:
     """Return the predicted target after a belief about the grasp point, as the planner uses it:
     estimate and forecast, never the truth.
@@ -460,7 +461,7 @@ def target_scene(
 
 
 def planner_input(
-    estimator: Estimator,
+    estimator: AnyEstimator,
     belief: Belief,
     target: TargetGeometry,
     gamma: int,

@@ -11,7 +11,7 @@ import numpy as np
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
-from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.model_size import Advice, compare_sizes, find_model
 from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register.registrar import Registrar

@@ -94,12 +94,7 @@ class Replanning:
         )
         self.limits = self.task.corridor(self.robot.limited(limits)).resolved(saved.extent_m)
         target = replace(target, axis_c=self.task.axis_c)
-        self._whole = target_at(target, self.task.grasp_c)
-        self._target = (
-            self._whole
-            if self.limits.clearance_m is not None
-            else replace(self._whole, surface=None)
-        )
+        self._target = target_at(target, self.task.grasp_c)
         self.truth = saved.truth(self.task.grasp_c)
 
     @property
@@ -319,7 +314,7 @@ class Replanning:
             task=self.task,
             estimator=self.saved.estimator,
             guidance=self._guidance(),
-            target=self._whole,
+            target=self._target,
             solid=surface is not None and len(surface.faces) > 0,
             extent_m=self.saved.extent_m,
             since_ns=self.saved.since_ns,

@@ -15,10 +15,11 @@ import numpy as np
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.assess import FlightLog, Setup, assess
 from avsreplay.assessment import Assessment
-from avsreplay.binary_files import pack_state, unpack
 from avsreplay.build import first_state, grasp_advice, stages, task_and_target
+from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError, value_class
+from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.initialise import PoseFix
@@ -275,7 +276,7 @@ class Run:
             self.flight,
         )
         motion = None if self._scored is None else self._scored.motion
-        return pack_state((*own, self._fixes, self._reference_instants, more), self._named(motion))
+        return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
     def restore(self, path: Path, more: Any = None) -> Any:
         """Continue from a checkpoint; returns what was stored with it.
@@ -288,15 +289,16 @@ class Run:
             UnreadableInput: the file is missing or damaged.
         """
         scored = self._scorer()
+        motion, scored.motion = scored.motion, None  # it is named and not stored
         judged = self._fold, self.model_check, None, scored, self.flight
-        like: Any = (None, 0, *judged, [], [], more)
+        like: Any = (self._state, 0, *judged, [], [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self._fold, self.model_check, self._end, *rest = found
         self._scored, self.flight, *rest = rest
         self._fixes, self._reference_instants, stored = rest
         if self._fixes:
             self._reference = reference_motion(self._fixes, self.estimator)
-        self._scored.motion = self._scorer().motion if self._fixes else scored.motion
+        self._scored.motion = self._scorer().motion if self._fixes else motion
         return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
@@ -355,7 +357,7 @@ class Run:
         first_ns = self.flight.stamps[0] if self.flight.stamps else 0
         setup = Setup(
             task=self.task,
-            estimator=self.estimator,
+            estimator=self._predictor(),
             guidance=self._stages.guidance,
             target=self._target,
             solid=len(surface.faces) > 0,
@@ -368,6 +370,13 @@ class Run:
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
         given = None if motion is None else (lambda times: motion(times + since_s))
         return assess(setup, self.flight, given)
+
+    def _predictor(self) -> Estimator:
+        """The estimator that predicts targets from a belief; a plug-in only predicts its own."""
+        if isinstance(self.estimator, Estimator):
+            return self.estimator
+        first_ns = self.flight.stamps[0] if self.flight.stamps else 0
+        return Estimator(self.config.estimator, None, self.surface.extent, first_ns)
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes

@@ -20,6 +20,8 @@ from typing import Any, Self
 
 from avsreplay.errors import value_class
 
+LARGEST = 1e100  # of every setting: squares and products of two settings remain finite
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
@@ -98,9 +100,10 @@ class Setting:
                 unit = f" [{self.unit}]" if self.unit else ""
                 each = "each value " if several else ""
                 shown = list(value) if several else value
-                raise SettingError(
-                    name, f"{name} is {shown}, {each}must be {self.range or 'finite'}{unit}"
-                )
+                allowed = self.range or "finite"
+                if LARGEST < abs(number) < math.inf:
+                    allowed = f"at most {LARGEST:g} in magnitude"
+                raise SettingError(name, f"{name} is {shown}, {each}must be {allowed}{unit}")
 
     def _allows(self, number: float) -> bool:
         inside = (
@@ -109,11 +112,7 @@ class Setting:
             and (self.below is None or number < self.below)
             and (self.high is None or number <= self.high)
         )
-        return inside and (
-            isinstance(number, int)
-            or math.isfinite(number)
-            or (self.infinite and not math.isnan(number))
-        )
+        return inside and (abs(number) <= LARGEST or (self.infinite and math.isinf(number)))
 
 
 class SettingError(ValueError):

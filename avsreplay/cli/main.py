@@ -33,6 +33,7 @@ SUMMARIES = {
     "info": "Show the content of a log and the options that a run needs.",
     "doctor": "Check a log for damage and repair it.",
     "backends": "List the registration back ends; run the contract tests on one.",
+    "estimators": "List the estimators; run the contract tests on one.",
     "bench": "Compare the speed and error of back ends on a log.",
     "observability": "Show which states the measurements of a log determine.",
     "plan": "Plan the capture again from a saved result.",

@@ -24,7 +24,7 @@ from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
-from avsreplay.log.point_cloud2 import decode_cloud, read_layout
+from avsreplay.log.point_cloud2 import raw_cloud, read_layout
 from avsreplay.log.source import Source
 from avsreplay.log.writer import LIBRARY
 from avsreplay.records import Scan, ScanStatus
@@ -300,7 +300,7 @@ class _Copier:
         """
         if channel.type in CLOUD_TYPES:
             try:
-                decode_cloud(payload, channel.encoding)
+                raw_cloud(payload, channel.encoding)
             except BadMessage as error:
                 self.done.dropped.append(f"a cloud on {shown(channel.topic)}: {shown(error)}")
                 return

@@ -31,7 +31,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
-from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
 from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Belief, Label, LogHeader, State, Surface

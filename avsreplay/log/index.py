@@ -14,7 +14,8 @@ from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
 from avsreplay.log.cdr import Cursor
 from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, decode_cloud
+from avsreplay.log.point_cloud2 import raw_cloud
+from avsreplay.log.raw_cloud import RawCloud
 
 MAX_NS = (
     2**31 - 2
@@ -279,9 +280,9 @@ class MessageClouds:
         """Parts of the log that could not be read."""
         return self._recording.losses
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
-        return decode_cloud(*self.payload(place))
+        return raw_cloud(*self.payload(place))
 
     def payload(self, place: int) -> tuple[bytes | memoryview, str]:
         """Return the serialised message and its encoding.

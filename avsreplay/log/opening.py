@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from avsreplay.errors import UnreadableInput, UsageError, counted
+from avsreplay.errors import AvsError, UnreadableInput, UsageError, counted
 from avsreplay.geometry import Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
@@ -54,8 +54,8 @@ def open_source(
     Raises:
         UnreadableInput: it does not exist, is of no known format, has no cloud topic, or
             (``strict``) is damaged.
-        UsageError: there are several cloud topics and none was chosen, or a requested topic or
-            frame does not exist.
+        UsageError: there are several cloud topics and none was chosen, a requested topic or
+            frame does not exist, or the values of the clouds do not tell what they mean.
     """
     path, options = Path(path), options or SourceOptions()
     try:
@@ -65,12 +65,24 @@ def open_source(
             error.strerror or "cannot be read", where=shown(path), hint="check the path"
         ) from None
     try:
+        if not inspect:
+            _refuse_undecided(source)
         if options.strict:
             refuse_losses(source)
-    except UnreadableInput:
+    except AvsError:
         source.close()
         raise
     return source
+
+
+def _refuse_undecided(source: Source) -> None:
+    """Raise UsageError if the values of the clouds leave open what they mean."""
+    if refused := source.meaning.refused:
+        raise UsageError(
+            f"{refused.about}: {refused.sentence}",
+            where=shown(source.path),
+            hint=f"state it: {refused.option}",
+        )
 
 
 def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:

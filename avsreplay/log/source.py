@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,9 +20,26 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.canonical import (
+    SAMPLE,
+    Cloud,
+    Meaning,
+    at_stamp,
+    canonical,
+    infer,
+    selected,
+    spread,
+)
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, lost_text
-from avsreplay.log.point_cloud2 import Cloud, at_stamp, selected
+from avsreplay.log.options import (
+    ClockChoice,
+    ClockSummary,
+    LogInfo,
+    Loss,
+    SourceOptions,
+    lost_text,
+)
+from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
@@ -104,6 +123,26 @@ class Source:
     def clock(self) -> ClockSummary:
         """Return how the times of the scans were determined."""
         return self._clock
+
+    @cached_property
+    def meaning(self) -> Meaning:
+        """What the numbers of the clouds mean, inferred from some that are spread over the log."""
+        if self.options.poses:
+            return Meaning()
+        sound = [k for k, placed in enumerate(self._placed) if placed.note is None]
+        sample = list[TimedCloud]()
+        for k in spread(len(sound), SAMPLE):
+            with suppress(BadMessage):
+                sample.append(TimedCloud(self._clouds.load(sound[k]), self._stamp(sound[k])))
+        return infer(sample, self._period_s(), self.options)
+
+    def _period_s(self) -> float | None:
+        """Return the usual time between two scans [s], None if it is not known."""
+        if not self._clouds.topics() and "assumed" in self.header.notes.get("times", ""):
+            return None
+        steps = sorted(b.t_ns - a.t_ns for a, b in pairwise(self._placed))
+        period_ns = steps[len(steps) // 2] if steps else 0
+        return period_ns * 1e-9 if period_ns > 1 else None
 
     def truth_poses(self) -> list[tuple[int, Pose]]:
         """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in
@@ -313,13 +352,26 @@ class Source:
     def _scan(self, seq: int, place: int) -> Scan:
         placed = self._placed[place]
         try:
-            cloud = self._taken(self._clouds.load(place), placed.t_ns)
+            cloud = self._taken(self._canonical(place), placed.t_ns)
         except BadMessage as error:
             self.damaged[seq] = shown(error)
             if self.options.strict:
                 refuse_losses(self)
             return self._finish(seq, place, None, self.damaged[seq])
         return self._finish(seq, place, cloud, placed.note)
+
+    def _canonical(self, place: int) -> Cloud:
+        """Return one cloud in metres, with its returns and their times only.
+
+        Raises BadMessage if it cannot be decoded.
+        """
+        raw = self._clouds.load(place)
+        trusted = self._placed[place].note is None
+        return canonical(raw, self.meaning, self._stamp(place) if trusted else 0)
+
+    def _stamp(self, place: int) -> int:
+        """Return the stamp of a cloud, or its time of reception if it has none [ns]."""
+        return self._clouds.header_ns[place] or self._clouds.log_ns[place]
 
     def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
         placed, log_ns = self._placed[place], self._clouds.log_ns[place]

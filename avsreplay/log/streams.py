@@ -13,8 +13,6 @@ from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TypeVar
 
-import numpy as np
-
 from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
@@ -22,9 +20,9 @@ from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.header import with_vertices
 from avsreplay.log.index import MessageClouds, Recording, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, usable
 from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
+from avsreplay.log.raw_cloud import RawCloud, of_points
 from avsreplay.log.scan_files import read_points
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
 from avsreplay.read_budget import BadFile
@@ -32,7 +30,6 @@ from avsreplay.records import LogHeader
 
 T = TypeVar("T")
 _WAIT_S = 0.1
-_NO_POINTS = np.zeros((0, 3), np.float32)
 EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero means "unset"
 
 
@@ -48,10 +45,10 @@ class PoseMessages(MessageClouds):
         super().__init__(recording, topic)
         self.type = next((t.type for t in recording.topics() if t.name == topic), "")
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Return the decoded pose. Raises BadMessage if it cannot be decoded or is not valid."""
         stamp_ns, frame, pose = decode_measured(self.type, *self.payload(place))
-        return Cloud(stamp_ns, frame, _NO_POINTS, None, 0, pose)
+        return RawCloud(stamp_ns, frame, {}, (1, 0), pose=pose)
 
 
 class _Files:
@@ -90,12 +87,12 @@ class PoseFile(_Files):
             steady if found.t_ns is None else list(found.t_ns)
         )
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Return one pose. Raises BadMessage if its line has no valid pose."""
         pose = self._poses[place]
         if isinstance(pose, str):
             raise BadMessage(pose)
-        return Cloud(self.header_ns[place], "", _NO_POINTS, None, 0, pose)
+        return RawCloud(self.header_ns[place], "", {}, (1, 0), pose=pose)
 
 
 class FolderClouds(_Files):
@@ -117,7 +114,7 @@ class FolderClouds(_Files):
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
 
-    def load(self, place: int) -> Cloud:
+    def load(self, place: int) -> RawCloud:
         """Read one file. Raises BadMessage if it cannot be decoded."""
         path = self._files[place]
         try:
@@ -129,9 +126,7 @@ class FolderClouds(_Files):
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None
         except ValueError as error:
             raise BadMessage(f"{shown(path.name)}: {error}") from None
-        chosen = usable(points)
-        kept = points if chosen is None else points[chosen]
-        return Cloud(self.header_ns[place], "", kept, None, len(points) - len(kept))
+        return of_points(points, self.header_ns[place])
 
 
 CloudStream = MessageClouds | FolderClouds | PoseFile
