@@ -402,7 +402,7 @@ class Run:
             "robot": self.config.robot_line,
             "approach": settings.dump(self.approach),
             "task": self.task.record(),
-            "config": settings.dump(self.config),
+            "config": settings.dump(replace(self.config, register=self.config.register.with_own())),
         }
 
     def _new_stages(self) -> Stages:
