@@ -84,7 +84,7 @@ def test_a_corridor_does_not_end_inside_the_part_at_the_grasp_point():
 
 
 def contact(radius_m=0.0, half_m=0.01, mouth_m=0.0):
-    surface, closest = body()
+    _, closest = body()
     return Contact(closest, np.array([1.0, 0.0, 0.0]), radius_m, half_m, mouth_m)
 
 
@@ -101,7 +101,7 @@ def test_a_straight_approach_is_no_contact_and_a_path_through_the_body_is():
 
 
 def test_a_part_that_the_gripper_encloses_is_entered_through_the_mouth_only():
-    surface, closest = body(Shape.BRACKET)
+    _, closest = body(Shape.BRACKET)
     grip = Contact(closest, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
     x = np.linspace(0.6, 0.0, 201)
     along = np.column_stack([x, 0.0 * x, 0.0 * x])
