@@ -26,6 +26,7 @@ from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.aliasing import Instants, in_words, other_rate
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,
@@ -75,6 +76,7 @@ class MonitorState:
     convergence: ConvergenceTrack
     violations: int = 0
     motion: FittedMotion | None = None
+    instants: Instants = Instants()
 
 
 @value_class
@@ -128,8 +130,10 @@ class Monitors:
         )
         forecast = estimator.track_forecast(track, self.convergence.times_s)
         possible = with_change(forecast, belief, track.change_P)
+        instants = state.instants.after(belief.t_ns) if healthy else state.instants
+        w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
         judged = self.convergence.judge(
-            state.convergence, belief, forecast, consistent is True, possible
+            state.convergence, belief, forecast, consistent is True and alias is None, possible
         )
         report = MonitorReport(
             ogm_rank=rank.rank,
@@ -142,10 +146,11 @@ class Monitors:
             converged=judged.converged,
             covariance_converged=judged.covariance_converged,
             predictive_converged=judged.predictive_converged,
-            unconverged=judged.unknown,
+            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(w, alias)),
             forecast=forecast,
         )
-        return MonitorState(gramian, seen, judged, state.violations + len(failed), motion), report
+        violated = state.violations + len(failed)
+        return MonitorState(gramian, seen, judged, violated, motion, instants), report
 
     def _gramian(
         self,
