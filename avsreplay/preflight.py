@@ -234,6 +234,10 @@ def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]
         others = f" (or {', '.join(names[1:3])})" if names[1:] else ""
         text = f"no truth is selected, but the log has poses{others}"
         return [Advice("ok", "truth", text, f"--truth-topic {names[0]}")]
+    frame = scans[0].frame if scans else ""
+    if moving := source.moving_beside(frame):
+        text = f"no truth is selected, but in /tf '{shown(moving[0])}' moves; is it the target?"
+        return [Advice("ok", "truth", text, f"--truth-frame {shown(moving[0])}")]
     return [
         Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")
     ]
