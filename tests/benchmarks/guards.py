@@ -103,7 +103,7 @@ GUARDS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "binary_files.py",
-        "    check_declared(count, dtype.itemsize, len(data) - start - size, \"numbers\")\n",
+        '    check_declared(count, dtype.itemsize, len(data) - start - size, "numbers")\n',
         "",
         "test_files.py::test_an_archive_that_declares_too_much_is_refused",
     ),
