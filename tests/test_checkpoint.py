@@ -104,9 +104,9 @@ def test_registrations_end_on_request_unless_they_are_shielded(fixtures_folder):
         with pytest.raises(KeyboardInterrupt):
             index.closest(points)
         with shielded():
-            assert np.array_equal(index.closest(points).foot, before.foot)
+            assert np.array_equal(index.closest(points).id, before.id)
         request_stop(False)
-        assert np.array_equal(index.closest(points).foot, before.foot)
+        assert np.array_equal(index.closest(points).id, before.id)
 
 
 def test_other_settings_are_refused(fixtures_folder, tmp_path):
