@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Estimator, Prediction, Track, in_doubt, with_change
+from avsreplay.estimate import Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
+from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
@@ -95,7 +96,7 @@ class Monitors:
     def observe(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         innovation: Innovation | None,
         gamma: int,
@@ -148,7 +149,7 @@ class Monitors:
     def _gramian(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         healthy: Innovation | None,
         track: Track,
@@ -174,7 +175,7 @@ class Stages:
     """
 
     registrar: Registrar
-    estimator: Estimator
+    estimator: AnyEstimator
     faults: FaultDetector
     monitors: Monitors
     guidance: Guidance
@@ -435,7 +436,7 @@ without measurements.
 
 
 def target_scene(
-    estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
+    estimator: AnyEstimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
 ) -> Scene:
     """Return the predicted target after a belief, as the planner uses it: estimate and
     forecast, never the truth.
@@ -456,7 +457,7 @@ def target_scene(
 
 
 def planner_input(
-    estimator: Estimator,
+    estimator: AnyEstimator,
     belief: Belief,
     target: TargetGeometry,
     gamma: int,

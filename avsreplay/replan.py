@@ -79,9 +79,7 @@ class Replanning:
         limits = self.robot.limited(limits)
         self.limits = limits.resolved(saved.extent_m)
         if saved.surface is not None:
-            self._target = target_geometry(
-                saved.surface, saved.axis_c, limits.clearance_m is not None
-            )
+            self._target = target_geometry(saved.surface, saved.axis_c)
         elif limits.clearance_m is None:
             self._target = TargetGeometry(np.array(saved.axis_c), np.zeros((1, 3)))
         else:

@@ -335,7 +335,7 @@ class Run:
             "selection": settings.dump(self.job.options),
             "robot": self.config.robot_line,
             "approach": settings.dump(self.config.approach_limits(surface.extent)),
-            "config": settings.dump(self.config),
+            "config": settings.dump(replace(self.config, register=self.config.register.with_own())),
         }
 
     def _new_stages(self) -> Stages:

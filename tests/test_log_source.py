@@ -271,7 +271,7 @@ def test_several_cloud_topics_are_listed_and_one_can_be_chosen(tmp_path: Path) -
     assert "\\x1b[31m" in str(caught.value)
     assert "\x1b" not in str(caught.value)
     check(read(path, topic="/left"), with_truth=False)
-    with pytest.raises(UsageError, match="no PointCloud2 topic '/middle'"):
+    with pytest.raises(UsageError, match="no cloud topic '/middle'"):
         open_source(path, SourceOptions(topic="/middle"))
 
 

@@ -28,6 +28,7 @@ METHOD = {
 }  # names of parameters
 ASSIGNED = {
     "backend": "register.backend",
+    "estimator": "estimator.method",
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from avsreplay.cli import interrupts
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output, is_stream
@@ -96,6 +97,7 @@ run_source_options = added(
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--scan-duration", "scan_duration_s", type=float),
+    source_setting("--intrinsics", type=str),
     source_setting("--scan-unit"),
     source_setting("--point-time", metavar="FIELD:UNIT:ORIGIN"),
     source_setting("--no-return", metavar="CODES"),
@@ -342,6 +344,8 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
     asked: list[int] = []
 
     def ask(number: int, _frame: object) -> None:
+        if not interrupts.counts():
+            return
         asked.append(number)
         stop()
         if not rows or len(asked) > 1:

@@ -254,12 +254,11 @@ def _changes(
         for factor in factors if before and len(out) < MOST_CHANGES else ():
             value, number = _scaled(before, factor)
             given: dict[str, Any] = {name: number} if table == "robot" else {}
-            robot = replace(planning.robot, **given)
-            changed = replace(
-                with_settings(saved, () if table == "robot" else (f"{key}={value}",)), robot=robot
-            )
             others = {k: v for k, v in flags.items() if k != name}
             try:
+                robot = replace(planning.robot, **given)
+                settings = () if table == "robot" else (f"{key}={value}",)
+                changed = replace(with_settings(saved, settings), robot=robot)
                 made = _planning(changed, others, planning.arm).plan_at(index)
             except (ValueError, UsageError):  # the changed value contradicts another one
                 continue

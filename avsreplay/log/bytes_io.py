@@ -4,17 +4,12 @@ to print.
 
 from __future__ import annotations
 
-import re
 import threading
 from pathlib import Path
 from typing import Any
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, printable
 
-# C0 and C1 control characters, bidirectional marks, zero-width characters and lone surrogates.
-_UNSAFE = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
-)
 _SMALL, _BLOCK = 256, 1 << 16  # small reads (record heads) are served from one cached block
 ROS1_MAGIC, SQLITE_MAGIC = (
     b"#ROSBAG V2.0\n",
@@ -33,9 +28,7 @@ def shown(text: object) -> str:
     r"""Return ``str(text)`` with every control character replaced by an escape (``\x1b``,
     ``\u202e``).
     """
-    return _UNSAFE.sub(
-        lambda m: m[0].encode("unicode_escape", "surrogatepass").decode("ascii"), str(text)
-    )
+    return printable(str(text))
 
 
 class ByteFile:

@@ -39,6 +39,7 @@ from avsreplay.log.options import (
     SourceOptions,
     lost_text,
 )
+from avsreplay.log.point_cloud2 import Layout
 from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
@@ -292,11 +293,11 @@ class Source:
         """
         return self._ground_truth.moving_in(frame)
 
-    def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
-        """Yield the serialised cloud messages with their encoding; none for a folder."""
+    def layouts(self) -> Iterator[Layout]:
+        """Yield the layouts of the messages of clouds; none for depth images, poses and files."""
         for at in self._selected:
             try:
-                found = self._clouds.payload(at)
+                found = self._clouds.layout(at)
             except BadMessage:
                 continue
             if found is not None:

@@ -17,8 +17,10 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.camera import Camera
+from avsreplay.log.depth_image import DepthImage, depth_cloud, read_png
 from avsreplay.log.header import with_vertices
-from avsreplay.log.index import MessageClouds, Recording, Sink
+from avsreplay.log.index import MessageClouds, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
 from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
@@ -36,14 +38,7 @@ EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero
 class PoseMessages(MessageClouds):
     """The measured poses of one topic; same interface as MessageClouds, with poses in place of
     points.
-
-    Attributes:
-        type: message type of the topic.
     """
-
-    def __init__(self, recording: Recording, topic: str | None) -> None:
-        super().__init__(recording, topic)
-        self.type = next((t.type for t in recording.topics() if t.name == topic), "")
 
     def load(self, place: int) -> RawCloud:
         """Return the decoded pose. Raises BadMessage if it cannot be decoded or is not valid."""
@@ -57,7 +52,7 @@ class _Files:
     topic: str | None = None
     losses: Sequence[Loss] = ()
 
-    def payload(self, place: int) -> None:
+    def layout(self, place: int) -> None:
         """Return None: files hold no messages."""
 
     def topics(self) -> list[TopicInfo]:
@@ -103,14 +98,20 @@ class FolderClouds(_Files):
         rate_hz: scans per second, used if ``times_ns`` is not given.
         limit: largest file that is read [bytes].
         times_ns: time of each file [ns].
+        camera: of the files, if they are depth images.
     """
 
     kind = "folder"
 
     def __init__(
-        self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None
+        self,
+        files: list[Path],
+        rate_hz: float,
+        limit: int,
+        times_ns: list[int] | None = None,
+        camera: Camera | None = None,
     ) -> None:
-        self._files, self._limit = files, limit
+        self._files, self._limit, self._camera = files, limit, camera
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
 
@@ -121,6 +122,9 @@ class FolderClouds(_Files):
             size = path.stat().st_size
             if size > self._limit:
                 raise BadFile(f"{size} bytes are over the limit of {self._limit}")
+            if self._camera is not None:
+                values = read_png(path.read_bytes(), self._limit)
+                return depth_cloud(DepthImage(self.header_ns[place], "", values), self._camera)
             points = read_points(path, self._limit)
         except OSError as error:
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None

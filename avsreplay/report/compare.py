@@ -11,7 +11,7 @@ from avsreplay.errors import value_class
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
-from avsreplay.settings import dump, entries
+from avsreplay.settings import dump, entries, value_of
 
 
 @value_class(eq=True)
@@ -237,13 +237,12 @@ def changed_settings(*tables: Any) -> list[str]:
     """
     found = []
     for table in tables:
-        defaults = flat(dump(type(table)()))
-        words = {e.key: e.declared.automatic or "off" for e in entries(type(table))}
-        for key, value in flat(dump(table)).items():
-            if value != defaults.get(key):
-                unset = words.get(key, "off")
+        for entry in entries(type(table)):
+            value, default = dump(value_of(table, entry.key)), dump(entry.default)
+            if value != default:
+                unset = entry.declared.automatic or "off"
                 found.append(
-                    f"{key} = {_value(value, unset)} (default {_value(defaults.get(key), unset)})"
+                    f"{entry.key} = {_value(value, unset)} (default {_value(default, unset)})"
                 )
     return found
 

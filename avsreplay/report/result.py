@@ -182,6 +182,8 @@ def load_result(path: str | Path) -> Result:
         unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
     with without_garbage_collection():
         rows = read_rows(rows_path)
+        if not rows:
+            raise UnreadableInput("has no rows", where=str(rows_path), hint=_RUN_AGAIN)
         if not unverified and len(rows) != header.get("rows"):
             what = f"{len(rows)} rows, run.json states {header.get('rows')}"
             raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
