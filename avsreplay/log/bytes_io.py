@@ -120,6 +120,33 @@ def inflate(data: bytes, compression: str, size: int) -> bytes:
     return out
 
 
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+def unpacked(payload: bytes | memoryview, encoding: str, limit: int) -> bytes | memoryview:
+    """Return a message, decompressed where rosbag2 compressed each message of its own.
+
+    Args:
+        payload: the message as it is stored.
+        encoding: of the message; one in CDR never begins with the mark of zstd.
+        limit: largest message that is decompressed [bytes].
+
+    Raises:
+        BadMessage: it cannot be decompressed, or is over the limit.
+    """
+    if encoding != "cdr" or bytes(payload[:4]) != ZSTD_MAGIC:
+        return payload
+    import zstandard
+
+    try:
+        size = zstandard.get_frame_parameters(payload).content_size
+    except zstandard.ZstdError as error:
+        raise BadMessage(f"a message that cannot be decompressed: {error}") from None
+    if size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR) or size > limit:
+        raise BadMessage(f"a compressed message without a size, or over the limit of {limit} bytes")
+    return inflate(bytes(payload), "zstd", size)
+
+
 def _zstd(data: bytes, size: int) -> bytes:
     import zstandard
 

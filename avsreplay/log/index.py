@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
+from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate, unpacked
 from avsreplay.log.camera import CAMERA_INFO
 from avsreplay.log.cloud_messages import LAYOUTS, message_stamp, raw_message
 from avsreplay.log.depth_image import IMAGE_TYPES
@@ -98,16 +98,21 @@ class MessageTable:
     pass over the log.
 
     Args:
-        sinks: called with every message of a topic during the pass.
+        sinks: called with every message of a topic during the pass; the sink of ``*/tf`` also for
+            every other topic with this last part, as those of a namespace.
+        limit: largest message that is decompressed [bytes].
     """
 
-    def __init__(self, sinks: dict[str, Sink] | None = None) -> None:
-        self._sinks = dict(sinks or {})
+    def __init__(self, sinks: dict[str, Sink] | None = None, limit: int = 1 << 27) -> None:
+        self._sinks, self._limit = dict(sinks or {}), limit
         self._topics: dict[str, _TopicCount] = {}
         self._clouds: dict[str, CloudIndex] = {}
 
     def declare(self, topic: str, kind: str, encoding: str) -> None:
         """Declare a topic; the first declared type is kept."""
+        shared = self._sinks.get(f"*/{topic.rsplit('/', 1)[-1]}")
+        if shared is not None:
+            self._sinks.setdefault(topic, shared)
         self._topics.setdefault(topic, _TopicCount(topic, kind, encoding))
 
     def add(
@@ -117,11 +122,17 @@ class MessageTable:
         (container, offset).
         """
         known = self._topics[topic]
+        stored = len(payload)
+        if topic in self._sinks or known.type in _INDEXED:
+            try:
+                payload = memoryview(unpacked(payload, known.encoding, self._limit))
+            except BadMessage:  # it is indexed, and reported when it is read
+                payload = memoryview(b"")
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
         if known.type in _INDEXED:
             clocks = (log_ns, times[1], message_stamp(known.type, payload, known.encoding))
-            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
+            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, stored)
         if topic in self._sinks:
             self._sinks[topic](known.type, known.encoding, log_ns, payload)
 
@@ -132,6 +143,14 @@ class MessageTable:
             for t in self._topics.values()
         )
         return sorted(infos, key=lambda t: t.name)
+
+    def encoding(self, topic: str) -> str:
+        """Return the encoding of a declared topic."""
+        return self._topics[topic].encoding
+
+    def wants(self, topic: str) -> bool:
+        """Return whether a sink takes the messages of a topic."""
+        return topic in self._sinks
 
     def clouds(self, topic: str) -> CloudIndex:
         """Return the index of a cloud topic."""
@@ -217,7 +236,7 @@ class Recording:
     def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
         self.path, self.losses = path, list[Loss]()
         self.metadata: dict[str, dict[str, str]] = {}
-        self._limit, self._table = limit, MessageTable(sinks)
+        self._limit, self._table = limit, MessageTable(sinks, limit)
 
     def topics(self) -> list[TopicInfo]:
         """Return every topic that was declared, sorted by name."""
@@ -228,10 +247,14 @@ class Recording:
         return self._table.clouds(topic)
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry.
+        """Return the payload of the message with this index entry.
 
-        Raises BadMessage if it cannot be read.
+        Raises BadMessage if it cannot be read or decompressed.
         """
+        return unpacked(self._stored(topic, place), self._table.encoding(topic), self._limit)
+
+    def _stored(self, topic: str, place: int) -> bytes | memoryview:
+        """Return a message as it is stored. Raises BadMessage if it cannot be read."""
         index = self._table.clouds(topic)
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:  # the message is not inside a chunk

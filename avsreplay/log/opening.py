@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from avsreplay.errors import AvsError, UnreadableInput, UsageError
-from avsreplay.geometry import Pose
+from avsreplay.files import refuse_pointer
+from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
 from avsreplay.log.camera import find_camera, stated_camera
@@ -61,6 +62,8 @@ def open_source(
             frame does not exist, or the values of the clouds do not tell what they mean.
     """
     path, options = Path(path), options or SourceOptions()
+    if path.name == BAG_METADATA and path.is_file():  # of a bag, whose folder is meant
+        path = path.parent
     try:
         source = _opened(path, options, inspect, upto)
     except OSError as error:
@@ -136,6 +139,9 @@ def _messages(
             fixed = header.fixed_frame
             return _messages(path, replace(options, fixed_frame=fixed), inspect, upto, fixed)
         ground_truth = collector.ground_truth()
+        if collector.damaged:
+            left = f"{collector.damaged} left out: not finite, without a unit quaternion, or cut"
+            header = replace(header, notes={**header.notes, "poses or transforms": left})
         if options.poses:
             clouds: MessageClouds = streams.PoseMessages(recording, topic)
             header = _pose_header(header, options)
@@ -199,10 +205,13 @@ def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
     )
 
 
+_HEAD_BYTES = 64
+
+
 def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(16)
+            return file.read(_HEAD_BYTES)
     except OSError as error:
         raise UnreadableInput(
             error.strerror or "cannot be read", where=shown(path), hint="check the path"
@@ -243,7 +252,7 @@ def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
             )
 
 
-_STORAGE = (".mcap", ".db3")
+_STORAGE, BAG_METADATA = (".mcap", ".db3"), "metadata.yaml"
 _LISTED = re.compile(
     r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
 )
@@ -266,11 +275,12 @@ def _open_recording(
 
 def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
     head = _head(path)
+    refuse_pointer(head, shown(path))
     if head.startswith(ROS1_MAGIC):
         from avsreplay.log.ros1_bag import Ros1Bag
 
         return Ros1Bag(path, limit, sinks)
-    if head == SQLITE_MAGIC:
+    if head.startswith(SQLITE_MAGIC):
         from avsreplay.log.db3_file import Db3File
 
         return Db3File(path, limit, sinks)
@@ -323,7 +333,7 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     there = sorted(
         (p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name)
     )
-    metadata = path / "metadata.yaml"
+    metadata = path / BAG_METADATA
     if not metadata.is_file():
         return there, []
     text = metadata.read_bytes()[: 4 << 20].decode("utf-8", "backslashreplace")
@@ -426,7 +436,7 @@ def _ground_truth(
     options: SourceOptions,
 ) -> streams.GroundTruth:
     if found is None and by_name:
-        named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
+        named = [(t, MeasuredPose(by_name[f.name])) for t, f in zip(times, files, strict=True)]
         found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
     if found is None:
         return streams.GroundTruth()
