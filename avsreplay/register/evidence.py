@@ -40,13 +40,27 @@ WRONG_OF_EXTENT, RIGHT_OF_EXTENT = 0.006, 0.001
 CONTRADICTING = 0.03  # share of the patches of the right pose that contradict it
 SHARES = 0.3  # weight of the shares of patches that are on the model, hidden, and not measured
 CONTINUES = 0.02  # share of the edges of the right pose beyond which the surface continues
+LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
+NORMAL_QUANTILES = np.array(
+    [0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485]
+)  # for a standard normal
+REFINEMENTS = 2
 LEAST_NOISE, MOST_NOISE = 0.0006, 0.012  # noise over the extent
 THROUGH, THROUGH_OF_EXTENT = 4.0, 0.012  # a ray passed through: so many sigmas, and at least
-ISOLATED, ISOLATED_OF_EXTENT, SPACINGS = 2, 0.03, 2.5  # near neighbours of a return, and how near
+NEIGHBOURS = 8  # returns next to one in the image, of which so many
+ISOLATED, ISOLATED_OF_EXTENT, SPACINGS = 2, 0.03, 2.5  # are near it, and how near
+AROUND, SAME_PLACE = 0.75, 0.1  # extents around the middle of the model, and between such places
 HOLE = 1.4  # a direction has no return if none is within so many spacings of the rays
 PIXELS = 70  # of the image of the model at most, along its longer side
 LEAST_COSINE = 0.2  # of the incidence at which a return is expected
 LEAST_RAYS = 20  # near the model; with fewer a pose is not measured
+NEIGHBOUR_OF_EXTENT = 0.1  # neighbouring rays whose points on the model are nearer share an error
+SURFACE_POINTS = 800  # of the model, which bound its image
+LEAST_MEAN, LEAST_SURE = 0.8, 1.1  # of the log likelihood ratio per patch: accepted, ends a search
+MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
+LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may be elsewhere
+TURNED_AWAY = "most points are on faces that face away from the camera"
+TOO_FEW = f"fewer than {LEAST_RAYS} of its points are near the model"
 PLANES = (1.0, 2.0, 3.0, 5.0)  # standard deviations between the classes of points on the model
 
 
@@ -62,6 +76,8 @@ class Evidence:
         noise_m: robust standard deviation of the distances [m].
         spread_m: part of the residuals that neighbouring rays share [m].
         extent_m: of the model.
+        away: most points are on faces that face away from the origin, where the sensor may be.
+        share: of the returns around the model that are on it.
     """
 
     on: Array
@@ -74,6 +90,8 @@ class Evidence:
     noise_m: float
     spread_m: float
     extent_m: float
+    away: bool
+    share: float
 
     @property
     def total(self) -> float:
@@ -108,32 +126,72 @@ class Evidence:
         """Return the log likelihood ratio per patch, by which a pose is accepted."""
         return (self.total + self.silhouettes) / self.patches
 
+    @property
+    def covered(self) -> bool:
+        """Return whether the visible side of the model is in the scan, up to ``MOST_MISSING``."""
+        missing = self.absent + self.through
+        return not self.away and missing <= MOST_MISSING * (float(self.on.sum()) + missing)
 
-class Observed:
-    """The returns of a scan that are not isolated, by their directions.
+    @property
+    def doubtful(self) -> bool:
+        """Return whether a search goes on, because another pose may have more evidence."""
+        return self.mean < LEAST_SURE
+
+    @property
+    def reason(self) -> str:
+        """Return why a pose is not accepted, "" if it is: what speaks most against it."""
+        if self.away and self.share < LEAST_ALONE:
+            return TURNED_AWAY
+        if self.mean >= LEAST_MEAN:
+            return ""
+        on, spread = float(self.on.sum()), np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
+        against = {
+            "neighbouring points have the same distance from it": on
+            * np.log(spread / RIGHT_OF_EXTENT),
+            "points beside the model": -self.beside * np.log(CONTRADICTING),
+            "rays that pass through it": -self.through * np.log(CONTRADICTING),
+            "the surface in the scan continues beyond the edges of the model, as that of another"
+            " or a larger object": -self.continued * np.log(CONTINUES / 0.5),
+            f"distances to the model spread by {self.noise_m:.3g} m": 0.5
+            * SHARES
+            * (4.0 * float(self.on[2]) + 9.0 * float(self.on[3])),
+        }
+        return f"the scan contradicts the pose: {max(against, key=lambda term: against[term])}"
+
+
+class Region:
+    """The returns of a scan around a place, by their directions.
 
     Attributes:
-        rays: of the scan.
-        points, ranges, directions: of the returns in {A}.
+        points, ranges, directions: (n, 3), (n,), (n, 3) of the returns in {A} that are not isolated.
+        places: (n, 3) by which returns are neighbours: their directions, or the points where the
+            position of the sensor is not known.
         pitch: angle between neighbouring rays [rad].
     """
 
-    def __init__(self, scan: NDArray[Any], extent_m: float) -> None:
-        """Thin the scan (n, 3) in {A} [m] and leave out its isolated returns."""
-        few = scan[np.linspace(0, len(scan) - 1, min(RAYS, len(scan))).astype(np.intp)]
+    def __init__(self, points: Array, extent_m: float, sees: bool) -> None:
+        """Leave out isolated returns of points (n, 3) in {A} [m]; ``sees``: the sensor is at the
+        origin.
+        """
+        few = points[np.linspace(0, len(points) - 1, min(RAYS, len(points))).astype(np.intp)]
         rays = Rays(np.ascontiguousarray(few, dtype=np.float64))
-        self.pitch = rays.spacing
-        self.rays, kept = rays, np.ones(len(rays.points), dtype=bool)
-        if rays.tree is not None:
+        kept = np.ones(len(rays.points), dtype=bool)
+        self.pitch, self.sees = rays.spacing, sees
+        if sees and rays.tree is not None:
             directions = rays.points / rays.ranges[:, None]
-            nearest = rays.tree.query(directions, min(9, len(directions)))[1][:, 1:]
+            nearest = rays.tree.query(directions, min(1 + NEIGHBOURS, len(directions)))[1][:, 1:]
             apart = np.linalg.norm(rays.points[:, None] - rays.points[nearest], axis=2)
             near = np.maximum(ISOLATED_OF_EXTENT * extent_m, SPACINGS * self.pitch * rays.ranges)
             kept = (apart < near[:, None]).sum(axis=1) >= ISOLATED
         self.points: Array = np.ascontiguousarray(rays.points[kept])
         self.ranges: Array = rays.ranges[kept]
         self.directions: Array = np.ascontiguousarray(self.points / self.ranges[:, None])
-        self.tree = kernel_module().PointTree(self.directions)
+        self.places: Array = self.directions if sees else self.points
+
+    @cached_property
+    def tree(self) -> Any:
+        """Return the tree of the directions."""
+        return kernel_module().PointTree(self.directions)
 
     @cached_property
     def axes(self) -> Array:
@@ -145,52 +203,87 @@ class Observed:
         return np.stack([x, np.cross(z, x), z])
 
 
+class Observed:
+    """A scan, of which the rays around the places of poses are prepared when they are asked for.
+
+    Attributes:
+        points: (n, 3) in {A} [m].
+    """
+
+    def __init__(self, points: NDArray[Any]) -> None:
+        self.points = points
+        self._regions: list[tuple[Array, bool, Region]] = []
+
+    def around(self, middle: Array, extent_m: float, sees: bool) -> Region:
+        """Return the returns near the model, and where ``sees`` those of all rays towards it.
+
+        Args:
+            middle: (3,) of the model in {A} [m].
+            extent_m: of the model.
+            sees: the sensor is at the origin of {A}.
+        """
+        for place, seen, region in self._regions:
+            if seen is sees and np.linalg.norm(place - middle) < SAME_PLACE * extent_m:
+                return region
+        p, radius = np.asarray(self.points, dtype=np.float64), AROUND * extent_m
+        within = np.einsum("ij,ij->i", p - middle, p - middle) < radius**2
+        away = float(np.linalg.norm(middle))
+        if sees and away > radius:
+            along = p @ (middle / away)
+            within |= along > np.linalg.norm(p, axis=1) * np.sqrt(1.0 - (radius / away) ** 2)
+        region = Region(p if within.all() else p[within], extent_m, sees)
+        self._regions.append((middle, sees, region))
+        return region
+
+
 class EvidenceModel:
     """Evidence of scans for poses of one target."""
 
     def __init__(self, target: Target) -> None:
         self._target, self._extent = target, target.surface.extent
-        self._points = sample_evenly(target.surface, 800)[0]
+        vertices = target.surface.vertices
+        self._middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        self._points = sample_evenly(target.surface, SURFACE_POINTS)[0]
 
-    def at(self, seen: Observed, T_ca: Pose) -> Evidence | None:
+    def at(self, scan: Observed, T_ca: Pose) -> Evidence | None:
         """Return what the rays of a scan say of a pose; None with fewer than ``LEAST_RAYS`` near
         the model.
         """
         target, L, index = self._target, self._extent, self._target.index
-        sees = target.visibility.may_be_camera(T_ca)
+        middle = T_ca.inverse().apply(self._middle[None])[0]
+        may_be = target.visibility.may_be_camera(T_ca)
+        seen = scan.around(middle, L, may_be)
         p = T_ca.apply(seen.points)
         most = min(NEAR_OF_EXTENT * L, index.reach_m)
-        camera = T_ca.t if sees else None
+        near = np.flatnonzero(index.distances(seen.points, T_ca, most, False, 1, 0.0)[0] < most)
+        if len(near) < LEAST_RAYS:
+            return None
+        camera = target.visibility.camera_c(index, seen.points[near], T_ca)
         found = index.closest(p, camera_c=camera, most_m=most)
         distance = np.sqrt(np.minimum(found.d2, most**2))
-        near = found.d2 < most**2
-        if np.count_nonzero(near) < LEAST_RAYS:
+        close = found.d2 < most**2
+        if np.count_nonzero(close) < LEAST_RAYS:
             return None
-        noise = float(np.clip(_noise(distance[near]), LEAST_NOISE * L, MOST_NOISE * L))
+        noise = float(np.clip(robust_noise(distance[close]), LEAST_NOISE * L, MOST_NOISE * L))
         z = distance / noise
         D = seen.directions @ T_ca.R.T
-        e = np.einsum("ij,ij->i", p - found.foot, found.normal)
-        if sees:
+        hit, ranges = np.zeros(len(p), dtype=bool), np.full(len(p), np.inf)
+        through = hit
+        if camera is not None:
             ranges, cosine, _ = self._cast(T_ca.t, D)
             hit = np.isfinite(ranges)
-            width = np.maximum(
-                THROUGH * noise / np.maximum(cosine, LEAST_COSINE), THROUGH_OF_EXTENT * L
-            )
-            through = hit & (seen.ranges - ranges > width)
-        else:
-            ranges, hit = np.full(len(p), np.inf), np.zeros(len(p), dtype=bool)
-            through = hit
-        on = ~through & near & (z < PLANES[-1])
+            slant = THROUGH * noise / np.maximum(cosine, LEAST_COSINE)
+            through = hit & (seen.ranges - ranges > np.maximum(slant, THROUGH_OF_EXTENT * L))
+        on = ~through & close & (z < PLANES[-1])
         beside = ~through & ~on & (distance < BESIDE_OF_EXTENT * L)
         hidden = hit & ~through & ~on & ~beside
         kind = np.full(len(p), -1)
         kind[on] = np.searchsorted(PLANES[:-1], z[on], side="right")
         kind[beside], kind[hidden], kind[through] = 4, 5, 6
-        at = np.where(
-            (on | beside)[:, None], found.foot, T_ca.t + D * np.where(hit, ranges, 0.0)[:, None]
-        )
+        behind = T_ca.t + D * np.where(hit, ranges, 0.0)[:, None]
+        at = np.where((on | beside)[:, None], found.foot, behind)
         missing, weight, edges = np.empty((0, 3)), 1.0, (0.0, 0.0)
-        if sees:
+        if camera is not None:
             missing, weight, edges = self._image(seen, T_ca, noise, ranges)
         known = kind >= 0
         counts = _by_patch(
@@ -199,8 +292,24 @@ class EvidenceModel:
             np.concatenate([np.ones(int(known.sum())), np.full(len(missing), weight)]),
             PATCH_OF_EXTENT * L,
         )
-        spread = _shared(seen, e, found.foot, on & (z < 3.0), 0.1 * L)
-        return Evidence(counts[:4], counts[4], counts[6], counts[5], counts[7], *edges, noise, spread, L)
+        spread = 0.0
+        if len(target.surface.faces):
+            e = np.einsum("ij,ij->i", p - found.foot, found.normal)
+            spread = _shared(seen, e, found.foot, on & (z < PLANES[2]), NEIGHBOUR_OF_EXTENT * L)
+        return Evidence(
+            on=counts[:4],
+            beside=float(counts[4]),
+            through=float(counts[6]),
+            hidden=float(counts[5]),
+            absent=float(counts[7]),
+            continued=edges[0],
+            ended=edges[1],
+            noise_m=noise,
+            spread_m=spread,
+            extent_m=L,
+            away=may_be and camera is None,
+            share=float(np.mean(on)),
+        )
 
     def _cast(self, eye: Array, D: Array) -> tuple[Array, Array, Array]:
         """Ranges (n,) [m] of the model along directions (n, 3), cosines of incidence and
@@ -216,7 +325,7 @@ class EvidenceModel:
         return ranges, cosine, normal
 
     def _image(
-        self, seen: Observed, T_ca: Pose, noise: float, measured: Array
+        self, seen: Region, T_ca: Pose, noise: float, measured: Array
     ) -> tuple[Array, float, tuple[float, float]]:
         """Places (k, 3) in {C} of the model in directions without a return, the rays for which
         each counts, and the patches of silhouettes beyond which the surface continues, and does
@@ -230,7 +339,9 @@ class EvidenceModel:
         uv = q[:, :2] / q[:, 2:]
         low, high = uv.min(axis=0), uv.max(axis=0)
         pitch = max(seen.pitch, float((high - low).max()) / PIXELS)
-        u, v = (np.arange(a - 3 * pitch, b + 4 * pitch, pitch) for a, b in zip(low, high, strict=True))
+        u, v = (
+            np.arange(a - 3 * pitch, b + 4 * pitch, pitch) for a, b in zip(low, high, strict=True)
+        )
         shape = (len(u), len(v))
         grid = np.stack([*np.meshgrid(u, v, indexing="ij"), np.ones(shape)], axis=-1).reshape(-1, 3)
         G = grid @ seen.axes
@@ -274,29 +385,39 @@ class EvidenceModel:
             & (np.abs(seen.ranges[ray] - plane) * np.abs(down) < 4.0 * noise)
         )
         counts = _by_patch(
-            T_ca.t + D[a] * ranges[a, None], goes_on.astype(np.intp), np.ones(len(a)), PATCH_OF_EXTENT * L, 2
+            T_ca.t + D[a] * ranges[a, None],
+            goes_on.astype(np.intp),
+            np.ones(len(a)),
+            PATCH_OF_EXTENT * L,
+            2,
         )
         return places, (pitch / seen.pitch) ** 2, (float(counts[1]), float(counts[0]))
 
 
-def _by_patch(at: Array, kind: NDArray[np.intp], weight: Array, side_m: float, kinds: int = 8) -> Array:
+def _by_patch(
+    at: Array, kind: NDArray[np.intp], weight: Array, side_m: float, kinds: int = 8
+) -> Array:
     """The sum (kinds,) over the patches of the shares of each kind of ray."""
     if not len(at):
         return np.zeros(kinds)
     cell = np.floor(at / side_m).astype(np.int64)
     cell -= cell.min(axis=0)
     span = cell.max(axis=0) + 1
-    patch = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[1]
-    sums = np.bincount(patch * kinds + kind, weight, (int(patch.max()) + 1) * kinds).reshape(-1, kinds)
+    patch = np.unique(
+        (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True
+    )[1]
+    sums = np.bincount(patch * kinds + kind, weight, (int(patch.max()) + 1) * kinds).reshape(
+        -1, kinds
+    )
     return np.asarray((sums / np.maximum(sums.sum(axis=1), 1.0)[:, None]).sum(axis=0))
 
 
-def _shared(seen: Observed, e: Array, foot: Array, on: NDArray[np.bool_], near_m: float) -> float:
+def _shared(seen: Region, e: Array, foot: Array, on: NDArray[np.bool_], near_m: float) -> float:
     """The rms [m] of the part of the residuals (n,) that neighbouring rays on the model share."""
     k = np.flatnonzero(on)
     if len(k) <= LEAST_RAYS:
         return 0.0
-    d = np.ascontiguousarray(seen.directions[k])
+    d = np.ascontiguousarray(seen.places[k])
     other = kernel_module().PointTree(d).query(d, min(4, len(k)))[1][:, 1:]
     near = np.linalg.norm(foot[k][:, None] - foot[k][other], axis=2) < near_m
     products = (e[k][:, None] * e[k][other])[near]
@@ -304,7 +425,23 @@ def _shared(seen: Observed, e: Array, foot: Array, on: NDArray[np.bool_], near_m
     return float(np.sqrt(max(shared, 0.0)))
 
 
-def _noise(distance: Array) -> float:
-    from avsreplay.register.plausibility import robust_noise
+def robust_noise(distance: Array) -> float:
+    """Return the standard deviation of a normal error with magnitudes ``distance`` (n,), outliers
+    among them.
 
-    return robust_noise(distance)
+    The first estimate is the least of those from the 30 % to the 90 % quantile; outliers only raise
+    them, by a factor of three if they are 60 %. The result uses the median of the magnitudes within
+    three standard deviations.
+    """
+    ordered = np.sort(distance)
+    noise = float(
+        np.min(
+            np.interp(LEVELS * (len(ordered) - 1), np.arange(len(ordered)), ordered)
+            / NORMAL_QUANTILES
+        )
+    )
+    for _ in range(REFINEMENTS):
+        if near := int(np.searchsorted(ordered, 3.0 * noise)):
+            middle = 0.5 * float(ordered[(near - 1) // 2] + ordered[near // 2])
+            noise = min(noise, middle / NORMAL_QUANTILES[2])
+    return noise

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import HornBackend, Target
+from avsreplay.register.evidence import robust_noise
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
+from avsreplay.register.plausibility import NOISE_OF_EXTENT
 from avsreplay.register.sampling import (
     attitudes,
     sample_evenly,
