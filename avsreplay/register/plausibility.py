@@ -16,7 +16,14 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
-from avsreplay.register.evidence import TOO_FEW, Evidence, EvidenceModel, Observed, robust_noise
+from avsreplay.register.evidence import (
+    AROUND,
+    TOO_FEW,
+    Evidence,
+    EvidenceModel,
+    Observed,
+    robust_noise,
+)
 from avsreplay.register.quality import not_measured
 from avsreplay.register.sampling import sample_evenly
 from avsreplay.register.surface_index import kernel_module
@@ -49,6 +56,8 @@ class PlausibilityTest:
             target.limits.gate_m,
             target.surface.extent,
         )
+        vertices = target.surface.vertices
+        self._middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         self._points = np.ascontiguousarray(sample_evenly(target.surface, SURFACE_POINTS)[0])
         self._evidence = EvidenceModel(target)
 
@@ -79,6 +88,18 @@ class PlausibilityTest:
             " right?"
         )
         return replace(not_measured(points, AlignStatus.IMPLAUSIBLE, guess), message=text)
+
+    def around(self, scan: NDArray[Any], guess: Pose) -> NDArray[Any]:
+        """Return the points of a scan (n, 3) in {A} around the model at a predicted T_ac; all where
+        few are there.
+
+        A wall, the ground or a neighbour are thereby left out, which could have nearly all points
+        of a scan.
+        """
+        middle = guess.apply(self._middle[None])[0]
+        away = np.asarray(scan, dtype=np.float64) - middle
+        near = np.einsum("ij,ij->i", away, away) < (AROUND * self._extent) ** 2
+        return scan if near.all() or np.count_nonzero(near) < LEAST_COMPARED else scan[near]
 
     def noise(self, distance: Array, T_ca: Pose, guess: Pose | None) -> float:
         """Return the robust noise [m] of distances (n,) [m] at a pose; of the smaller ones where

@@ -132,9 +132,26 @@ class Registrar:
             The pose T_ac with its quality. A failure is its status, never an exception; T_ac is
             then the guess.
         """
-        scan = usable_points(points, self.params.subsample_m)
-        if refused := self._test.refused(scan, len(points), guess):
+        whole = usable_points(points, self.params.subsample_m)
+        if refused := self._test.refused(whole, len(points), guess):
             return refused
+        seen, scan = Observed(whole), self._test.around(whole, guess)
+        found = self._registered(seen, scan, guess, seq, carried, effort, unknown)
+        return found if found.points == len(whole) else replace(found, points=len(whole))
+
+    def _registered(
+        self,
+        seen: Observed,
+        scan: NDArray[Any],
+        guess: Pose,
+        seq: int,
+        carried: bool,
+        effort: Effort,
+        unknown: Array | None,
+    ) -> Alignment:
+        """Register the part of a scan around its guess; the whole scan is searched where that
+        fails.
+        """
         halves, budget = (
             seq % self.params.split_every == 0,
             Budget(healthy_work(len(scan), self._target.near_work)),
@@ -147,15 +164,14 @@ class Registrar:
         first = self._grader.graded(scan, guess, budget, None, halves, carried, rough=True)
         if first.status is AlignStatus.FAILED:
             return first
-        seen = Observed(scan)
         sound = self._restarter.sound(seen, first, budget)
         found, searched = (
             (first, False)
             if sound
-            else self._recovered(seen, guess, first, halves, carried, budget)
+            else self._recovered(seen, scan, guess, first, halves, carried, budget)
         )
         if self._far(guess, found) and not searched:
-            found = self._searched(scan, found, carried, budget)
+            found = self._searched(seen.points, found, carried, budget)
         elif not searched:
             found = self._unique(scan, guess, found, budget, halves, carried)
             found = self._settled(scan, found, budget, halves, carried, unknown)
@@ -309,7 +325,13 @@ class Registrar:
                 False,
                 True,
             )
-        rivals, marked = list(search.rivals), self._symmetry.marked
+        T_ca, marked = found.T_ac.inverse(), self._symmetry.marked
+        members = self._symmetry.members(part, T_ca)
+        rivals = members + [
+            each
+            for each in search.rivals
+            if not any(self._symmetry.search.same(each, other) for other in members)
+        ]
         decided = marked and budget.allows(self._symmetry.work(len(part), len(rivals)))
         if marked and not decided and not rivals:
             status = AlignStatus.BUDGET_EXHAUSTED
@@ -478,6 +500,7 @@ class Registrar:
     def _recovered(
         self,
         seen: Observed,
+        scan: NDArray[Any],
         guess: Pose,
         first: Alignment,
         halves: bool,
@@ -488,7 +511,6 @@ class Registrar:
 
         Whether it was searched.
         """
-        scan = seen.points
         few = self._restarter.part(scan)
         starts = self._restarter.starts(few, first, guess, budget)
         near = [
@@ -522,7 +544,8 @@ class Registrar:
                 known = final.T_ac.inverse() if final.measured else None
                 if (
                     overlap
-                    and (found := self._acquire(scan, budget, carried, 1, known)).status in ACCEPTED
+                    and (found := self._acquire(seen.points, budget, carried, 1, known)).status
+                    in ACCEPTED
                 ):
                     return found, True
                 continue

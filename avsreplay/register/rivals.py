@@ -30,12 +30,13 @@ from avsreplay.register.backend import Target
 from avsreplay.register.budget import TEST_WORK, healthy_work
 from avsreplay.register.degenerate import turn_words
 from avsreplay.register.elsewhere import COMPARED, OFF, Contradicted, Search, decides
-from avsreplay.register.global_search import FINE_PASSES, as_good
+from avsreplay.register.evidence import robust_noise
+from avsreplay.register.global_search import FINE_PASSES, RIVAL_WITHIN, Candidate, as_good
 from avsreplay.register.grading import FAR_RAD
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
-from avsreplay.register.sampling import EMPTY, Rays, sample
+from avsreplay.register.sampling import EMPTY, Rays, sample, thin_to
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 
@@ -56,6 +57,8 @@ NOT_VERIFIED = (
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
+MEMBER_POINTS = 1500  # of a scan, with which the exactly turned poses are compared
+MOST_NAMED = 4  # turned poses that are named in words
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
@@ -246,6 +249,37 @@ class NearSymmetry:
         ]
         return best.T_ca, rivals, extra
 
+    def members(self, scan: NDArray[np.floating], T_ca: Pose) -> list[Pose]:
+        """Return the poses turned by a near-symmetry that explain a scan as well as a pose does.
+
+        They are compared where the motion carries the pose, without a registration: passes over few
+        points would move a pose away that is exactly as good.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            T_ca: registered pose.
+        """
+        if not self.turned:
+            return []
+        points = np.ascontiguousarray(thin_to(np.asarray(scan, dtype=np.float64), MEMBER_POINTS))
+        few = points[:: max(1, len(points) // SCREENED)]
+        here = self._test.measure(points, T_ca)
+        noise = robust_noise(here)
+        width = max(self._gate, 3.0 * noise)
+        margin, first = self.search.margin(noise), Candidate(T_ca, here)
+        found = list[Pose]()
+        screened = np.minimum(self._test.measure(few, T_ca) / width, 1.0) ** 2
+        for motions in self._kinds:
+            cost = (self._distances(T_ca.apply(few), motions, width) / width) ** 2
+            for k in np.flatnonzero(cost.mean(axis=1) < screened.mean() + RIVAL_WITHIN):
+                turned = Pose.from_matrix(motions[k]) @ T_ca
+                other = Candidate(turned, self._test.measure(points, turned))
+                if as_good(first, other, width, margin) and not any(
+                    self.search.same(turned, each) for each in (T_ca, *found)
+                ):
+                    found.append(turned)
+        return found
+
     def elsewhere(
         self, scan: NDArray[np.floating], T_ca: Pose, partial: bool, left: int
     ) -> tuple[Pose, list[Pose], int]:
@@ -294,8 +328,14 @@ class NearSymmetry:
             rivals = [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
         if not rivals:
             return found
-        words = turn_words(at @ rivals[0].inverse())
-        return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
+        words = dict.fromkeys(turn_words(at @ each.inverse()) for each in rivals)
+        return replace(
+            found,
+            status=AlignStatus.AMBIGUOUS,
+            covariance=None,
+            free_directions=", ".join([*words][:MOST_NAMED]),
+            members=tuple(each.inverse() for each in (at, *rivals)),
+        )
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
