@@ -26,6 +26,7 @@ from avsreplay.register.evidence import (
 )
 from avsreplay.register.quality import not_measured
 from avsreplay.register.sampling import sample_evenly
+from avsreplay.register.size import size_error
 from avsreplay.register.surface_index import kernel_module
 
 SURFACE_POINTS = 1500
@@ -43,6 +44,7 @@ NEAR_OF_EXTENT, MOST_HIDDEN = (
 # a scan narrower than so much of the model, in one of four directions of the image, shows a part of
 # it
 PARTIAL = 0.8
+MOST_OTHER_SIZE = 0.1  # error of the size of the model with which a pose can be accepted
 LEAST_COMPARED = 30  # with fewer points the noise is that of all
 
 
@@ -146,9 +148,27 @@ class PlausibilityTest:
         return self._evidence.at(scan, T_ca)
 
     def reason(self, scan: Observed, T_ca: Pose) -> str:
-        """Return why a pose is not accepted, "" if it is."""
+        """Return why a pose is not accepted, "" if it is, also with another size of the target."""
         found = self.check(scan, T_ca)
-        return TOO_FEW if found is None else found.reason
+        if found is None:
+            return TOO_FEW
+        return found.reason if self._of_other_size(scan, T_ca, found) is None else ""
+
+    def _of_other_size(self, scan: Observed, T_ca: Pose, found: Evidence) -> Evidence | None:
+        """What the rays say with the size of the target that they show, if that is accepted; None
+        else.
+        """
+        if not found.reason:
+            return found
+        points = self.around(scan.points, T_ca.inverse())
+        camera_c = self._visibility.camera_c(self._index, points, T_ca)
+        size = size_error(self._index, points, T_ca, camera_c)
+        if size is None or not size.significant or abs(size.delta) > MOST_OTHER_SIZE:
+            return None
+        turn = Pose(geometry.exp(size.shift[:3]), size.shift[3:]).inverse() @ T_ca
+        factor = 1.0 / (1.0 + size.delta)
+        at = self.check(Observed(factor * scan.points), Pose(turn.q, factor * turn.t))
+        return None if at is None or at.reason else at
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the

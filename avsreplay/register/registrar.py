@@ -325,13 +325,8 @@ class Registrar:
                 False,
                 True,
             )
-        T_ca, marked = found.T_ac.inverse(), self._symmetry.marked
-        members = self._symmetry.members(part, T_ca)
-        rivals = members + [
-            each
-            for each in search.rivals
-            if not any(self._symmetry.search.same(each, other) for other in members)
-        ]
+        marked = self._symmetry.marked
+        rivals = list(search.rivals)
         decided = marked and budget.allows(self._symmetry.work(len(part), len(rivals)))
         if marked and not decided and not rivals:
             status = AlignStatus.BUDGET_EXHAUSTED
@@ -344,6 +339,9 @@ class Registrar:
             budget.spend(work + extra)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
                 found = self._neighbourhood.regraded(scan, few, best, budget, True, carried)
+        images, same = self._symmetry.images(found.T_ac.inverse()), self._symmetry.search.same
+        rivals = [each for each in rivals if not any(same(each, image) for image in images)]
+        rivals = images + rivals
         return self._unrivalled(scan, found, rivals, covered, budget), alone, at.doubtful
 
     def _verified(

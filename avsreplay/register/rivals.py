@@ -30,17 +30,16 @@ from avsreplay.register.backend import Target
 from avsreplay.register.budget import TEST_WORK, healthy_work
 from avsreplay.register.degenerate import turn_words
 from avsreplay.register.elsewhere import COMPARED, OFF, Contradicted, Search, decides
-from avsreplay.register.evidence import robust_noise
-from avsreplay.register.global_search import FINE_PASSES, RIVAL_WITHIN, Candidate, as_good
+from avsreplay.register.global_search import FINE_PASSES, as_good
 from avsreplay.register.grading import FAR_RAD
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.quality import view_directions
-from avsreplay.register.sampling import EMPTY, Rays, sample, thin_to
+from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 
-VERSION = 10  # version of the kept data of a model
+VERSION = 11  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
@@ -57,7 +56,8 @@ NOT_VERIFIED = (
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
-MEMBER_POINTS = 1500  # of a scan, with which the exactly turned poses are compared
+# an exact symmetry carries all but this share of the surface to within this of it, over the extent
+EXACT_OF_EXTENT, MOST_INEXACT = 5e-4, 5e-4
 MOST_NAMED = 4  # turned poses that are named in words
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
@@ -99,10 +99,23 @@ class NearSymmetry:
             kept["least"] = np.array(found.least_rad)
         self._kinds = np.split(kept["kinds"], kept["ends"])[:-1]
         search.same_rad = min(search.same_rad, 0.5 * float(kept["least"]))
+        if "exact" not in kept:
+            kept["exact"] = self._exact_ones()
+        self._exact = kept["exact"]
         if "marks" not in kept:
             kept["marks"], kept["marked"] = self._found()
         self._marks, self._normals = kept["marks"]
         self._share, self._area = (float(x) for x in kept["marked"])
+
+    def _exact_ones(self) -> Array:
+        """The near-symmetries (k, 4, 4) that carry all of the surface onto itself."""
+        motions = np.concatenate([np.zeros((0, 4, 4)), *self._kinds])
+        if not len(motions):
+            return motions
+        width = EXACT_OF_EXTENT * self._target.index.extent_m
+        points = sample(self._target.surface, SAMPLES)[0]
+        off = [self._distances(points, T[None], width)[0] >= width for T in motions]
+        return motions[[float(each.mean()) <= MOST_INEXACT for each in off]]
 
     def _found(self) -> tuple[Array, Array]:
         """Points on the marks and their normals (2, n, 3); the share of the surface that they have,
@@ -249,35 +262,18 @@ class NearSymmetry:
         ]
         return best.T_ca, rivals, extra
 
-    def members(self, scan: NDArray[np.floating], T_ca: Pose) -> list[Pose]:
-        """Return the poses turned by a near-symmetry that explain a scan as well as a pose does.
+    def images(self, T_ca: Pose) -> list[Pose]:
+        """Return the poses onto which the exact symmetries of the model carry a pose, where they
+        carry it.
 
-        They are compared where the motion carries the pose, without a registration: passes over few
-        points would move a pose away that is exactly as good.
-
-        Args:
-            scan: (n, 3) in {A} [m].
-            T_ca: registered pose.
+        No scan can tell them apart. Each is a different pose. A registration could only move it
+        away.
         """
-        if not self.turned:
-            return []
-        points = np.ascontiguousarray(thin_to(np.asarray(scan, dtype=np.float64), MEMBER_POINTS))
-        few = points[:: max(1, len(points) // SCREENED)]
-        here = self._test.measure(points, T_ca)
-        noise = robust_noise(here)
-        width = max(self._gate, 3.0 * noise)
-        margin, first = self.search.margin(noise), Candidate(T_ca, here)
         found = list[Pose]()
-        screened = np.minimum(self._test.measure(few, T_ca) / width, 1.0) ** 2
-        for motions in self._kinds:
-            cost = (self._distances(T_ca.apply(few), motions, width) / width) ** 2
-            for k in np.flatnonzero(cost.mean(axis=1) < screened.mean() + RIVAL_WITHIN):
-                turned = Pose.from_matrix(motions[k]) @ T_ca
-                other = Candidate(turned, self._test.measure(points, turned))
-                if as_good(first, other, width, margin) and not any(
-                    self.search.same(turned, each) for each in (T_ca, *found)
-                ):
-                    found.append(turned)
+        for T in self._exact:
+            turned = Pose.from_matrix(T) @ T_ca
+            if not any(self.search.same(turned, each) for each in (T_ca, *found)):
+                found.append(turned)
         return found
 
     def elsewhere(
