@@ -56,7 +56,7 @@ LEAST_COSINE = 0.2  # of the incidence at which a return is expected
 LEAST_RAYS = 20  # near the model; with fewer a pose is not measured
 NEIGHBOUR_OF_EXTENT = 0.1  # neighbouring rays whose points on the model are nearer share an error
 SURFACE_POINTS = 800  # of the model, which bound its image
-LEAST_MEAN, LEAST_SURE = 0.8, 1.1  # of the log likelihood ratio per patch: accepted, ends a search
+LEAST_MEAN, LEAST_SURE = 0.8, 1.0  # of the log likelihood ratio per patch: accepted, ends a search
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
 LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may be elsewhere
 TURNED_AWAY = "most points are on faces that face away from the camera"
@@ -100,14 +100,20 @@ class Evidence:
         """
         on = float(self.on.sum())
         spread = np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
-        shares = np.array([on, self.hidden, self.absent])
-        known = max(float(shares.sum()), np.finfo(float).tiny)
-        likely = float(shares @ np.log(np.maximum(shares, 0.5) / known))
         tail = 4.0 * float(self.on[2]) + 9.0 * float(self.on[3])
         against = (self.beside + self.through) * np.log(CONTRADICTING)
         return float(
-            on * np.log(WRONG_OF_EXTENT / spread) + SHARES * (likely - 0.5 * tail) + against
+            on * np.log(WRONG_OF_EXTENT / spread) + SHARES * (self._shares - 0.5 * tail) + against
         )
+
+    @property
+    def _shares(self) -> float:
+        """The log likelihood of the shares of the patches that are on the model, hidden, and not
+        measured.
+        """
+        shares = np.array([float(self.on.sum()), self.hidden, self.absent])
+        known = max(float(shares.sum()), np.finfo(float).tiny)
+        return float(shares @ np.log(np.maximum(shares, 0.5) / known))
 
     @property
     def silhouettes(self) -> float:
@@ -137,12 +143,17 @@ class Evidence:
         """Return whether a search goes on, because another pose may have more evidence."""
         return self.mean < LEAST_SURE
 
-    @property
-    def reason(self) -> str:
-        """Return why a pose is not accepted, "" if it is: what speaks most against it."""
+    def reason(self, predicted: bool = False) -> str:
+        """Return why a pose is not accepted, "" if it is: what speaks most against it.
+
+        Args:
+            predicted: the pose is the predicted one, so that surface which is hidden or outside of
+                the scan says nothing.
+        """
         if self.away and self.share < LEAST_ALONE:
             return TURNED_AWAY
-        if self.mean >= LEAST_MEAN:
+        allowed = -SHARES * self._shares / self.patches if predicted else 0.0
+        if self.mean + allowed >= LEAST_MEAN:
             return ""
         on, spread = float(self.on.sum()), np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
         against = {
@@ -163,7 +174,8 @@ class Region:
     """The returns of a scan around a place, by their directions.
 
     Attributes:
-        points, ranges, directions: (n, 3), (n,), (n, 3) of the returns in {A} that are not isolated.
+        points, ranges, directions: (n, 3), (n,), (n, 3) in {A} of the returns that are not
+            isolated.
         places: (n, 3) by which returns are neighbours: their directions, or the points where the
             position of the sensor is not known.
         pitch: angle between neighbouring rays [rad].

@@ -329,7 +329,7 @@ class Neighbourhood:
             )
         few = self._restarter.part(scan)
         found = self.regraded(scan, few, T_ca, budget, True, carried)
-        reason = self._restarter.reason(Observed(scan), found, budget)
+        reason = self._restarter.reason(Observed(scan), found, budget, None)
         return (
             replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
             if reason

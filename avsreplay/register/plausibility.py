@@ -147,28 +147,31 @@ class PlausibilityTest:
         """Return what the rays of a scan say of a pose; None with too few near the model."""
         return self._evidence.at(scan, T_ca)
 
-    def reason(self, scan: Observed, T_ca: Pose) -> str:
-        """Return why a pose is not accepted, "" if it is, also with another size of the target."""
+    def reason(self, scan: Observed, T_ca: Pose, guess: Pose | None = None) -> str:
+        """Return why a pose is not accepted, "" if it is, also with another size of the target.
+
+        Args:
+            scan: the scan.
+            T_ca: the pose.
+            guess: predicted T_ac. At a pose that agrees with it, hidden surface says nothing.
+        """
         found = self.check(scan, T_ca)
         if found is None:
             return TOO_FEW
-        return found.reason if self._of_other_size(scan, T_ca, found) is None else ""
+        reason = found.reason(self.predicted(T_ca, guess))
+        return "" if reason and self._has_other_size(scan, T_ca) else reason
 
-    def _of_other_size(self, scan: Observed, T_ca: Pose, found: Evidence) -> Evidence | None:
-        """What the rays say with the size of the target that they show, if that is accepted; None
-        else.
-        """
-        if not found.reason:
-            return found
+    def _has_other_size(self, scan: Observed, T_ca: Pose) -> bool:
+        """Whether the pose is accepted with the size of the target that the scan shows."""
         points = self.around(scan.points, T_ca.inverse())
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
         size = size_error(self._index, points, T_ca, camera_c)
         if size is None or not size.significant or abs(size.delta) > MOST_OTHER_SIZE:
-            return None
+            return False
         turn = Pose(geometry.exp(size.shift[:3]), size.shift[3:]).inverse() @ T_ca
         factor = 1.0 / (1.0 + size.delta)
         at = self.check(Observed(factor * scan.points), Pose(turn.q, factor * turn.t))
-        return None if at is None or at.reason else at
+        return at is not None and not at.reason()
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the

@@ -318,8 +318,8 @@ class Registrar:
             or not found.measured
         ):
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False, True
-        if at is None or at.reason:
-            reason = TOO_FEW if at is None else at.reason
+        reason = TOO_FEW if at is None else at.reason()
+        if at is None or reason:
             return (
                 replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason),
                 False,
@@ -525,7 +525,7 @@ class Registrar:
             if len(tried) == 1
             else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         )
-        reason = self._restarter.reason(seen, final, budget)
+        reason = self._restarter.reason(seen, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, seen, guess, final, budget)):
             return self._restarter.consistent(few, guess, final, budget), False
         before, overlap = (
@@ -557,7 +557,7 @@ class Registrar:
             )
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._neighbourhood.regraded(scan, few, before, budget, halves, carried)
-                reason = self._restarter.reason(seen, final, budget)
+                reason = self._restarter.reason(seen, final, budget, guess)
             if final.measured and not reason:
                 return self._restarter.consistent(few, guess, final, budget), False
         if not reason:

@@ -210,10 +210,10 @@ class Restarter:
         cost = [self.measure(few, each.T_ac.inverse(), budget).cost(width_m) for each in found]
         return found[cost[1] < NEARER * cost[0]]
 
-    def reason(self, scan: Observed, found: Alignment, budget: Budget) -> str:
+    def reason(self, scan: Observed, found: Alignment, budget: Budget, guess: Pose | None) -> str:
         """Return why a pose is not plausible; "" if it is, or nothing was measured."""
         budget.spend(TEST_WORK)
-        return self._test.reason(scan, found.T_ac.inverse()) if found.measured else ""
+        return self._test.reason(scan, found.T_ac.inverse(), guess) if found.measured else ""
 
     def healthy(self, inlier_ratio: float, rms_m: float) -> bool:
         """Return whether an alignment is a close fit of nearly all points, which needs no further

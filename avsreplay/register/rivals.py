@@ -330,7 +330,7 @@ class NearSymmetry:
             status=AlignStatus.AMBIGUOUS,
             covariance=None,
             free_directions=", ".join([*words][:MOST_NAMED]),
-            members=tuple(each.inverse() for each in (at, *rivals)),
+            members=(found.T_ac, *(each.inverse() for each in rivals)),
         )
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
