@@ -1,27 +1,17 @@
-"""Binary files of unknown origin, read with checks: arrays of numpy, and the state of an
-interrupted run.
+"""Binary files of unknown origin, read with checks: arrays of numpy.
 
 The sizes of arrays are compared with the size of the file before memory is allocated.
-
-The state of an interrupted run, from which the run continues with the same bits, is a pickle that
-is read with a restricted reader: it creates objects of the classes of this package that hold data,
-and numpy arrays, and nothing else, so that a file from elsewhere cannot execute code. Objects that
-a run builds from its input (model, stages) are not stored but named, and those of the continued run
-take their places.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
-import pickle
 import re
 import stat
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
+from avsreplay.read_budget import BadFile, ReadBudget, check_declared
 
 _MAX_NPY_HEADER = 4096
-_MOST_STATE = 16 << 30
-_LEAST_ARRAYS, _MAX_RATIO = (
-    96 << 20,
-    8,
-)  # arrays may take 96 MiB, or eight times the size of their archive
 _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
@@ -50,10 +36,6 @@ _ZIP_ERRORS = (
     OSError,
     ValueError,
 )
-
-
-class BadFile(ValueError):
-    """A file whose bytes do not match its header or its name."""
 
 
 def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> bytes:
@@ -113,31 +95,34 @@ def parse_npy(data: bytes) -> NDArray[Any]:
         raise BadFile("an npy file that is not an array of numbers")
     shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
     dtype, count = np.dtype(header["descr"]), math.prod(shape)
-    if count * dtype.itemsize > len(data) - start - size:
-        raise BadFile(f"an array of shape {str(shape)[:60]}, which its bytes do not contain")
+    check_declared(count, dtype.itemsize, len(data) - start - size, "numbers")
     array = np.frombuffer(data, dtype, count, start + size)
     return array.reshape(shape, order="F" if header["fortran"] == "True" else "C")
 
 
-def read_members(data: bytes, limit: int) -> dict[str, bytes]:
+def read_members(data: bytes, budget: ReadBudget) -> dict[str, bytes]:
     """Return the members of a zip archive by name.
 
     Args:
         data: the bytes of the archive.
-        limit: largest total size of the members after decompression [bytes].
+        budget: what the members may take; their declared sizes are taken from it before any is
+            decompressed.
 
     Raises:
-        BadFile: the archive is malformed, or its members are larger.
+        BadFile: the archive is malformed, or its members are larger than they declare.
+        OverBudget: there are too many members, or they are too large.
     """
     out: dict[str, bytes] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for info in archive.infolist():
+            found = archive.infolist()
+            budget.take_records(len(found), "arrays")
+            budget.take_bytes(sum(info.file_size for info in found), "arrays")
+            for info in found:
                 with archive.open(info) as member:
-                    out[info.filename] = member.read(limit + 1)
-                limit -= len(out[info.filename])
-                if limit < 0:
-                    raise BadFile("its arrays are over the size limit")
+                    out[info.filename] = member.read(info.file_size + 1)
+                if len(out[info.filename]) > info.file_size:
+                    raise BadFile(f"the array '{info.filename[:40]}' is larger than it declares")
     except BadFile:
         raise
     except _ZIP_ERRORS as error:
@@ -172,7 +157,7 @@ def read_npz(
     """
     data = read_limited(path, limit, hint)
     try:
-        members = read_members(data, max(_LEAST_ARRAYS, _MAX_RATIO * len(data)))
+        members = read_members(data, ReadBudget(len(data)))
         wanted = [name for name in shapes if name not in optional or f"{name}.npy" in members]
         return {name: _declared(members, name, *shapes[name]) for name in wanted}
     except BadFile as error:
@@ -191,112 +176,3 @@ def _declared(
     if array.dtype.kind != kind or not fits:
         raise BadFile(f"the array '{name}' has the type {array.dtype} and the shape {array.shape}")
     return array.astype(np.int64 if kind == "i" else np.float64)
-
-
-_HINT = "start the run anew with --overwrite"
-_LIBRARY = {
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("collections", "Counter"),
-    ("builtins", "set"),
-}
-_ACCUMULATORS = {  # classes that collect values scan by scan and are no dataclasses
-    ("avsreplay.estimate.work", "Work"),
-    ("avsreplay.register.model_check", "ModelCheck"),
-    ("avsreplay.report.summary", "SummaryFold"),
-    ("avsreplay.result_dir", "Beliefs"),
-    ("avsreplay.viewers", "NewPaths"),
-    ("avsreplay.result_dir", "ViewWriter"),
-    ("avsreplay.score", "Scorer"),
-}
-
-
-def pack_state(value: Any, named: Mapping[str, object]) -> bytes:
-    """Return a value as bytes.
-
-    Args:
-        value: state of a run: objects of this package, arrays and plain values.
-        named: objects that are replaced by their names.
-    """
-    names = {id(thing): name for name, thing in named.items() if thing is not None}
-
-    class Packer(pickle.Pickler):
-        def persistent_id(self, thing: Any) -> str | None:
-            return names.get(id(thing))
-
-    stream = io.BytesIO()
-    Packer(stream, protocol=5).dump(value)
-    return stream.getvalue()
-
-
-def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
-    """Read a value that ``pack_state`` made.
-
-    Args:
-        path: the file.
-        named: objects in place of their names.
-        like: a value of the same structure, whose types and names of attributes it must have; None
-            for any.
-
-    Raises:
-        UnreadableInput: the file is missing, damaged, of another version, or contains what a
-            checkpoint never contains.
-    """
-    try:
-        found = _Unpacker(io.BytesIO(read_limited(path, _MOST_STATE, _HINT)), named).load()
-        _check_alike(found, like)
-        return found
-    except Exception as error:  # a damaged pickle raises almost any error
-        what = f"the checkpoint cannot be read: {error}".splitlines()[0][:200]
-        raise UnreadableInput(what, where=str(path), hint=_HINT) from None
-
-
-def _check_alike(found: Any, like: Any) -> None:
-    """Raise ValueError where the types or the attributes of two values differ; None is like
-    everything.
-    """
-    if like is None:
-        return
-    if type(found) is not type(like) or (isinstance(like, tuple) and len(found) != len(like)):
-        raise ValueError(f"a {type(found).__name__} in place of a {type(like).__name__}")
-    if isinstance(like, tuple):
-        for one, other in zip(found, like, strict=True):
-            _check_alike(one, other)
-    elif (type(like).__module__, type(like).__name__) in _ACCUMULATORS:
-        if vars(found).keys() != vars(like).keys():
-            raise ValueError(f"a {type(like).__name__} with other attributes")
-        for name, own in vars(like).items():
-            if (type(own).__module__, type(own).__name__) in _ACCUMULATORS:
-                _check_alike(vars(found)[name], own)
-
-
-class _Unpacker(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, named: Mapping[str, object]) -> None:
-        super().__init__(stream)
-        self._named = named
-
-    def persistent_load(self, name: Any) -> object:
-        if name not in self._named:
-            raise pickle.UnpicklingError(f"no object '{name}'")
-        return self._named[name]
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _LIBRARY and not module.startswith("avsreplay."):
-            raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
-        found = super().find_class(module, name)
-        if (module, name) in _LIBRARY or _holds_data(found, module):
-            return found
-        raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
-
-
-def _holds_data(found: Any, module: str) -> bool:
-    """Whether it is a class of that module and a dataclass, an enumeration or one of the
-    accumulators.
-    """
-    if not isinstance(found, type) or found.__module__ != module:
-        return False
-    known = (module, found.__name__) in _ACCUMULATORS
-    return known or dataclasses.is_dataclass(found) or issubclass(found, Enum)

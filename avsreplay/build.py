@@ -5,17 +5,20 @@ objects.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
+from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
+from avsreplay.plan._cone import Winding, winding
 from avsreplay.plan.arm import with_arm
 from avsreplay.plan.guidance import Guidance
 from avsreplay.plan.limits import TargetGeometry, hull_vertices
@@ -24,6 +27,10 @@ from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.settings import SettingError
+from avsreplay.task import Task, patches, target_at, task_of
+
+INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
 
 def stages(
@@ -54,12 +61,13 @@ def stages(
     estimator = config.estimator
     if config.register.backend == POSES:
         estimator = estimator.at_interval(clock[1], surface.extent)
-    robot, arm = with_arm(config.robot)
-    limits = robot.limited(config.limits)
-    supervision = config.supervisor.resolved(surface.extent)
+    task, target = task_and_target(config, surface)
+    robot, arm = with_arm(config.task.with_gripper(config.robot))
+    limits = task.corridor(robot.limited(config.limits))
+    supervision = config.task.with_tolerance(config.supervisor).resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
+        estimator=estimator_of(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
             Consistency(config.consistency), Convergence(config.convergence, surface.extent)
@@ -72,7 +80,8 @@ def stages(
             robot.gripper,
             arm,
         ),
-        target=target_geometry(surface, config.fixture_axis_c, limits.clearance_m is not None),
+        target=target,
+        grasp_c=task.grasp_c,
         guess=config.guess,
         deskew=config.deskew,
         reacquire=config.reacquire,
@@ -80,29 +89,84 @@ def stages(
     )
 
 
-def target_geometry(
-    surface: Surface, axis_c: tuple[float, float, float], clearance: bool
-) -> TargetGeometry:
+def task_and_target(config: RunConfig, surface: Surface) -> tuple[Task, TargetGeometry]:
+    """Return the task, compared with the model, and the geometry of the target about its grasp
+    point.
+
+    Args:
+        config: effective configuration.
+        surface: model of the target.
+
+    Raises:
+        UsageError: the task names a patch that the model does not have.
+    """
+    geometry_c = target_geometry(surface, config.fixture_axis_c)
+    assert geometry_c.surface is not None
+    settings = config.supervisor, config.robot, config.fixture_axis_c
+    try:
+        task = task_of(config.task, *settings, surface, geometry_c.surface, config.limits)
+    except SettingError as error:
+        raise UsageError(
+            str(error), where=f"task.{error.name}", hint="'avsreplay info' lists the patches"
+        ) from None
+    return task, target_at(replace(geometry_c, axis_c=task.axis_c), task.grasp_c)
+
+
+def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> TargetGeometry:
     """Return the geometry of the target for guidance.
 
     Args:
-        surface: model of the target in {C} [m].
+        surface: model of the target in {C} [m]; it is indexed at the first distance that is asked
+            for.
         axis_c: outward axis of the fixture in {C}.
-        clearance: whether distances to the surface are needed; only then is the surface indexed.
     """
-    axis, hull = np.array(axis_c), hull_vertices(surface.vertices)
-    if not clearance:
-        return TargetGeometry(axis, hull)
-    index = SurfaceIndex.build(surface, surface.extent)
-    oriented = len(surface.faces) > 0
+    return TargetGeometry(
+        np.array(axis_c), hull_vertices(surface.vertices), _signed_distance(surface)
+    )
+
+
+def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]:
+    """Closest points (n, 3) and signed distances (n,) of points (n, 3) in {C}.
+
+    A point is inside where the winding number of the faces is above one half: also where closed
+    parts overlap and the nearest face is inside another part. An open sheet has no inside.
+    """
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+
+    @cache
+    def indexed() -> tuple[SurfaceIndex, Winding]:
+        return SurfaceIndex.build(surface, surface.extent), winding(
+            surface.vertices, np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3)
+        )
 
     def closest(y: Array) -> tuple[Array, Array]:
+        index, turns = indexed()
         found = index.closest(y)
         distance = np.sqrt(found.d2)
-        inside = oriented & (np.sum((y - found.foot) * found.normal, axis=1) < 0.0)
-        return found.foot, np.where(inside, -distance, distance)
+        within = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
+        inside = turns.inside(np.ascontiguousarray(y[within]), distance[within], INSIDE)
+        distance[within[inside]] *= -1.0
+        return found.foot, distance
 
-    return TargetGeometry(axis, hull, closest)
+    return closest
+
+
+def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
+    """Return in words which grasp points could be used in place of one that cannot.
+
+    Args:
+        task: compared with the model.
+        surface: model of the target.
+        axis_c: outward axis of the fixture in {C}.
+    """
+    if not task.problem:
+        return ""
+    closest = target_geometry(surface, axis_c).surface
+    assert closest is not None
+    found = patches(surface, closest)
+    if not found:
+        return "name one with task.grasp_m and task.axis"
+    return f"patches that can be reached: {', '.join(patch.option for patch in found)}"
 
 
 def first_state(ready: Stages) -> PipelineState:

@@ -11,7 +11,7 @@ import numpy as np
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
-from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.model_size import Advice, compare_sizes, find_model
 from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register.registrar import Registrar
@@ -234,6 +234,10 @@ def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]
         others = f" (or {', '.join(names[1:3])})" if names[1:] else ""
         text = f"no truth is selected, but the log has poses{others}"
         return [Advice("ok", "truth", text, f"--truth-topic {names[0]}")]
+    frame = scans[0].frame if scans else ""
+    if moving := source.moving_beside(frame):
+        text = f"no truth is selected, but in /tf '{shown(moving[0])}' moves; is it the target?"
+        return [Advice("ok", "truth", text, f"--truth-frame {shown(moving[0])}")]
     return [
         Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")
     ]

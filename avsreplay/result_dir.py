@@ -3,7 +3,7 @@ back here.
 
 ``rows.jsonl``, ``estimate.tum``, ``registration.tum``, ``truth.tum``, ``beliefs.npz``, ``view.npz``
 and ``result.mcap`` depend on the input alone, byte for byte; ``run.json`` also names the versions.
-An interrupted run also leaves its checkpoint, ``resume.bin``.
+An interrupted run also leaves its checkpoint, ``resume.npz``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.settings import dump
 from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
-CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
+CHECKPOINT = "resume.npz"  # checkpoint of an interrupted run
 OWN = frozenset(
     {
         "rows.jsonl",

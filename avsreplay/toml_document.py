@@ -19,12 +19,19 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from avsreplay.errors import UnreadableInput, UsageError, value_class
-from avsreplay.settings import Entry, SettingError, dump, entries
+from avsreplay.parts import Parts
+from avsreplay.read_budget import ReadBudget
+from avsreplay.settings import Entry, SettingError, Tables, declared_of, dump, entries, value_of
 
 T = TypeVar("T")
 _Path = tuple[str | int, ...]
 MAX_BYTES = 1 << 20
 _SIMILAR = 0.7  # similarity from which a known key is suggested in place of an unknown one
+_LONGEST = 200  # characters of an unknown key that are compared with the known ones
+_BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
+# Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
@@ -93,12 +100,42 @@ def parse(text: str, name: str) -> Document:
         UsageError: the text is not TOML.
     """
     try:
-        return Document(name, tomllib.loads(text), text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        message = str(error) or "nested too deeply"
+        return Document(name, _loads(text), text)
+    except (ValueError, RecursionError) as error:
+        message = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise UsageError(
             f"not valid TOML: {message}", where=name, hint="correct the syntax"
         ) from None
+
+
+def _loads(text: str) -> dict[str, Any]:
+    """Parse TOML whose keys are not nested deeply; the time of the parser grows with the square
+    of their depth.
+
+    Raises ValueError, which includes OverBudget, or RecursionError.
+    """
+    budget = ReadBudget(len(text))
+    budget.take_bytes(_BYTES_PER_CHARACTER * len(text), "values")
+    for found in _DOTTED.finditer(text):
+        budget.check_depth(found[0].count(".") + 1, "keys")
+    return tomllib.loads(text)
+
+
+def own_settings(scenario: str, log: str) -> Mapping[str, Any]:
+    """Return the table ``[run]`` of the scenario that a log contains; an empty one if there is
+    none.
+
+    Args:
+        scenario: TOML text from the log, "" for none.
+        log: name of the log in error messages.
+
+    Raises:
+        UsageError: the text is not TOML, or ``run`` is not a table.
+    """
+    table = parse(scenario, f"{log} (its scenario)").table.get("run", {})
+    if not isinstance(table, Mapping):
+        raise UsageError("'run' must be a table", where=f"{log} (its scenario)", hint="record anew")
+    return table
 
 
 class Assignment(str):
@@ -140,8 +177,8 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
                 f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint
             )
         try:
-            value = tomllib.loads(f"v = {raw}")["v"]
-        except (tomllib.TOMLDecodeError, RecursionError):
+            value = _loads(f"v = {raw}")["v"]
+        except (ValueError, RecursionError):
             value = raw.strip()
         path = tuple(key.strip().split("."))
         node = table
@@ -191,6 +228,10 @@ class _Builder:
             raise self.error(path, f"'{_dotted(path)}' must be a table", "write it as [table]")
         hints = typing.get_type_hints(cls)
         known = {f.name: f for f in dataclasses.fields(cls) if f.init}
+        of_parts = [known.pop(f.name) for f in dataclasses.fields(cls) if declared_of(f).parts]
+        own = {f.name: self.parts(f, table, path) for f in of_parts}
+        taken = {name for tables in own.values() for name, _ in tables.given}
+        table = {key: value for key, value in table.items() if key not in taken}
         unknown = next((key for key in table if key not in known), None)
         if unknown is not None:
             hint = self.nearest(path, unknown, table[unknown], known)
@@ -203,12 +244,23 @@ class _Builder:
             raise self.error(path, f"missing key '{_dotted((*path, missing))}'", "add it")
         values = {key: self.value(hints[key], value, (*path, key)) for key, value in table.items()}
         try:
-            return cls(**values)
+            return cls(**values, **own)
         except SettingError as error:
             prefix = f"{_dotted(path)}." if path else ""
             raise self.error((*path, error.name), f"{prefix}{error}", "correct the value") from None
         except ValueError as error:
             raise self.error(path, str(error), "correct the value") from None
+
+    def parts(self, field: dataclasses.Field[Any], table: Mapping[str, Any], path: _Path) -> Tables:
+        """The tables of a field that belong to installed parts."""
+        parts = typing.cast(Parts, declared_of(field).parts)
+        kinds = {name: parts.parameters(name) for name in table if name in parts.names()}
+        given = [
+            (name, self.table(kind, table[name], (*path, name)))
+            for name, kind in sorted(kinds.items())
+            if kind is not None
+        ]
+        return Tables(tuple(given))
 
     def value(self, hint: Any, value: Any, path: _Path) -> Any:
         """A value of the type that a field declares."""
@@ -276,7 +328,7 @@ class _Builder:
         ):  # an unknown table: its content determines the suggestion
             name, value = next(iter(value.items()))
             inside = (*inside, name)
-        whole, leaf = _dotted((*path, *inside)), str(inside[-1])
+        whole, leaf = _dotted((*path, *inside))[:_LONGEST], str(inside[-1])[:_LONGEST]
 
         def likeness(entry: str) -> tuple[float, float]:
             in_full = difflib.SequenceMatcher(None, whole, entry).ratio()
@@ -286,10 +338,11 @@ class _Builder:
             )
 
         here = [_dotted((*path, name)) for name in known]
-        best = max([*here, *(entry.key for entry in entries(self.cls, self.prefix))], key=likeness)
+        every = [*here, *(entry.key for entry in entries(self.cls, self.prefix))]
+        best = max(every, key=likeness, default="")
         if likeness(best)[0] >= _SIMILAR:
             return f"did you mean '{best}'?"
-        return f"known keys: {', '.join(known)}"
+        return f"known keys: {', '.join(known) or 'none'}"
 
     def error(self, path: _Path, what: str, hint: str) -> UsageError:
         """A UsageError that names the place of ``path``."""
@@ -343,10 +396,7 @@ def to_toml(value: Any, name: str = "") -> str:
         if parent != table:
             lines += ["", f"[{parent}]"]
             table = parent
-        current = value
-        for part in entry.key.split("."):
-            current = getattr(current, part)
-        lines += ["", *_commented(entry), _assignment(leaf, current, entry)]
+        lines += ["", *_commented(entry), _assignment(leaf, value_of(value, entry.key), entry)]
     return "\n".join(lines).lstrip("\n") + "\n"
 
 

@@ -167,7 +167,7 @@ def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_fo
     rows = (result / "rows.jsonl").read_text().splitlines()
     header = json.loads((result / "run.json").read_text())
     assert header["interrupted_after"] == len(rows) >= 28
-    assert not (result / "resume.bin").exists()
+    assert not (result / "resume.npz").exists()
 
 
 @pytest.mark.slow

@@ -21,15 +21,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.binary_files import BadFile
 from avsreplay.log.bytes_io import BadMessage
+from avsreplay.log.canonical import Cloud, canonical, infer
 from avsreplay.log.cdr import point_cloud2
+from avsreplay.log.options import SourceOptions
 from avsreplay.log.ply import read_ply
-from avsreplay.log.point_cloud2 import decode_cloud
+from avsreplay.log.point_cloud2 import raw_cloud
+from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.pose_messages import POSE_TYPES, read_pose, read_transforms
 from avsreplay.log.scan_files import read_pcd, unpack_lzf
+from avsreplay.read_budget import BadFile
 
 CORPUS = seeds()
+
+
+def decode_cloud(message: bytes, encoding: str) -> Cloud:
+    """The canonical cloud of a message that is the only one of its log."""
+    raw = raw_cloud(message, encoding)
+    return canonical(raw, infer([TimedCloud(raw, raw.stamp_ns)], None, SourceOptions()))
 
 
 @pytest.mark.slow

@@ -11,12 +11,20 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from avsreplay.log.bytes_io import BadMessage
+from avsreplay.log.canonical import Cloud, canonical, infer, selected
 from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.options import SourceOptions
-from avsreplay.log.point_cloud2 import decode_cloud, read_layout, selected
+from avsreplay.log.point_cloud2 import raw_cloud, read_layout
+from avsreplay.log.point_times import TimedCloud
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+
+
+def decode_cloud(payload: bytes, encoding: str = "cdr") -> Cloud:
+    """The canonical cloud of a message that is the only one of its log."""
+    raw = raw_cloud(payload, encoding)
+    return canonical(raw, infer([TimedCloud(raw, raw.stamp_ns)], None, SourceOptions()))
 
 
 def message(  # type: ignore[no-untyped-def]
@@ -161,7 +169,7 @@ def test_time_fields_in_all_their_forms() -> None:
 
     def times(name: str, kind: str, values: object) -> np.ndarray:  # type: ignore[type-arg]
         table = np.zeros(4, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<" + kind)])
-        table[name] = values
+        table[name], table["x"] = values, np.arange(1.0, 5.0)
         fields = [("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4"), (name, 12, kind)]
         raw = bytearray(message(fields, table.tobytes(), 4, 1, table.itemsize, table.nbytes))
         struct.pack_into("<iI", raw, 4, 1_600_000_000, 500_000_000)

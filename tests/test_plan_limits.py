@@ -15,6 +15,7 @@ from avsreplay.plan.limits import Scene, margins
 from avsreplay.plan.path import path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.records import Surface
 from avsreplay.simulate.target import builtin_surface
 
 X = np.array([1.0, 0.0, 0.0])
@@ -52,7 +53,7 @@ def test_a_change_of_alternative_between_two_points_is_seen():
 
 def test_signed_distance_of_the_built_in_target():
     surface = builtin_surface()
-    target = target_geometry(surface, (1.0, 0.0, 0.0), True)
+    target = target_geometry(surface, (1.0, 0.0, 0.0))
     inside, outside = np.array([[-0.8, 0.0, 0.0]]), np.array([[2.0, 0.0, 0.0]])
     assert target.surface(inside)[1][0] < 0.0
     foot, distance = target.surface(outside)
@@ -61,6 +62,42 @@ def test_signed_distance_of_the_built_in_target():
         surface.vertices + X, axis=1
     ).max()  # from the centre of mass of ``still``
     assert still(hull_c=target.hull_c).radius_m == pytest.approx(furthest)
+
+
+def boxes(*of):
+    """A mesh of boxes (low corner, high corner), each closed and wound outwards."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32)
+    vertices = [np.array(low) + corners * (np.array(high) - np.array(low)) for low, high in of]
+    numbered = np.concatenate([faces + 8 * k for k in range(len(of))])
+    return Surface(np.concatenate(vertices), numbered, "boxes", "")
+
+
+def test_inside_and_outside_of_parts_that_overlap():
+    """The nearest face of a point in one part may be the side of another that lies in the first."""
+    lows, highs = [[-1, -1, -1], [-0.2, -0.3, -0.3]], [[1, 1, 1], [3, 0.3, 0.3]]
+    distance = target_geometry(boxes(*zip(lows, highs, strict=True)), (1.0, 0.0, 0.0)).surface
+    y = np.random.default_rng(0).uniform([-1.5, -1.5, -1.5], [3.5, 1.5, 1.5], (4000, 3))
+    within = [np.all((y > low) & (y < high), axis=1) for low, high in zip(lows, highs, strict=True)]
+    truth = within[0] | within[1]
+    assert np.array_equal(distance(y)[1] < 0.0, truth)
+    outside = y[~truth]
+    exact = np.min(
+        [
+            np.linalg.norm(np.maximum(np.maximum(low - outside, outside - high), 0.0), axis=1)
+            for low, high in zip(np.array(lows), np.array(highs), strict=True)
+        ],
+        axis=0,
+    )
+    assert distance(outside)[1] == pytest.approx(exact, abs=1e-6)
+
+
+def test_an_open_sheet_has_no_inside():
+    sheet = np.array([[0, 0, 0], [0, 2, 0], [0, 2, 2], [0, 0, 2]], float)
+    surface = Surface(sheet, np.array([[0, 1, 2], [0, 2, 3]], np.int32), "sheet", "")
+    y = np.array([[s * d, 1.1, 0.7] for s in (-1, 1) for d in (1e-3, 0.1, 0.5)])
+    assert target_geometry(surface, (1.0, 0.0, 0.0)).surface(y)[1] == pytest.approx(np.abs(y[:, 0]))
 
 
 def test_the_workspace_is_a_shell_about_the_base():

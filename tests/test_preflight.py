@@ -48,6 +48,9 @@ class Log:
     def in_own_frame(self, scan):
         return scan.points
 
+    def moving_beside(self, frame):
+        return []
+
     def scan_at(self, seq):
         return Scan(seq, seq * 100_000_000, np.asarray(self.clouds[seq], np.float64), ScanStatus.OK)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,6 +28,7 @@ METHOD = {
 }  # names of parameters
 ASSIGNED = {
     "backend": "register.backend",
+    "estimator": "estimator.method",
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",
@@ -176,6 +177,13 @@ def run_settings(command: F) -> F:
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
+            "--task",
+            "task_file",
+            type=file,
+            envvar=_variable("task"),
+            help="TOML file that describes what is grasped in a table [task], and perhaps [robot].",
+        ),
+        click.option(
             "--set",
             "assignments",
             multiple=True,
@@ -214,6 +222,11 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
         from avsreplay.config import robot_settings
 
         put("robot_file", list(robot_settings(robot_file)), "--robot", robot_file)
+    task_file = flags.pop("task_file")
+    if task_file is not None:
+        from avsreplay.config import task_settings
+
+        put("task_file", list(task_settings(task_file)), "--task", task_file)
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():
@@ -298,14 +311,12 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
         )
 
 
-def _own_table(log: Path) -> dict[str, Any]:
-    import tomllib
-
+def _own_table(log: Path) -> Mapping[str, Any]:
+    from avsreplay import toml_document
     from avsreplay.log import SourceOptions, open_source
 
     with open_source(log, SourceOptions()) as source:
-        table: dict[str, Any] = tomllib.loads(source.header.scenario).get("run", {})
-    return table
+        return toml_document.own_settings(source.header.scenario, str(log))
 
 
 def reference_page() -> str:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from avsreplay.cli import interrupts
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output, is_stream
@@ -96,6 +97,11 @@ run_source_options = added(
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--scan-duration", "scan_duration_s", type=float),
+    source_setting("--intrinsics", type=str),
+    source_setting("--scan-unit"),
+    source_setting("--point-time", metavar="FIELD:UNIT:ORIGIN"),
+    source_setting("--no-return", metavar="CODES"),
+    source_setting("--byte-order"),
     source_setting("--rate", "rate_hz", type=float),
     source_setting("--every-scan", "every", type=int),
     source_setting("--end", "end_s", type=float),
@@ -120,25 +126,32 @@ pose_options = added(
 """Options for reading measured poses (``--backend poses``)."""
 
 
+_CHOICES = {
+    "clock": "ClockChoice",
+    "model_unit": "Unit",
+    "scan_unit": "Unit",
+    "byte_order": "ByteOrder",
+}  # options that are enumerations
+
+
 def read_options(flags: Mapping[str, Any]) -> SourceOptions:
     """The given (not None) options as ``SourceOptions``.
 
     Raises:
         UsageError: a value is not allowed.
     """
-    from avsreplay.log import ClockChoice, SourceOptions
-    from avsreplay.log.options import Unit
+    from avsreplay.log import SourceOptions
+    from avsreplay.log import options as log_options
 
     given = {name: value for name, value in flags.items() if value is not None}
-    if "clock" in given:
-        given["clock"] = ClockChoice(given["clock"])
+    for name, choice in _CHOICES.items():
+        if name in given:
+            given[name] = getattr(log_options, choice)(given[name])
     if "grasp" in given and given.get("model") == Path("auto"):
         hint = "build the model first with 'avsreplay model', which has the same option"
         raise UsageError(
             "the frame of a model is not known before it is built", where="--grasp", hint=hint
         )
-    if "model_unit" in given:
-        given["model_unit"] = Unit(given["model_unit"])
     try:
         return SourceOptions(**given)
     except ValueError as error:
@@ -331,6 +344,8 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
     asked: list[int] = []
 
     def ask(number: int, _frame: object) -> None:
+        if not interrupts.counts():
+            return
         asked.append(number)
         stop()
         if not rows or len(asked) > 1:

@@ -244,10 +244,10 @@ def export_command(
         stamped = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
         click.echo(f"{output}: {export.write_tum(output, stamped)} poses", err=quiet)
         return
-    export.write_kitti(output, by_row)
+    export.write_kitti(output, (pose for pose in by_row if pose is not None))
     missing = len(by_row) - count
-    note = f"; {missing} scans without a pose are lines of nan" if missing else ""
-    click.echo(f"{output}: {len(by_row)} lines, one per scan{note}", err=quiet)
+    left = f"; {missing} scans without a pose are left out, --to tum has the times"
+    click.echo(f"{output}: {count} lines, one per pose{left if missing else ''}", err=quiet)
 
 
 REPORT_EPILOG = """\b

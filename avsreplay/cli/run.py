@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
 
-GRADES = click.Choice(["pass", "check"], case_sensitive=False)
+GRADES = ("pass", "check", "any")
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
@@ -51,8 +51,33 @@ Examples:
   avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
-Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than required,
+Exit codes: 0 ok, 1 the tracking is FAIL, the golden file differs or a requirement is not met,
             2 usage, 3 unreadable input, 4 finished but data was lost, 130 interrupted."""
+
+
+class Requirement(click.ParamType[str | float]):
+    """``pass``, ``check`` or ``any``, or ``capture=P`` with the least probability of a capture."""
+
+    name = "pass|check|any|capture=P"
+
+    def convert(
+        self,
+        value: Any,
+        param: click.Parameter | None,
+        ctx: click.Context | None,  # noqa: ARG002 -- the signature of click
+    ) -> str | float:
+        """Return the name of a grade, or the probability."""
+        text = str(value).lower()
+        if text in GRADES:
+            return text
+        name, sign, number = text.partition("=")
+        try:
+            least = float(number) if name == "capture" and sign else -1.0
+        except ValueError:
+            least = -1.0
+        if not 0.0 <= least <= 1.0:
+            self.fail(f"'{value}' is not {', '.join(GRADES)} or capture=P, P from 0 to 1", param)
+        return least
 
 
 @click.command("run", cls=SectionedCommand, epilog=EPILOG)
@@ -98,7 +123,14 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
     help="LOG is still being written: replay each scan as soon as it is complete.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@click.option("--require", "least", type=GRADES, help="Exit with code 1 if the verdict is worse.")
+@click.option(
+    "--require",
+    "required",
+    type=Requirement(),
+    multiple=True,
+    help="Exit with code 1 if the verdict is worse, or the capture is less probable (capture=0.9)."
+    " Without it FAIL gives code 1; any accepts every verdict. May be repeated.",
+)
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
@@ -157,7 +189,7 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
-        click.echo(f"verdict {done.verdict.line}", err=True)
+        click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
 
@@ -178,7 +210,7 @@ class Wanted:
     table_all: bool
     plain: bool
     to_rerun: str | None
-    least: str | None
+    required: tuple[str | float, ...]
 
     def check(self) -> None:
         """Raise UsageError if two options contradict each other, UnreadableInput for an unusable
@@ -285,6 +317,8 @@ def _replayed(
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
+        record["capture"] = None if summary.assessment is None else summary.assessment.record()
+        record["measured_1s"] = None if run.flight.noise is None else list(run.flight.noise)
         record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
         grade = (
             "check" if summary.healthy else "fail"
@@ -411,11 +445,27 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
             _print_differences(result, done.verdict, to_stderr=wanted.as_json)
         result.check(str(wanted.golden))
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
-    order = ["pass", "check", "fail"]
-    if wanted.least and order.index(done.verdict.grade.value.lower()) > order.index(wanted.least):
-        raise CheckFailed(f"the verdict is {done.verdict.line}", where=f"--require {wanted.least}")
     if "interrupted_after" in done.record:
         raise KeyboardInterrupt
+    _check_required(wanted.required, done.verdict)
+
+
+def _check_required(required: Sequence[str | float], verdict: RunVerdict) -> None:
+    """Raise CheckFailed for a verdict that is worse than required; without a requirement on the
+    grade FAIL is worse.
+    """
+    capture = verdict.capture
+    probability = (None if capture is None else capture.probability) or 0.0
+    for least in required:
+        if isinstance(least, float) and (probability < least or not (capture and capture.succeeds)):
+            where = f"--require capture={least:g}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+    order = ["pass", "check", "fail"]
+    grades = [least for least in required if isinstance(least, str)] or ["check"]
+    for grade in grades:
+        if grade != "any" and order.index(verdict.grade.value.lower()) > order.index(grade):
+            where = f"--require {grade}" if required else "tracking"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
 
 
 def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:

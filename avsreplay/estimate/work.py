@@ -9,10 +9,11 @@ were there when it began; its result is corrected by the later ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
+from avsreplay.checkpoint import TRANSIENT
 from avsreplay.errors import value_class
 
 T = TypeVar("T")
@@ -32,6 +33,7 @@ def whole(parts: Parts[T]) -> T:
             return result
 
 
+@dataclass(eq=False)
 class Work(Generic[T]):
     """A computation up to some part. ``continued`` leaves it as it is: any track that holds it may
     continue it.
@@ -40,18 +42,11 @@ class Work(Generic[T]):
     them again.
     """
 
-    def __init__(self, count: int = 0) -> None:
-        self.count = count
-        self.result: T | None = None
-        self.done = False
-        self._parts: Parts[T] | None = None
-        self._after: Work[T] | None = None
-
-    def __getstate__(self) -> int:
-        return self.count
-
-    def __setstate__(self, count: int) -> None:
-        Work.__init__(self, count)
+    count: int = 0
+    result: T | None = field(default=None, init=False, metadata=TRANSIENT)
+    done: bool = field(default=False, init=False, metadata=TRANSIENT)
+    _parts: Parts[T] | None = field(default=None, init=False, repr=False, metadata=TRANSIENT)
+    _after: Work[T] | None = field(default=None, init=False, repr=False, metadata=TRANSIENT)
 
     def continued(self, begin: Callable[[], Parts[T]]) -> Work[T]:
         """Return the computation after the parts of one more scan. ``begin`` begins it."""

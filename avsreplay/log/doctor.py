@@ -18,13 +18,13 @@ from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.files import check_output, output_path
 from avsreplay.geometry import Array
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.cloud_messages import raw_message
 from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, parse_surface
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
-from avsreplay.log.point_cloud2 import decode_cloud, read_layout
 from avsreplay.log.source import Source
 from avsreplay.log.writer import LIBRARY
 from avsreplay.records import Scan, ScanStatus
@@ -254,11 +254,7 @@ def _scans(tally: _Tally) -> Iterator[Finding]:
 def _layout(source: Source) -> Iterator[Finding]:
     """Report the fields of the clouds and whether they change."""
     layouts: Counter[str] = Counter()
-    for payload, encoding in source.payloads():
-        try:
-            layout = read_layout(payload, encoding)
-        except BadMessage:
-            continue
+    for layout in source.layouts():
         fields = " ".join(f"{shown(f.name)}:{f.kind}@{f.offset}" for f in layout.fields)
         order = "little" if layout.order == "<" else "big"
         layouts[
@@ -300,7 +296,7 @@ class _Copier:
         """
         if channel.type in CLOUD_TYPES:
             try:
-                decode_cloud(payload, channel.encoding)
+                raw_message(channel.type, payload, channel.encoding)
             except BadMessage as error:
                 self.done.dropped.append(f"a cloud on {shown(channel.topic)}: {shown(error)}")
                 return

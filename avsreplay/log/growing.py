@@ -58,6 +58,7 @@ class GrowingLog:
         self._at, self._fed, self._pause_s = 0, feed is not None, _POLL_S
         self._stop, self._opened = threading.Event(), False
         self._used: list[tuple[Scan, Truth]] = []
+        self._meanings = set[object]()  # of the numbers of the clouds, at each opening
         self._clock = (
             0,
             0.0,
@@ -101,10 +102,12 @@ class GrowingLog:
         self._used.append((replace(scan, points=_NO_POINTS, times_s=None, places=None), truth))
 
     def outdated(self) -> bool:
-        """Return whether the finished log gives another time, note or truth for a scan than was
-        used.
+        """Return whether the finished log gives another meaning, time, note or truth for a scan
+        than was used.
         """
         if len(self._used) != len(self.source):
+            return True
+        if len(self._meanings) > 1:
             return True
         if self._clock != (self.source.first_ns, self.source.clock.period_s):
             return True
@@ -147,6 +150,7 @@ class GrowingLog:
                         self.source.add_loss(
                             Loss(f"the stream broke off: {self._broken.strerror}", self._at, 0)
                         )
+                    self._meanings.add(self.source.meaning.decided)
                     if not self._opened:
                         self._opened = True
                         self._clock = self.source.first_ns, self.source.clock.period_s

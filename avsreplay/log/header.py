@@ -26,16 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
-from avsreplay.binary_files import BadFile, read_limited
+from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import refuse_pointer
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
-from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
+from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
+OWN_MODEL, _OWN_WITHIN = b"comment reconstructed by avsreplay", 1024  # marks a built model
 FORMAT, _MAX_NAME = "1", 256
 _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
@@ -197,7 +200,8 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     Args:
         path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of
             the model.
-        cloud_ok: accept a file without faces as a point-cloud model.
+        cloud_ok: accept a file without faces as a point-cloud model; one that ``avsreplay model``
+            built is accepted anyway.
 
     Returns:
         The model with the bytes and the SHA-256 of its file.
@@ -208,7 +212,8 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     """
     path = Path(path)
     data = read_limited(path, MAX_BYTES, "name a model file of at most 512 MiB")
-    return _parsed(data, path.name, shown(path), cloud_ok)
+    own = OWN_MODEL in data[:_OWN_WITHIN]
+    return _parsed(data, path.name, shown(path), cloud_ok or own)
 
 
 def parse_surface(data: bytes, name: str) -> Surface:
@@ -283,6 +288,7 @@ def surface_bytes(surface: Surface) -> bytes:
 
 def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     suffix = PurePath(name).suffix.lower().lstrip(".")
+    refuse_pointer(data, where)
     if not data:
         raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
     if data.startswith(b"ply"):
@@ -296,9 +302,8 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
             f"'{shown(suffix)}' is not a known model format", where=where, hint=hint
         )
     try:
-        vertices, faces = (
-            _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
-        )
+        reader, budget = _OWN_READERS.get(suffix), ReadBudget(len(data))
+        vertices, faces = reader(data, budget) if reader else _trimesh(data, suffix)
     except _FOREIGN as error:
         reason = shown(str(error) or type(error).__name__)[:120]
         raise UnreadableInput(
@@ -315,14 +320,14 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data, reversed_)
 
 
-def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
-    ply = read_ply(data)
+def _ply(data: bytes, budget: ReadBudget) -> tuple[Array, NDArray[np.int64]]:
+    ply = read_ply(data, budget)
     return ply.points().astype(np.float64), ply.faces
 
 
-def _pcd(data: bytes) -> tuple[Array, NDArray[Any]]:
+def _pcd(data: bytes, budget: ReadBudget) -> tuple[Array, NDArray[Any]]:
     """A PCD file is a point-cloud model; points without a return are left out."""
-    points = read_pcd(data).astype(np.float64)
+    points = read_pcd(data, budget).astype(np.float64)
     return points[np.isfinite(points).all(axis=1)], np.zeros((0, 3), np.int32)
 
 

@@ -8,6 +8,8 @@ from enum import Enum
 from pathlib import Path
 
 from avsreplay.errors import counted, value_class
+from avsreplay.log.point_times import parse_point_time
+from avsreplay.log.returns import parse_no_return
 from avsreplay.settings import Settings, setting
 
 ASSUMED_HZ = 1.0  # rate of scans or poses without times
@@ -34,6 +36,13 @@ class Unit(Enum):
     def metres(self) -> float:
         """Return one unit in metres."""
         return {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}[self.value]
+
+
+class ByteOrder(Enum):
+    """Order of the bytes of the values of a cloud."""
+
+    DECLARED = "declared"
+    REVERSED = "reversed"  # the other order than declared
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,12 +153,41 @@ class SourceOptions(Settings):
         high=1e3,
         unset="the points of a cloud belong to one instant",
     )
+    scan_unit: Unit | None = setting(
+        None,
+        "Unit of the coordinates of the clouds.",
+        unset="metres, for whole numbers millimetres",
+    )
+    point_time: str | None = setting(
+        None,
+        "Times of the points as FIELD:UNIT:ORIGIN: a unit of s, ms, us or ns, and an origin of"
+        " stamp, clock (that of the stamps), first or last (point, at the stamp), or the offset of"
+        " another clock in seconds; 'none' ignores them.",
+        unset="inferred from the values",
+    )
+    no_return: str | None = setting(
+        None,
+        "Codes of missing returns, separated by semicolons: X,Y,Z, z=VALUE or range=VALUE; 'none'"
+        " for no code.",
+        unset="inferred from the values",
+    )
+    byte_order: ByteOrder | None = setting(
+        None,
+        "Order of the bytes of the values of a cloud, against what its message declares.",
+        unset="inferred from the values",
+    )
     fixed_frame: str | None = setting(
         None, "Frame of the /tf tree into which each cloud is transformed at its own time."
     )
     sensor_topic: str | None = setting(
         None,
         "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame.",
+    )
+    intrinsics: str | None = setting(
+        None,
+        "Camera of depth images: FX,FY,CX,CY [pixel], or a file with the matrix, the YAML of a ROS"
+        " calibration or the JSON of Open3D.",
+        unset="the CameraInfo of the log, or a file of intrinsics in the folder or above it",
     )
     rate_hz: float | None = setting(
         None,
@@ -167,7 +205,7 @@ class SourceOptions(Settings):
     )
 
     def check(self) -> None:
-        """Raise ValueError if a crop is empty."""
+        """Raise ValueError if a crop is empty, or a text has another form than stated."""
         box = self.crop_box
         if box is not None and not all(
             low < high for low, high in zip(box[:3], box[3:], strict=True)
@@ -175,6 +213,12 @@ class SourceOptions(Settings):
             raise ValueError(f"crop_box {box} is empty")
         if self.crop_range is not None and not self.crop_range[0] < self.crop_range[1]:
             raise ValueError(f"crop_range {self.crop_range} is empty")
+        for name, parse in (("point_time", parse_point_time), ("no_return", parse_no_return)):
+            if (text := getattr(self, name)) is not None:
+                try:
+                    parse(text)
+                except ValueError as error:
+                    raise ValueError(f"{name} {error}") from None
 
     @property
     def scan_rate_hz(self) -> float:

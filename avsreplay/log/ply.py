@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.binary_files import BadFile
 from avsreplay.errors import value_class
+from avsreplay.read_budget import BadFile, ReadBudget
 
 _TYPES = {
     "char": "i1",
@@ -36,6 +36,7 @@ _TYPES = {
     "float64": "f8",
 }
 _MAX_HEADER = 1 << 16
+_VALUE_BYTES = 8  # memory of a value
 
 
 @value_class(eq=True)
@@ -79,9 +80,22 @@ class Ply:
         return np.stack([self.vertex[axis] for axis in "xyz"], axis=1)
 
 
-def read_ply(data: bytes) -> Ply:
-    """Parse the bytes of a PLY file. Raises BadFile if it is malformed; the text states why."""
+def read_ply(data: bytes, budget: ReadBudget | None = None) -> Ply:
+    """Parse the bytes of a PLY file.
+
+    Args:
+        data: the bytes.
+        budget: what its content may take; None for the default of a file of this size.
+
+    Raises:
+        BadFile: the file is malformed; the text states why.
+        OverBudget: it has too many properties, or its content would take too much memory.
+    """
+    budget = budget or ReadBudget(len(data))
     order, elements, start = _header(data)
+    for element in elements:
+        budget.take_records(element.size, f"{element.name} elements")
+        budget.take_bytes(_VALUE_BYTES * element.size * len(element.properties), "elements")
     vertex: dict[str, NDArray[Any]] = {}
     faces = np.zeros((0, 3), dtype=np.int64)
     body = _Text(data[start:]) if order is None else _Binary(data, start, order)

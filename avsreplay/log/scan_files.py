@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.binary_files import BadFile, parse_npy, read_members
+from avsreplay.binary_files import parse_npy, read_members
 from avsreplay.errors import MissingBackend, UnreadableInput, value_class
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
+from avsreplay.read_budget import BadFile, ReadBudget
 
 
 def read_points(path: Path, limit: int) -> NDArray[Any]:
@@ -36,28 +37,29 @@ def read_points(path: Path, limit: int) -> NDArray[Any]:
         OSError: the file cannot be read.
         MissingBackend: the library for the format is not installed.
     """
-    return _READERS[path.suffix.lower()](path.read_bytes(), limit)
+    data = path.read_bytes()
+    return _READERS[path.suffix.lower()](data, ReadBudget(len(data), most_bytes=limit))
 
 
 def _floats(points: NDArray[Any]) -> NDArray[Any]:
     return points if points.dtype in (np.float32, np.float64) else points.astype(np.float64)
 
 
-def _ply(data: bytes, _limit: int) -> NDArray[Any]:
-    return _floats(read_ply(data).points())
+def _ply(data: bytes, budget: ReadBudget) -> NDArray[Any]:
+    return _floats(read_ply(data, budget).points())
 
 
-def _pcd(data: bytes, _limit: int) -> NDArray[Any]:
-    return read_pcd(data)
+def _pcd(data: bytes, budget: ReadBudget) -> NDArray[Any]:
+    return read_pcd(data, budget)
 
 
-def _kitti(data: bytes, _limit: int) -> NDArray[Any]:
+def _kitti(data: bytes, _budget: ReadBudget) -> NDArray[Any]:
     if len(data) % 16:
         raise BadFile(f"{len(data)} bytes are not whole KITTI points of 16")
     return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
 
 
-def _npy(data: bytes, _limit: int) -> NDArray[Any]:
+def _npy(data: bytes, _budget: ReadBudget) -> NDArray[Any]:
     return _columns(parse_npy(data))
 
 
@@ -69,17 +71,17 @@ def _columns(array: NDArray[Any]) -> NDArray[Any]:
     return _floats(flat.astype(flat.dtype.newbyteorder("="), copy=False))
 
 
-def _npz(data: bytes, limit: int) -> NDArray[Any]:
+def _npz(data: bytes, budget: ReadBudget) -> NDArray[Any]:
     members = {
-        name: member for name, member in read_members(data, limit).items() if name.endswith(".npy")
+        name: member for name, member in read_members(data, budget).items() if name.endswith(".npy")
     }
     named = [name for name in members if name in ("points.npy", "xyz.npy")] or list(members)
     if len(named) != 1:
         raise BadFile(f"{len(members)} arrays; name one of them 'points'")
-    return _npy(members[named[0]], limit)
+    return _npy(members[named[0]], budget)
 
 
-def _las(data: bytes, limit: int) -> NDArray[Any]:
+def _las(data: bytes, budget: ReadBudget) -> NDArray[Any]:
     try:
         import laspy
     except ImportError:
@@ -89,10 +91,7 @@ def _las(data: bytes, limit: int) -> NDArray[Any]:
     module: Any = laspy  # its type stubs are incomplete
     try:
         with module.open(io.BytesIO(data)) as reader:
-            if reader.header.point_count * 24 > limit:
-                raise BadFile(
-                    f"{reader.header.point_count} points are over the limit of {limit} bytes"
-                )
+            budget.take_bytes(reader.header.point_count * 24, "points")
             return np.asarray(reader.read().xyz, dtype=np.float64)
     except (
         laspy.errors.LaspyException,
@@ -105,7 +104,7 @@ def _las(data: bytes, limit: int) -> NDArray[Any]:
         raise BadFile(f"not a readable LAS: {str(error)[:80]}") from None
 
 
-_READERS: dict[str, Callable[[bytes, int], NDArray[Any]]] = {
+_READERS: dict[str, Callable[[bytes, ReadBudget], NDArray[Any]]] = {
     ".ply": _ply,
     ".pcd": _pcd,
     ".bin": _kitti,
@@ -115,6 +114,7 @@ _READERS: dict[str, Callable[[bytes, int], NDArray[Any]]] = {
     ".laz": _las,
 }
 SCAN_FORMATS = tuple(_READERS)
+DEPTH_FORMAT = ".png"  # a folder of depth images, where it has no other scans
 LOG_FORMATS, LISTED = (".mcap", ".bag", ".db3"), 3
 
 
@@ -143,18 +143,23 @@ def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = Non
                 hint=hint,
             )
         return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
-    found = [p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in SCAN_FORMATS]
+    files = [p for p in folder.iterdir() if p.is_file()]
+    found = [p for p in files if p.suffix.lower() in SCAN_FORMATS] or [
+        p for p in files if p.suffix.lower() == DEPTH_FORMAT
+    ]
     if model is not None and model.exists():
         found = [p for p in found if not p.samefile(model)]
     if not found:
         logs = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in LOG_FORMATS)
-        hint = f"scans are {', '.join(SCAN_FORMATS)} files; a log is an MCAP or a ROS bag"
+        kinds = f"{', '.join(SCAN_FORMATS)} or depth {DEPTH_FORMAT} files"
+        hint = f"scans are {kinds}; a log is an MCAP or a ROS bag"
         if logs:
             more = ", ..." if len(logs) > LISTED else ""
             hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
         raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
-    counts = {s: sum(p.suffix.lower() == s for p in found) for s in SCAN_FORMATS}
-    common = max(SCAN_FORMATS, key=lambda s: counts[s])
+    formats = (*SCAN_FORMATS, DEPTH_FORMAT)
+    counts = {s: sum(p.suffix.lower() == s for p in found) for s in formats}
+    common = max(formats, key=lambda s: counts[s])
     return sorted((p for p in found if p.suffix.lower() == common), key=lambda p: by_number(p.name))
 
 
@@ -193,13 +198,20 @@ class _Header:
         return np.dtype([(n, k, s) for n, k, s in fields])
 
 
-def read_pcd(data: bytes) -> NDArray[Any]:
+def read_pcd(data: bytes, budget: ReadBudget | None = None) -> NDArray[Any]:
     """Return the (n, 3) points of a PCD file, float32 or float64, NaN where the sensor had no
     return.
 
-    Raises BadFile if the file is malformed; the text states why.
+    Args:
+        data: the bytes of the file.
+        budget: what its content may take; None for the default of a file of this size.
+
+    Raises:
+        BadFile: the file is malformed; the text states why.
+        OverBudget: its points would take too much memory.
     """
-    header = _header(data)
+    header, budget = _header(data), budget or ReadBudget(len(data))
+    budget.take_bytes(header.points * header.row.itemsize, "points")
     for axis in "xyz":
         if header.names.count(axis) != 1 or header.counts[header.names.index(axis)] != 1:
             raise BadFile(f"its points have no single '{axis}'")

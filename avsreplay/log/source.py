@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,9 +20,27 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.canonical import (
+    SAMPLE,
+    Cloud,
+    Meaning,
+    at_stamp,
+    canonical,
+    infer,
+    selected,
+    spread,
+)
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, lost_text
-from avsreplay.log.point_cloud2 import Cloud, at_stamp, selected
+from avsreplay.log.options import (
+    ClockChoice,
+    ClockSummary,
+    LogInfo,
+    Loss,
+    SourceOptions,
+    lost_text,
+)
+from avsreplay.log.point_cloud2 import Layout
+from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
@@ -104,6 +124,26 @@ class Source:
     def clock(self) -> ClockSummary:
         """Return how the times of the scans were determined."""
         return self._clock
+
+    @cached_property
+    def meaning(self) -> Meaning:
+        """What the numbers of the clouds mean, inferred from some that are spread over the log."""
+        if self.options.poses:
+            return Meaning()
+        sound = [k for k, placed in enumerate(self._placed) if placed.note is None]
+        sample = list[TimedCloud]()
+        for k in spread(len(sound), SAMPLE):
+            with suppress(BadMessage):
+                sample.append(TimedCloud(self._clouds.load(sound[k]), self._stamp(sound[k])))
+        return infer(sample, self._period_s(), self.options)
+
+    def _period_s(self) -> float | None:
+        """Return the usual time between two scans [s], None if it is not known."""
+        if not self._clouds.topics() and "assumed" in self.header.notes.get("times", ""):
+            return None
+        steps = sorted(b.t_ns - a.t_ns for a, b in pairwise(self._placed))
+        period_ns = steps[len(steps) // 2] if steps else 0
+        return period_ns * 1e-9 if period_ns > 1 else None
 
     def truth_poses(self) -> list[tuple[int, Pose]]:
         """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in
@@ -229,6 +269,9 @@ class Source:
         transforms = any(
             topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics()
         )
+        if self._apart(at, clouds):
+            text = f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'"
+            return f"{text}, and no transform of the log connects them", ""
         if at in ("", clouds) or not clouds or not (at in frames if frames else transforms):
             return None
         return (
@@ -244,6 +287,21 @@ class Source:
         """
         return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
+    def moving_beside(self, frame: str) -> list[str]:
+        """Return the frames of /tf that move and do not carry a frame.
+
+        Args:
+            frame: name of the frame of a cloud.
+        """
+        return self._ground_truth.moving_beside(frame)
+
+    def _apart(self, one: str, two: str) -> bool:
+        """Whether two named frames are in no common tree of transforms."""
+        known = self._ground_truth.frames
+        return bool(
+            one and two and one != two and one in known
+        ) and not self._ground_truth.connected(one, two)
+
     def moving_in(self, frame: str) -> str | None:
         """Return the root frame in which a frame moves; None if it is fixed or the transforms were
         not collected.
@@ -253,11 +311,11 @@ class Source:
         """
         return self._ground_truth.moving_in(frame)
 
-    def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
-        """Yield the serialised cloud messages with their encoding; none for a folder."""
+    def layouts(self) -> Iterator[Layout]:
+        """Yield the layouts of the messages of clouds; none for depth images, poses and files."""
         for at in self._selected:
             try:
-                found = self._clouds.payload(at)
+                found = self._clouds.layout(at)
             except BadMessage:
                 continue
             if found is not None:
@@ -313,13 +371,26 @@ class Source:
     def _scan(self, seq: int, place: int) -> Scan:
         placed = self._placed[place]
         try:
-            cloud = self._taken(self._clouds.load(place), placed.t_ns)
+            cloud = self._taken(self._canonical(place), placed.t_ns)
         except BadMessage as error:
             self.damaged[seq] = shown(error)
             if self.options.strict:
                 refuse_losses(self)
             return self._finish(seq, place, None, self.damaged[seq])
         return self._finish(seq, place, cloud, placed.note)
+
+    def _canonical(self, place: int) -> Cloud:
+        """Return one cloud in metres, with its returns and their times only.
+
+        Raises BadMessage if it cannot be decoded.
+        """
+        raw = self._clouds.load(place)
+        trusted = self._placed[place].note is None
+        return canonical(raw, self.meaning, self._stamp(place) if trusted else 0)
+
+    def _stamp(self, place: int) -> int:
+        """Return the stamp of a cloud, or its time of reception if it has none [ns]."""
+        return self._clouds.header_ns[place] or self._clouds.log_ns[place]
 
     def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
         placed, log_ns = self._placed[place], self._clouds.log_ns[place]
@@ -376,6 +447,9 @@ class Source:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""
         lookup = self._ground_truth.sensor
         pose = Pose.identity() if lookup is None else lookup(t_ns, frame)
+        if pose is None and self._apart((self.options.fixed_frame or "").lstrip("/"), frame):
+            fixed = self.options.fixed_frame
+            raise BadMessage(f"no transform connects '{shown(frame)}' to '{shown(fixed)}'")
         if pose is None:
             raise BadMessage(UNKNOWN_SENSOR)
         return pose

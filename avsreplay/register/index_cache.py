@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.binary_files import BadFile, parse_npy, read_members
+from avsreplay.binary_files import parse_npy, read_members
 from avsreplay.geometry import Array
+from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Surface
 
 MAGIC = b"AVSINDEX"
@@ -103,7 +104,7 @@ def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
     if payload is None:
         return {}
     try:
-        members = read_members(payload.tobytes(), payload.nbytes)
+        members = read_members(payload.tobytes(), ReadBudget(payload.nbytes))
         return {name.removesuffix(".npy"): parse_npy(member) for name, member in members.items()}
     except BadFile:  # another program wrote it
         return {}

@@ -97,7 +97,7 @@ class Registrar:
         )
         near = near_work(surface, self.index)
         self._target = Target(surface, self.index, self.limits, self._visibility, near)
-        self._backend = create_backend(self.params.backend, factory, self._target)
+        self._backend = create_backend(self.params, factory, self._target)
         self._test = PlausibilityTest(self._target)
         self._restarter = restarts.Restarter(self._target, self._test)
         self._grader = Grader(self._target, self.params, self._backend, self._restarter)

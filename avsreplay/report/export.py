@@ -69,19 +69,11 @@ def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
     )
 
 
-def write_kitti(path: str | Path, poses: Iterable[Pose | None]) -> int:
-    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per scan [m]; return the
+def write_kitti(path: str | Path, poses: Iterable[Pose]) -> int:
+    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per pose [m]; return the
     number of poses.
-
-    KITTI has no time stamps, so that a line number must be a scan number: a scan without a pose is
-        a line of ``nan``.
     """
-    listed = list(poses)
-    nothing = " ".join(["nan"] * 12)
-    _write_lines(
-        path, (nothing if pose is None else _text(pose.matrix[:3].ravel()) for pose in listed)
-    )
-    return sum(pose is not None for pose in listed)
+    return _write_lines(path, (_text(pose.matrix[:3].ravel()) for pose in poses))
 
 
 def _text(values: Array) -> str:

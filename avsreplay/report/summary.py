@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, Label, State
@@ -127,6 +128,7 @@ class Summary:
         weighed_down: healthy poses with a Cauchy weight below 1.
         reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.
+        assessment: of the capture, which is not computed from the rows; None where there is none.
         interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
     """
@@ -166,6 +168,7 @@ class Summary:
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
     acceleration: str | None = None
+    assessment: Assessment | None = None
 
     @classmethod
     def fold(

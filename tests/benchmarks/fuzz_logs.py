@@ -19,7 +19,7 @@ from avsreplay.errors import AvsError
 from avsreplay.log import SourceOptions, open_source, parse_surface
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.doctor import examine, repair
-from avsreplay.log.point_cloud2 import decode_cloud
+from avsreplay.log.point_cloud2 import raw_cloud
 from avsreplay.log.pose_files import read_conf, read_poses
 
 LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 512, 16
@@ -35,7 +35,7 @@ def check(name: str, data: bytes, folder: Path, deep: bool) -> str:
     kind = name.rsplit(".", 1)[-1]
     try:
         if kind in ("cdr", "ros1"):
-            decode_cloud(data, kind)
+            raw_cloud(data, kind)
         elif kind == "toml":
             toml_document.parse(data.decode("utf-8", "replace"), name)
         elif name.startswith("model"):

@@ -21,7 +21,7 @@ with atheris.instrument_imports(include=["avsreplay.log"]):
     from avsreplay.binary_files import BadFile
     from avsreplay.log.bytes_io import BadMessage
     from avsreplay.log.ply import read_ply
-    from avsreplay.log.point_cloud2 import decode_cloud
+    from avsreplay.log.point_cloud2 import raw_cloud
     from avsreplay.log.scan_files import read_pcd, read_points, unpack_lzf
 
 _SCRATCH = Path(tempfile.mkdtemp()) / "one.npy"
@@ -33,8 +33,8 @@ def _npy(data: bytes) -> object:
 
 
 PARSERS: dict[str, Callable[[bytes], object]] = {
-    "cdr": decode_cloud,
-    "ros1": lambda data: decode_cloud(data, "ros1"),
+    "cdr": raw_cloud,
+    "ros1": lambda data: raw_cloud(data, "ros1"),
     "pcd": read_pcd,
     "ply": read_ply,
     "lzf": lambda data: unpack_lzf(data[2:], int.from_bytes(data[:2], "little")),

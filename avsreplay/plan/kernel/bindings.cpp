@@ -8,6 +8,7 @@
 #include "constraints.hpp"
 #include "interior_point.hpp"
 #include "primer.hpp"
+#include "winding.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -138,6 +139,28 @@ nb::object integrals(const In<double, -1, 3>& P0, const In<double, -1, 3>& P1, c
                         nb::ndarray<nb::numpy, double>(second, 2, shape, own_second));
 }
 
+Winding winding_of(const In<double, -1, 3>& vertices, const In<int, -1, 3>& faces) {
+  const size_t n = vertices.shape(0), m = faces.shape(0);
+  for (size_t i = 0; i < 3 * m; ++i)
+    if (faces.data()[i] < 0 || static_cast<size_t>(faces.data()[i]) >= n)
+      throw nb::value_error("a face refers to a missing vertex");
+  nb::gil_scoped_release release;
+  return Winding(vertices.data(), faces.data(), m);
+}
+
+// Which points (n, 3) with distances (n,) to the surface have a winding number above ``least``.
+nb::object inside(const Winding& winding, const In<double, -1, 3>& points, const In<double, -1>& distances, double least) {
+  const size_t n = points.shape(0), shape[1] = {n};
+  if (distances.shape(0) != n) throw nb::value_error("points and distances of different numbers");
+  bool* out = new bool[n];
+  nb::capsule own(out, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+  {
+    nb::gil_scoped_release release;
+    winding.inside(reinterpret_cast<const Vector3*>(points.data()), distances.data(), n, least, out);
+  }
+  return nb::cast(nb::ndarray<nb::numpy, bool>(out, 1, shape, own));
+}
+
 }  // namespace
 
 NB_MODULE(_cone, m) {
@@ -148,4 +171,6 @@ NB_MODULE(_cone, m) {
   m.def("spline", &spline_of);
   m.def("values", &values);
   m.def("integrals", &integrals);
+  nb::class_<Winding>(m, "Winding").def("inside", &inside);
+  m.def("winding", &winding_of);
 }
