@@ -396,6 +396,7 @@ class Run:
                 "extent_m": surface.extent,
             },
             "clock": settings.dump(self.source.clock),
+            "clouds": self.source.meaning.record(),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),

@@ -259,6 +259,9 @@ def _checked(run: Run) -> list[Advice]:
 
     checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
     found = [advice for advice in checked if advice.grade != "ok"]
+    for each in run.source.meaning.inferences:
+        if each.grade == "ok":
+            click.echo(f"avsreplay: {each.about}: {each.sentence}", err=True)
     for advice in found:
         click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
     return found
