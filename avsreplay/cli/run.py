@@ -377,8 +377,8 @@ def _collect(
 
     try:
         with (
-            closing(found),
             interruptible(rows, growing.stop if growing else lambda: None) as stopped,
+            closing(found),
         ):
             for row in found:
                 if live:
