@@ -109,6 +109,7 @@ def _write_job(
     """Write the options of the command, and those that were advised with their reasons."""
     from avsreplay.cli.job import job_text
     from avsreplay.cli.trial import advised_words, job_with
+    from avsreplay.files import output_text
 
     job, before = job_with(source, reading, words), job_with(source, reading, [])
     reasons = dict[str, str]()
@@ -123,7 +124,8 @@ def _write_job(
     text = job_text(source, job.options, list(map(str, job.assignments)), reasons, path.parent)
     result = next((a.text for a in advice if a.about == "replay"), "")
     head = f"# {result}\n" if result else ""
-    path.write_text(head + text, encoding="utf-8")
+    with output_text(path) as stream:
+        stream.write(head + text)
 
 
 def _advice(opened: Source, built: bool) -> list[Advice]:

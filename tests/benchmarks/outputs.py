@@ -40,6 +40,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("record", "output"): ("scenario.toml", "-o", "OUT", "--overwrite"),
     ("run", "output"): (*RUN, "-o", "OUT", "--overwrite"),
     ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
+    ("info", "job_file"): ("log.mcap", "--write", "OUT", "--overwrite"),
     ("doctor", "output"): ("log.mcap", "--repair", "OUT", "--overwrite"),
     ("plan", "export"): (
         "result",
@@ -230,6 +231,7 @@ def output_of(case: tuple[str, str], place: Path) -> Path:
         ("compare", "output"): ".html",
         ("compare", "junit"): ".xml",
         ("run", "update_golden"): ".jsonl",
+        ("info", "job_file"): ".toml",
         ("plan", "animate"): ".html",
     }
     return place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
