@@ -21,6 +21,7 @@ from avsreplay.config import Guess
 from avsreplay.errors import value_class
 from avsreplay.estimate import Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
+from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
@@ -174,7 +175,8 @@ class Stages:
     """The stages of the chain, configured for one log.
 
     Attributes:
-        target: geometry of the target for guidance.
+        target: geometry of the target about the grasp point, for guidance.
+        grasp_c: (3,) grasp point in {C} [m].
         deskew: move points with times of their own to the scan's instant by the predicted motion.
         reacquire: register without a guess where the prediction is too uncertain to be one.
         region: what follows the target and removes the points around it; None: all are used.
@@ -187,6 +189,7 @@ class Stages:
     monitors: Monitors
     guidance: Guidance
     target: TargetGeometry
+    grasp_c: Array
     guess: Guess
     deskew: bool
     reacquire: bool
@@ -256,9 +259,10 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
-        forecast = partial(stages.estimator.track_forecast, track)
+        forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
+        aim = at_grasp(belief, stages.grasp_c)
         known = planner_input(
-            stages.estimator, belief, stages.target, gamma, report.converged, forecast
+            stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
         guidance = stages.guidance.step(guidance, known)
     outcome = Outcome(
@@ -464,8 +468,8 @@ without measurements.
 def target_scene(
     estimator: AnyEstimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
 ) -> Scene:
-    """Return the predicted target after a belief, as the planner uses it: estimate and
-    forecast, never the truth.
+    """Return the predicted target after a belief about the grasp point, as the planner uses it:
+    estimate and forecast, never the truth.
     """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:

@@ -66,6 +66,14 @@ class Scorer:
             times = np.array([(t_ns - self._epoch_ns) * 1e-9 for t_ns, _ in poses])
             self.motion = interpolated(times, [pose for _, pose in poses])
 
+    def since_s(self, t_ns: int) -> float:
+        """Return an instant on the clock of ``motion`` [s].
+
+        Args:
+            t_ns: the instant.
+        """
+        return (t_ns - self._epoch_ns) * 1e-9
+
     def rescore(self, rows: list[Row], poses: Sequence[tuple[int, Pose]]) -> list[int]:
         """Compare the flights of a log that grew with all its true poses.
 

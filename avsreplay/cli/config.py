@@ -178,6 +178,13 @@ def run_settings(command: F) -> F:
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
+            "--task",
+            "task_file",
+            type=file,
+            envvar=_variable("task"),
+            help="TOML file that describes what is grasped in a table [task], and perhaps [robot].",
+        ),
+        click.option(
             "--set",
             "assignments",
             multiple=True,
@@ -216,6 +223,11 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
         from avsreplay.config import robot_settings
 
         put("robot_file", list(robot_settings(robot_file)), "--robot", robot_file)
+    task_file = flags.pop("task_file")
+    if task_file is not None:
+        from avsreplay.config import task_settings
+
+        put("task_file", list(task_settings(task_file)), "--task", task_file)
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():

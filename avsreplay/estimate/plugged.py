@@ -126,9 +126,14 @@ class PluggedEstimator:
         """The predicted attitudes of the fixture, see ``Estimator.attitude``."""
         return dynamics.fixture_attitude(belief.x)
 
-    def track_forecast(self, track: Track, times_s: Array) -> Forecast:
-        """The predicted 1 sigma of the grasp point at times (n,) [s after the scan]."""
-        return self._method.forecast(track.plugged, times_s)
+    def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
+        """The predicted 1 sigma of the grasp point (3,) in {C} at times (n,) [s after the scan].
+
+        A plug-in predicts the origin of {C}; the error of the attitude acts on the distance to it.
+        """
+        found, arm_m = self._method.forecast(track.plugged, times_s), float(np.linalg.norm(grasp_c))
+        moved = np.hypot(found.pos_1s_m, arm_m * found.rot_1s_rad)
+        return Forecast(found.times_s, moved, found.vel_1s_mps, found.rot_1s_rad)
 
     def pose_covariance(self, belief: Belief) -> Array:
         """Covariance (6, 6) of the pose of {C}, see ``Estimator.pose_covariance``."""

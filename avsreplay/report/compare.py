@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
@@ -79,6 +80,13 @@ def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None
 
     def get(summary: Summary) -> float | None:
         return pick(summary) if summary.faults.known else None
+
+    return get
+
+
+def _assessed(pick: Callable[[Assessment], float | None]) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        return None if summary.assessment is None else pick(summary.assessment)
 
     return get
 
@@ -201,6 +209,24 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")
+    ),
+    Metric(
+        "capture_probability",
+        "",
+        "of a capture within the tolerances and without contact",
+        _assessed(lambda a: a.probability),
+    ),
+    Metric(
+        "capture_contact",
+        "",
+        "probability of contact with the body outside the grasp",
+        _assessed(lambda a: a.contact),
+    ),
+    Metric(
+        "captured",
+        "",
+        "1 where the gripper in fact captured, 0 where it did not",
+        _assessed(lambda a: None if a.in_fact is None else float(a.in_fact.captured)),
     ),
     Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
     Metric("losses", "", "damaged places in the log", lambda s: s.counts.get("losses")),
