@@ -36,6 +36,7 @@ def scene(seed, distance, count):
     return points, np.arange(len(points)) < count, T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_target_is_followed_and_ground_wall_and_neighbour_are_removed(seed):
     region = Region(scene(seed, 40.0, 60)[2].t, -0.5 * SIZE, 0.5 * SIZE)
