@@ -4,8 +4,10 @@ processor are pinned.
 OpenBLAS has one kernel for each generation of processors, numpy has SIMD variants of its functions,
 and the C library has variants of the elementary functions with fused multiply-add. They round
 differently. Environment variables, read when the libraries are loaded, choose the variants that
-every processor with SSE4.2 has. The command line sets them and starts itself once more, because the
-C library reads its variable when the process starts. Other processes inherit them.
+every processor with SSE4.2 has. ``pin`` sets them before numpy is loaded. The C library reads its
+variable when the process starts: the command is started once more with it before it reads anything;
+a script is not, and states that its arithmetic is native unless the variable was set from outside.
+Other processes inherit them.
 
 OpenBLAS runs on one thread on every system, because the result of a product on several threads
 depends on their number.
@@ -19,6 +21,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import warnings
 
 VARIABLE = "AVSREPLAY_ARITHMETIC"
 CHOICES = ("pinned", "native")
@@ -51,38 +54,64 @@ def has_variants() -> bool:
 
 def state() -> str:
     """Return ``"pinned"`` or ``"native"`` for this process, for ``run.json``."""
-    pinned = has_variants() and all(
-        value in os.environ.get(name, "") for name, value in PINS.items()
-    )
+    set_ = all(value in os.environ.get(name, "") for name, value in PINS.items())
+    pinned = has_variants() and set_ and _is_started_pinned()
     return "pinned" if pinned and not _numpy_variants() else "native"
 
 
-def pin() -> None:
-    """Pin the arithmetic of this process and of those that it starts; the process may be replaced
-    by a new one.
+def pin() -> str:
+    """Pin the arithmetic of this process, as far as that is possible in a running process, and of
+    those that it starts.
 
-    It only limits the number of threads if ``AVSREPLAY_ARITHMETIC=native`` is set, if the system
-    has no such variants, or if numpy has been imported already. The limit takes effect if numpy is
-    loaded later.
+    OpenBLAS and numpy read their variables when they are loaded; the C library reads its variable
+    when the process starts, so that it must be set from outside: ``python -m avsreplay.arithmetic``
+    prints the variables for a shell. Nothing is changed if ``AVSREPLAY_ARITHMETIC=native`` is set,
+    if the system has no such variants, or if numpy has been imported already; only the number of
+    threads is limited, where numpy is loaded later.
+
+    Returns:
+        "pinned", or "native" where the bytes of results may depend on the processor.
     """
     os.environ[THREADS] = "1"  # the sums of a product on several threads depend on their number
-    if (
-        os.environ.get(VARIABLE) == "native"
-        or "numpy" in sys.modules
-        or not sys.executable
-        or not has_variants()
-    ):
-        return
-    glibc = os.environ.get("GLIBC_TUNABLES", "")
-    os.environ.update(PINS)
-    if PINS["GLIBC_TUNABLES"] in glibc.split(":"):
-        os.environ["GLIBC_TUNABLES"] = glibc
-        return
-    others = [
-        part for part in glibc.split(":") if part and not part.startswith("glibc.cpu.hwcaps=")
-    ]
-    os.environ["GLIBC_TUNABLES"] = ":".join([*others, PINS["GLIBC_TUNABLES"]])
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    chosen = os.environ.get(VARIABLE) != "native" and has_variants()
+    if chosen and "numpy" not in sys.modules:
+        os.environ.update(_variables())
+        # Where a user turns warnings into errors, numpy's about names of other versions are none.
+        warnings.filterwarnings("ignore", "During parsing environment variable", ImportWarning)
+    return "pinned" if chosen and _is_started_pinned() and "numpy" not in sys.modules else "native"
+
+
+def start_pinned() -> None:
+    """Replace this process by one that is started with the variable of the C library.
+
+    Only for a command that has not read its input yet; a program that is not a regular file, such
+    as one that is read from standard input, could not be read again and is not replaced.
+    """
+    chosen = os.environ.get(VARIABLE) != "native" and has_variants() and "numpy" not in sys.modules
+    again = sys.executable and os.path.isfile(sys.argv[0])  # noqa: PTH113 (pathlib takes 5 ms)
+    if chosen and again and not _is_started_pinned():
+        os.environ.update(_variables())
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def _variables() -> dict[str, str]:
+    """The variables that pin the arithmetic; other tunables of the C library are kept."""
+    parts = os.environ.get("GLIBC_TUNABLES", "").split(":")
+    others = [part for part in parts if part and not part.startswith("glibc.cpu.hwcaps=")]
+    return PINS | {"GLIBC_TUNABLES": ":".join([*others, PINS["GLIBC_TUNABLES"]])}
+
+
+def _is_started_pinned() -> bool:
+    """Return whether the C library has found its variable at the start of this process."""
+    try:
+        with open("/proc/self/environ", "rb") as stream:  # noqa: PTH123 (as above)
+            found = stream.read()
+    except OSError:
+        return False
+    given = [line for line in found.split(b"\0") if line.startswith(b"GLIBC_TUNABLES=")]
+    return bool(given) and PINS["GLIBC_TUNABLES"].encode() in given[-1].partition(b"=")[2].split(
+        b":"
+    )
 
 
 def _numpy_variants() -> bool:
@@ -96,3 +125,8 @@ def _numpy_variants() -> bool:
         name for name in core.__cpu_dispatch__ if name.startswith(("AVX", "FMA", "F16C", "X86_"))
     ]
     return any(core.__cpu_features__[name] for name in variants)
+
+
+if __name__ == "__main__":
+    for name, value in _variables().items():
+        print(f"export {name}='{value}'")  # noqa: T201

@@ -5,14 +5,15 @@ objects.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
+from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
@@ -26,6 +27,8 @@ from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.settings import SettingError
+from avsreplay.task import Task, patches, target_at, task_of
 
 INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
@@ -58,12 +61,13 @@ def stages(
     estimator = config.estimator
     if config.register.backend == POSES:
         estimator = estimator.at_interval(clock[1], surface.extent)
-    robot, arm = with_arm(config.robot)
-    limits = robot.limited(config.limits)
-    supervision = config.supervisor.resolved(surface.extent)
+    task, target = task_and_target(config, surface)
+    robot, arm = with_arm(config.task.with_gripper(config.robot))
+    limits = task.corridor(robot.limited(config.limits))
+    supervision = config.task.with_tolerance(config.supervisor).resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
+        estimator=estimator_of(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
             Consistency(config.consistency), Convergence(config.convergence, surface.extent)
@@ -76,12 +80,36 @@ def stages(
             robot.gripper,
             arm,
         ),
-        target=target_geometry(surface, config.fixture_axis_c),
+        target=target,
+        grasp_c=task.grasp_c,
         guess=config.guess,
         deskew=config.deskew,
         reacquire=config.reacquire,
         initialise=_initialise(config, header, truth_of),
     )
+
+
+def task_and_target(config: RunConfig, surface: Surface) -> tuple[Task, TargetGeometry]:
+    """Return the task, compared with the model, and the geometry of the target about its grasp
+    point.
+
+    Args:
+        config: effective configuration.
+        surface: model of the target.
+
+    Raises:
+        UsageError: the task names a patch that the model does not have.
+    """
+    geometry_c = target_geometry(surface, config.fixture_axis_c)
+    assert geometry_c.surface is not None
+    settings = config.supervisor, config.robot, config.fixture_axis_c
+    try:
+        task = task_of(config.task, *settings, surface, geometry_c.surface, config.limits)
+    except SettingError as error:
+        raise UsageError(
+            str(error), where=f"task.{error.name}", hint="'avsreplay info' lists the patches"
+        ) from None
+    return task, target_at(replace(geometry_c, axis_c=task.axis_c), task.grasp_c)
 
 
 def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> TargetGeometry:
@@ -121,6 +149,24 @@ def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]
         return found.foot, distance
 
     return closest
+
+
+def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
+    """Return in words which grasp points could be used in place of one that cannot.
+
+    Args:
+        task: compared with the model.
+        surface: model of the target.
+        axis_c: outward axis of the fixture in {C}.
+    """
+    if not task.problem:
+        return ""
+    closest = target_geometry(surface, axis_c).surface
+    assert closest is not None
+    found = patches(surface, closest)
+    if not found:
+        return "name one with task.grasp_m and task.axis"
+    return f"patches that can be reached: {', '.join(patch.option for patch in found)}"
 
 
 def first_state(ready: Stages) -> PipelineState:

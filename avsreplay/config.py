@@ -21,6 +21,7 @@ from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import SupervisorParams
 from avsreplay.register.params import RegisterParams
 from avsreplay.settings import SettingError, Settings, is_unit, setting
+from avsreplay.task import TaskParams
 from avsreplay.toml_document import Document, build, load, override, toml_value
 
 
@@ -71,6 +72,7 @@ class RunConfig(Settings):
     faults: FaultParams = setting(FaultParams, "Fault detection.")
     consistency: ConsistencyParams = setting(ConsistencyParams, "Consistency of the innovations.")
     convergence: ConvergenceParams = setting(ConvergenceParams, "Convergence.")
+    task: TaskParams = setting(TaskParams, "The task of the capture.")
     plan: PlanParams = setting(PlanParams, "Planning.")
     robot: RobotParams = setting(RobotParams, "The robot.")
     limits: Limits = setting(Limits, "Constraints of every capture plan.")
@@ -83,16 +85,7 @@ class RunConfig(Settings):
     @property
     def robot_line(self) -> str:
         """The assumed robot in one line."""
-        return self.robot.described(self.plan, self.limits)
-
-    def approach_limits(self, extent_m: float) -> Limits:
-        """Return the limits of every plan with those of the robot.
-
-        Args:
-            extent_m: diagonal of the target's bounding box [m]; lengths that are not set are
-                proportional to it.
-        """
-        return self.robot.limited(self.limits).resolved(extent_m)
+        return self.task.with_gripper(self.robot).described(self.plan, self.limits)
 
     def check(self) -> None:
         """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an
@@ -197,10 +190,14 @@ def load_config(
     build(RunConfig, of_log)
     of_file = load(file) if file else Document("configuration", {})
     build(RunConfig, of_file)
-    below = with_robot_path(log_table, log_folder or Path())
-    above = with_robot_path(of_file.table, file.parent if file else Path())
-    merged = Document(of_file.name, _over(below, above), of_file.text)
-    return build(RunConfig, override(merged, assignments))
+    folders = log_folder or Path(), file.parent if file else Path()
+    below, above = (
+        with_task_robot(with_robot_path(table, folder), folder)
+        for table, folder in zip((log_table, of_file.table), folders, strict=True)
+    )
+    merged = override(Document(of_file.name, _over(below, above), of_file.text), assignments)
+    table = with_task_robot(merged.table, Path())
+    return build(RunConfig, replace(merged, table=table))
 
 
 def with_robot_path(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -239,6 +236,52 @@ def robot_settings(file: Path) -> tuple[str, ...]:
     build(RobotFile, document)
     robot = with_robot_path(document.table, file.parent)["robot"]
     return tuple(f"robot.{key}={toml_value(value)}" for key, value in robot.items())
+
+
+@dataclass(frozen=True, slots=True)
+class TaskFile(Settings):
+    """A file that describes a task, and perhaps the robot."""
+
+    task: TaskParams = setting(doc="The task of the capture.")
+    robot: RobotParams = setting(RobotParams, "The robot.")
+
+
+def task_settings(file: Path) -> tuple[str, ...]:
+    """Return the assignments that a file states in its tables ``[task]`` and ``[robot]``.
+
+    Args:
+        file: TOML file.
+
+    Raises:
+        UnreadableInput: The file, or the file of the robot that it names, cannot be read.
+        UsageError: A key or value is wrong; the message names file and line.
+    """
+    document = load(file)
+    build(TaskFile, document)
+    tables = with_task_robot(with_robot_path(document.table, file.parent), file.parent)
+    return tuple(
+        f"{table}.{key}={toml_value(value)}"
+        for table, values in tables.items()
+        for key, value in values.items()
+    )
+
+
+def with_task_robot(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a table of settings with the robot of the file that ``task.robot`` names.
+
+    Args:
+        table: Settings; those of its own table ``robot`` take precedence.
+        folder: Folder of the file that states them.
+    """
+    task = table.get("task")
+    named = task.get("robot") if isinstance(task, Mapping) else None
+    if not isinstance(named, str):
+        return dict(table)
+    path = folder / named
+    build(RobotFile, load(path))
+    robot = with_robot_path(load(path).table, path.parent)["robot"]
+    own = {key: value for key, value in table["task"].items() if key != "robot"}
+    return _over({"robot": robot}, {**table, "task": own})
 
 
 def check_robot(robot: RobotParams, plan: PlanParams, limits: Limits) -> None:

@@ -5,6 +5,7 @@ Only the command line prints errors or exits.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform, overload
@@ -73,6 +74,25 @@ def counted(count: int, noun: str) -> str:
         noun: in the singular; its plural ends in s.
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+# C0 and C1 control characters, bidirectional marks, zero-width characters and lone surrogates.
+_UNSAFE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
+
+
+def printable(text: str, keep: str = "") -> str:
+    r"""Return a text with every control character replaced by an escape (``\x1b``, ``\u202e``).
+
+    Args:
+        text: the text.
+        keep: control characters that stay.
+    """
+    return _UNSAFE.sub(
+        lambda m: m[0] if m[0] in keep else m[0].encode("unicode_escape", "surrogatepass").decode(),
+        text,
+    )
 
 
 class AvsError(Exception):

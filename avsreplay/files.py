@@ -41,6 +41,21 @@ def is_stream(path: Path) -> bool:
     return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode) or stat.S_ISBLK(mode)
 
 
+_POINTER = b"version https://git-lfs.github.com/spec"
+
+
+def refuse_pointer(data: bytes, where: str) -> None:
+    """Raise UnreadableInput if the bytes of a file are a git-LFS pointer in place of its content.
+
+    Args:
+        data: the file, or its begin.
+        where: its name, for the message.
+    """
+    if data.startswith(_POINTER):
+        hint = "fetch the content: git lfs pull"
+        raise UnreadableInput("a git-LFS pointer, not the file itself", where=where, hint=hint)
+
+
 def check_output(
     path: Path, *, overwrite: bool = True, folder: bool = False, inputs: Iterable[Path] = ()
 ) -> None:

@@ -116,7 +116,8 @@ class MonitorReport:
         covariance_converged, predictive_converged: every block of the covariance (the paper's
             criterion), or every predicted standard deviation of the grasp point, is below its
             limit.
-        unconverged: blocks whose covariance is above its limit.
+        unconverged: blocks whose covariance is above its limit, and two rates where both explain
+            the poses.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
 

@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Estimator, Prediction, Track, in_doubt, with_change
+from avsreplay.estimate import Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
+from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.aliasing import Instants, in_words, other_rate
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,
@@ -73,6 +76,7 @@ class MonitorState:
     convergence: ConvergenceTrack
     violations: int = 0
     motion: FittedMotion | None = None
+    instants: Instants = Instants()
 
 
 @value_class
@@ -95,7 +99,7 @@ class Monitors:
     def observe(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         innovation: Innovation | None,
         gamma: int,
@@ -126,8 +130,10 @@ class Monitors:
         )
         forecast = estimator.track_forecast(track, self.convergence.times_s)
         possible = with_change(forecast, belief, track.change_P)
+        instants = state.instants.after(belief.t_ns) if healthy else state.instants
+        w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
         judged = self.convergence.judge(
-            state.convergence, belief, forecast, consistent is True, possible
+            state.convergence, belief, forecast, consistent is True and alias is None, possible
         )
         report = MonitorReport(
             ogm_rank=rank.rank,
@@ -140,15 +146,16 @@ class Monitors:
             converged=judged.converged,
             covariance_converged=judged.covariance_converged,
             predictive_converged=judged.predictive_converged,
-            unconverged=judged.unknown,
+            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(w, alias)),
             forecast=forecast,
         )
-        return MonitorState(gramian, seen, judged, state.violations + len(failed), motion), report
+        violated = state.violations + len(failed)
+        return MonitorState(gramian, seen, judged, violated, motion, instants), report
 
     def _gramian(
         self,
         state: MonitorState,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         prior: Prediction,
         healthy: Innovation | None,
         track: Track,
@@ -167,18 +174,20 @@ class Stages:
     """The stages of the chain, configured for one log.
 
     Attributes:
-        target: geometry of the target for guidance.
+        target: geometry of the target about the grasp point, for guidance.
+        grasp_c: (3,) grasp point in {C} [m].
         deskew: move points with times of their own to the scan's instant by the predicted motion.
         reacquire: register without a guess where the prediction is too uncertain to be one.
         initialise: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
     """
 
     registrar: Registrar
-    estimator: Estimator
+    estimator: AnyEstimator
     faults: FaultDetector
     monitors: Monitors
     guidance: Guidance
     target: TargetGeometry
+    grasp_c: Array
     guess: Guess
     deskew: bool
     reacquire: bool
@@ -244,9 +253,10 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
-        forecast = partial(stages.estimator.track_forecast, track)
+        forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
+        aim = at_grasp(belief, stages.grasp_c)
         known = planner_input(
-            stages.estimator, belief, stages.target, gamma, report.converged, forecast
+            stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
         guidance = stages.guidance.step(guidance, known)
     outcome = Outcome(
@@ -435,10 +445,10 @@ without measurements.
 
 
 def target_scene(
-    estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
+    estimator: AnyEstimator, belief: Belief, target: TargetGeometry, forecast: Forecaster
 ) -> Scene:
-    """Return the predicted target after a belief, as the planner uses it: estimate and
-    forecast, never the truth.
+    """Return the predicted target after a belief about the grasp point, as the planner uses it:
+    estimate and forecast, never the truth.
     """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
@@ -456,7 +466,7 @@ def target_scene(
 
 
 def planner_input(
-    estimator: Estimator,
+    estimator: AnyEstimator,
     belief: Belief,
     target: TargetGeometry,
     gamma: int,

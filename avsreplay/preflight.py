@@ -46,6 +46,7 @@ def preflight(
     """
     info, scans = source.info(), _sampled(source)
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
+    general += _meaning(source)
     if source.options.poses:
         return [*_poses(source, surface), *_grasp_point(surface), *general]
     found = [
@@ -62,6 +63,14 @@ def preflight(
         )
         found.insert(1, Advice("ok" if share >= 0.5 else "check", "points on the model", text))
     return found
+
+
+def _meaning(source: Source) -> list[Advice]:
+    """What the numbers of the clouds mean; an option is named where it should be confirmed."""
+    return [
+        Advice(each.grade, each.about, each.sentence, each.option if each.grade != "ok" else "")
+        for each in source.meaning.inferences
+    ]
 
 
 def _faces(surface: Surface | None) -> list[Advice]:
@@ -234,6 +243,10 @@ def _truth(info: LogInfo, source: Source, scans: Sequence[Scan]) -> list[Advice]
         others = f" (or {', '.join(names[1:3])})" if names[1:] else ""
         text = f"no truth is selected, but the log has poses{others}"
         return [Advice("ok", "truth", text, f"--truth-topic {names[0]}")]
+    frame = scans[0].frame if scans else ""
+    if moving := source.moving_beside(frame):
+        text = f"no truth is selected, but in /tf '{shown(moving[0])}' moves; is it the target?"
+        return [Advice("ok", "truth", text, f"--truth-frame {shown(moving[0])}")]
     return [
         Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")
     ]

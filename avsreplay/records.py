@@ -28,6 +28,10 @@ BLOCKS: Mapping[str, slice] = {
     "varrho": slice(14, 17),  # [m], {B}
     "mu": slice(17, 20),  # dmu_v, half angle, {B}
 }  # the 20 error states by name, in the order of every covariance
+STATES: int = max(block.stop for block in BLOCKS.values())  # number of error states
+# 99.99 % points of chi-square by degrees of freedom: a squared normalised error above it is not by
+# chance. Of the three of a vector, and of the six of a pose.
+UNLIKELY = {3: 21.1, 6: 27.86}
 _SIZES = {
     "q_ab": 4,
     "w_b": 3,
@@ -285,6 +289,7 @@ class Alignment:
         systematic: its part from errors of model and ranges.
         message: why it failed or is not accepted.
         free_directions: not determined, in words; free: columns d (6, k).
+        members: of an ambiguous one, the poses T_ac that explain the scan, the registered first.
         split_nis, size: see ``quality``; with the 1 sigma of the size.
         size_1s: error of the size, until it is fitted.
     """
@@ -307,6 +312,7 @@ class Alignment:
     size_1s: float | None = None
     systematic: Array | None = None
     size: tuple[float, float] | None = None
+    members: tuple[Pose, ...] = ()
 
     @property
     def measured(self) -> bool:

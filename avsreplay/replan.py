@@ -12,19 +12,18 @@ from functools import partial
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.assess import FLIGHTS, FlightLog, Setup, assess, drawn_beliefs, simulated
+from avsreplay.assessment import Assessment
 from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator
-from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import boxplus
-from avsreplay.estimate.params import NoiseSource
-from avsreplay.geometry import Array, Pose
+from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.flights import Execution, Flights, Miss, closed_loop, miss
+from avsreplay.plan.flights import Ended, Execution, Miss, miss
 from avsreplay.plan.flights import execute as plan_execute
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
@@ -40,13 +39,14 @@ from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
-from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, draws, spread
-from avsreplay.records import Alignment, AlignStatus, Belief, State
+from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
+from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
+from avsreplay.task import target_at, task_of
 
 FLIGHT_INSTANTS = 401  # instants of the flight on its page
-SIGMA_BOUND = 0.99  # inertia ratios of the draws are limited to the physical range
+_NO_MODEL = Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int32), "", "")
 
 
 class Replanning:
@@ -72,20 +72,30 @@ class Replanning:
         Raises:
             UsageError: A clearance is required and the result contains no model.
         """
-        self.saved, self.supervisor, self.robot, self.arm = saved, supervisor, saved.robot, arm
+        self.saved, self.arm = saved, arm
+        self.robot = saved.task.with_gripper(saved.robot)
+        self.supervisor = saved.task.with_tolerance(supervisor).resolved(saved.extent_m)
         self.params = self.robot.applied(params)
         self.robot_line = self.robot.described(params, limits)
-        self._radius = self.robot.radius_m
-        limits = self.robot.limited(limits)
-        self.limits = limits.resolved(saved.extent_m)
-        if saved.surface is not None:
-            self._target = target_geometry(saved.surface, saved.axis_c)
-        elif limits.clearance_m is None:
-            self._target = TargetGeometry(np.array(saved.axis_c), np.zeros((1, 3)))
-        else:
+        if saved.surface is None and limits.clearance_m is not None:
             raise UsageError(
                 "the result contains no model", where=saved.name, hint="plan without a clearance"
             )
+        surface, axis = saved.surface or _NO_MODEL, saved.task.axis or (1.0, 0.0, 0.0)
+        target = (
+            target_geometry(surface, axis)
+            if saved.surface is not None
+            else TargetGeometry(np.array(axis), np.zeros((1, 3)), lambda y: (y, np.zeros(len(y))))
+        )
+        assert target.surface is not None
+        self.task = task_of(
+            saved.task,
+            *(supervisor, saved.robot, axis, surface, target.surface, limits, saved.extent_m),
+        )
+        self.limits = self.task.corridor(self.robot.limited(limits)).resolved(saved.extent_m)
+        target = replace(target, axis_c=self.task.axis_c)
+        self._target = target_at(target, self.task.grasp_c)
+        self.truth = saved.truth(self.task.grasp_c)
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -95,8 +105,15 @@ class Replanning:
     @property
     def tolerance(self) -> Tolerance:
         """Largest errors of a capture: the supervisor's tolerances."""
-        s = self.supervisor
-        return Tolerance(s.capture_pos_m or 0.0, s.capture_speed_mps or 0.0, s.capture_angle_deg)
+        return self.task.tolerance
+
+    def belief(self, index: int) -> Belief:
+        """Return the belief after a scan, about the grasp point.
+
+        Args:
+            index: index of the scan.
+        """
+        return at_grasp(self.saved.beliefs[index], self.task.grasp_c)
 
     def plan_at(self, index: int) -> Plan:
         """Plan from the belief after a scan, under the limits.
@@ -104,7 +121,7 @@ class Replanning:
         Args:
             index: index of the scan.
         """
-        belief = self.saved.beliefs[index]
+        belief = self.belief(index)
         return self._planned(self._scene(belief), belief.t_ns)
 
     def start_margin(self, index: int) -> float:
@@ -114,7 +131,7 @@ class Replanning:
         Args:
             index: index of the scan from which is planned.
         """
-        return margin(self._scene(self.saved.beliefs[index]), self.limits, *self.start)
+        return margin(self._scene(self.belief(index)), self.limits, *self.start)
 
     def _forecast(self, belief: Belief) -> Forecaster:
         return partial(self.saved.estimator.forecast, belief)
@@ -154,7 +171,7 @@ class Replanning:
         """
         if self.arm is None or not made.found:
             return None
-        belief, estimator = self.saved.beliefs[index], self.saved.estimator
+        belief, estimator = self.belief(index), self.saved.estimator
         scene = Scene(estimator.motion(belief), estimator.attitude(belief))
         return self.arm.last_metres(self.path(made), scene, self.limits)
 
@@ -174,7 +191,7 @@ class Replanning:
             index: index of the scan from which the plan was made.
             made: the plan; it must have been found.
         """
-        scene, path = self._scene(self.saved.beliefs[index]), self.path(made)
+        scene, path = self._scene(self.belief(index)), self.path(made)
         times = np.linspace(0.0, made.t_go_s, FLIGHT_INSTANTS)
         r, v = path.at(times)
         rho, rate = scene.goal(times)
@@ -195,7 +212,7 @@ class Replanning:
             times,
             y,
             figures,
-            np.array(self.saved.axis_c),
+            self.task.axis_c,
             limits.cones,
             limits.mouth_m or 0.0,
             surface,
@@ -219,8 +236,8 @@ class Replanning:
             count: number of draws.
             seed: seed of the draws.
         """
-        belief = self.saved.beliefs[index]
-        drawn = _draws(belief, count, np.random.Generator(np.random.PCG64(seed)))
+        belief = self.belief(index)
+        _, drawn = drawn_beliefs(belief, count, np.random.Generator(np.random.PCG64(seed)))
         path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
 
         def planner(scene: Scene) -> Plan:
@@ -229,27 +246,18 @@ class Replanning:
         futures = [self._scene(b) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
-        return spread(path, futures, planner, self.tolerance, aimed, disturbance, self._body)
-
-    @property
-    def _body(self) -> Limits | None:
-        """The limits for contact: that of the end-effector itself, without the margin of the
-        plan.
-        """
-        return (
-            None
-            if self.limits.clearance_m is None
-            else replace(self.limits, clearance_m=max(self._radius, 1e-9))
+        return spread(
+            path, futures, planner, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
         )
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
         """Return the error of a plan made at scan ``index`` against the truth; None without
         truth or after the log.
         """
-        if self.saved.truth is None or not made.found:
+        if self.truth is None or not made.found:
             return None
-        belief, begin_s = self.saved.beliefs[index], self.saved.rows[index].t_s
-        found = miss(self.path(made), begin_s, self.saved.truth, self.attitude(belief, made.t_go_s))
+        belief, begin_s = self.belief(index), self.saved.rows[index].t_s
+        found = miss(self.path(made), begin_s, self.truth, self.attitude(belief, made.t_go_s))
         return found if np.isfinite(found.distance_m) else None
 
     def hindsight(self, period_s: float) -> list[tuple[float, Plan, Miss | None]]:
@@ -271,7 +279,7 @@ class Replanning:
                 due_s = row.t_s + period_s
         return out
 
-    def flights(self, index: int, count: int, seed: int) -> Flights:
+    def flights(self, index: int, count: int, seed: int) -> list[Ended]:
         """Fly approaches with replanning, measured scans, thrust errors and delay against draws
         from a belief.
 
@@ -280,45 +288,54 @@ class Replanning:
             count: number of flights.
             seed: of draws and errors.
         """
-        belief, rng = self.saved.beliefs[index], np.random.Generator(np.random.PCG64([seed, 2]))
-        noise, ended = self.robot.thrust_noise * self.params.a_max_mps2, []
-        for drawn in _draws(belief, count, rng):
-            flight = self._guidance(), self._measured(belief, drawn, rng), self._scene(drawn)
-            ended.append(closed_loop(*flight, belief.t_ns, self.tolerance, noise, rng, self._body))
-        numbers = {
-            name: sum(end == name for end, _ in ended) for name in ("captured", "outside", "abort")
-        }
-        touched = sum(hit for _, hit in ended)
-        return Flights(count, numbers["captured"], numbers["outside"], numbers["abort"], touched)
+        log = FlightLog()
+        log.stamps = [row.t_ns for row in self.saved.rows]
+        log.gammas = [row.gamma for row in self.saved.rows]
+        return simulated(self._setup(count, seed), log, None, self.belief(index))
 
-    def _measured(
-        self, belief: Belief, drawn: Belief, rng: np.random.Generator
-    ) -> Iterator[PlannerInput]:
-        """Inputs of guidance for a drawn target after each scan: the filter with poses that
-        have its own noise.
+    def assess(self, index: int, flights: int = FLIGHTS, seed: int = 0) -> Assessment:
+        """Return whether the robot would capture if its approach began at a scan.
+
+        Args:
+            index: the scan.
+            flights: number of simulated flights where the result ends before the capture.
+            seed: of all draws.
         """
-        params = replace(
-            self.saved.estimator.params, noise=NoiseSource.R0
-        )  # there is no registration
-        estimator = Estimator(params, belief, self.saved.extent_m, self.saved.since_ns)
-        motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
-        track = estimator.initial(belief.t_ns, belief.x.T_ac)
-        step_ns = int(np.median(np.diff([row.t_ns for row in self.saved.rows])))
-        R = estimator.params.resolved(self.saved.extent_m).R0
-        for t_ns in range(
-            belief.t_ns + step_ns, belief.t_ns + round(self.params.horizon_s * 2e9), step_ns
-        ):
-            dt = np.array([(t_ns - belief.t_ns) * 1e-9])
-            error = np.sqrt(np.diag(R)) * rng.standard_normal(6)
-            pose = Pose(
-                geometry.multiply(attitude(dt)[0], geometry.exp(2.0 * error[3:])),
-                motion(dt)[0][0] + error[:3],
+        log, state, guidance = FlightLog(), None, self._guidance()
+        for k, known in enumerate(self._inputs()):
+            if k >= index and not log.ended:
+                state = guidance.step(state or guidance.initial(known.t_ns), known)
+            log.take(self.belief(k), state, known.gamma, known.converged)
+        return assess(self._setup(flights, seed), log, self.truth)
+
+    def _setup(self, flights: int, seed: int) -> Setup:
+        surface = self.saved.surface
+        return Setup(
+            task=self.task,
+            estimator=self.saved.estimator,
+            guidance=self._guidance(),
+            target=self._target,
+            solid=surface is not None and len(surface.faces) > 0,
+            extent_m=self.saved.extent_m,
+            since_ns=self.saved.since_ns,
+            thrust_noise_mps2=self.robot.thrust_noise * self.params.a_max_mps2,
+            noise=self.saved.noise,
+            flights=flights,
+            seed=seed,
+        )
+
+    def _inputs(self) -> Iterator[PlannerInput]:
+        """What was known after each scan of the result."""
+        for k, row in enumerate(self.saved.rows):
+            belief = self.belief(k)
+            yield planner_input(
+                self.saved.estimator,
+                belief,
+                self._target,
+                row.gamma,
+                row.converged,
+                self._forecast(belief),
             )
-            seen = Alignment(pose, 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED)
-            prior = estimator.predict(track, t_ns)
-            track = estimator.update(track, prior, estimator.innovate(prior, seen), 1)
-            forecast = partial(estimator.forecast, track.belief)
-            yield planner_input(estimator, track.belief, self._target, 1, True, forecast)
 
     def _guidance(self) -> Guidance:
         supervisor, extent_m = Supervisor(self.supervisor), self.saved.extent_m
@@ -328,38 +345,10 @@ class Replanning:
 
     def execute(self) -> Execution | None:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
-        if self.saved.truth is None:
+        if self.truth is None:
             return None
-        beliefs = {belief.t_ns: belief for belief in self.saved.beliefs}
-        inputs = (
-            planner_input(
-                self.saved.estimator,
-                belief,
-                self._target,
-                row.gamma,
-                row.converged,
-                self._forecast(belief),
-            )
-            for belief, row in zip(self.saved.beliefs, self.saved.rows, strict=True)
-        )
+        beliefs = {row.t_ns: self.belief(k) for k, row in enumerate(self.saved.rows)}
         turned = lambda known, after_s: self.attitude(beliefs[known.t_ns], after_s)  # noqa: E731
-        return plan_execute(self._guidance(), inputs, self.saved.truth, turned, self.saved.since_ns)
-
-
-def _draws(belief: Belief, count: int, rng: np.random.Generator) -> list[Belief]:
-    """Draws from a belief; those of one with a constant acceleration have different
-    accelerations.
-    """
-    if not isinstance(belief, DrivenBelief):
-        return [
-            replace(belief, x=_bounded(boxplus(belief.x, d))) for d in draws(belief.P, count, rng)
-        ]
-    P, n = np.block([[belief.P, belief.cross], [belief.cross.T, belief.P_u]]), len(belief.P)
-    return [
-        replace(belief, x=_bounded(boxplus(belief.x, d[:n])), u=belief.u + d[n:])
-        for d in draws(P, count, rng)
-    ]
-
-
-def _bounded(x: State) -> State:
-    return replace(x, sigma=np.clip(x.sigma, -SIGMA_BOUND, SIGMA_BOUND))
+        return plan_execute(
+            self._guidance(), self._inputs(), self.truth, turned, self.saved.since_ns
+        )

@@ -10,12 +10,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from avsreplay import arithmetic, pipeline, settings
-from avsreplay.build import first_state, stages
+from avsreplay.assess import FlightLog, Setup, assess
+from avsreplay.assessment import Assessment
+from avsreplay.build import first_state, grasp_advice, stages, task_and_target
 from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError, value_class
+from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
+from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference
 from avsreplay.geometry import Pose
@@ -24,8 +30,10 @@ from avsreplay.log.streams import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan.flights import Motion
+from avsreplay.plan.robot import Limits
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register.backend import POSES
+from avsreplay.register.interrupt import shielded
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.registrar import Registrar
 from avsreplay.report.summary import Summary, SummaryFold
@@ -90,6 +98,8 @@ class Run:
         registrar: registers scans against that model.
         model_check: check of the model by the rows so far.
         done: number of scans processed so far.
+        task: what is to be grasped, compared with the model.
+        flight: the flight of guidance so far, for the assessment of the capture.
         acceleration: fitted to the poses, None where it is given.
     """
 
@@ -133,6 +143,7 @@ class Run:
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
             self.model_check = ModelCheck(self.registrar, self.surface)
+            self.task, self._target = task_and_target(self.config, self.surface)
             self.acceleration = self._fitted_acceleration()
             self._stages = self._new_stages()
             self.estimator = self._stages.estimator
@@ -147,6 +158,8 @@ class Run:
         self._state, self.done = first_state(self._stages), 0
         self._scored: Scorer | None = None
         self._end: tuple[Belief, State] | None = None
+        self.flight = FlightLog()
+        self._assessed: tuple[int, Assessment] | None = None
 
     def __enter__(self) -> Run:
         return self
@@ -224,7 +237,8 @@ class Run:
             truth = self._truth_of(outcome.scan)
             if self.job.growing:
                 self.job.growing.take(outcome.scan, self._true(outcome.scan))
-            self.model_check.add(outcome.scan, outcome.alignment)
+            with shielded():
+                self.model_check.add(outcome.scan, outcome.alignment)
             row = Row.of(outcome, self._scored.score(state, outcome, truth))
             self._fold.add(row)
             if truth.state is not None:
@@ -232,6 +246,13 @@ class Run:
             scan = ReplayedScan(outcome, state, truth, row)
             for listener in listeners:
                 listener(scan)
+            self.flight.take(
+                at_grasp(outcome.belief, self.task.grasp_c),
+                state.guidance,
+                outcome.verdict.gamma,
+                outcome.monitors.converged,
+                None if outcome.innovation is None else outcome.innovation.R,
+            )
             self._state, self.done = state, self.done + 1
             yield row
 
@@ -252,7 +273,10 @@ class Run:
         Args:
             more: further state to store with it, such as what listeners have collected.
         """
-        own = (self._state, self.done, self._fold, self.model_check, self._end, self._scored)
+        own = (
+            *(self._state, self.done, self._fold, self.model_check, self._end, self._scored),
+            self.flight,
+        )
         motion = None if self._scored is None else self._scored.motion
         return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
@@ -268,9 +292,11 @@ class Run:
         """
         scored = self._scorer()
         motion, scored.motion = scored.motion, None  # it is named and not stored
-        like: Any = (self._state, 0, self._fold, self.model_check, None, scored, [], [], more)
+        judged = self._fold, self.model_check, None, scored, self.flight
+        like: Any = (self._state, 0, *judged, [], [], more)
         found = unpack(path, self._named(None), like)
-        self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
+        self._state, self.done, self._fold, self.model_check, self._end, *rest = found
+        self._scored, self.flight, *rest = rest
         self._fixes, self._reference_instants, stored = rest
         if self._fixes:
             self._reference = reference_motion(self._fixes, self.estimator)
@@ -295,6 +321,11 @@ class Run:
         """
         return self.header.truth if self._end is None else matched_truth(*self._end)
 
+    @property
+    def approach(self) -> Limits:
+        """Constraints of every plan of this run, with all lengths."""
+        return self._stages.guidance.limits
+
     def summary(self) -> Summary:
         """Summarise the rows taken so far."""
         clock, losses = self.source.clock, self.source.losses
@@ -310,7 +341,44 @@ class Run:
         }
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         text = acceleration_text(self.config.estimator, self.acceleration)
-        return replace(self._fold.result(self.truth), counts=counts, acceleration=text)
+        found = self._fold.result(self.truth)
+        return replace(found, counts=counts, acceleration=text, assessment=self.assessment)
+
+    @property
+    def assessment(self) -> Assessment:
+        """Whether the robot would have captured the target, by the scans so far; it is computed
+        once.
+        """
+        if self._assessed is None or self._assessed[0] != self.done:
+            self._assessed = self.done, self._assess()
+        return self._assessed[1]
+
+    def _assess(self) -> Assessment:
+        surface, robot = self.surface, self.config.task.with_gripper(self.config.robot)
+        motion = None if self._scored is None else self._scored.motion
+        first_ns = self.flight.stamps[0] if self.flight.stamps else 0
+        setup = Setup(
+            task=self.task,
+            estimator=self._predictor(),
+            guidance=self._stages.guidance,
+            target=self._target,
+            solid=len(surface.faces) > 0,
+            extent_m=surface.extent,
+            since_ns=first_ns,
+            thrust_noise_mps2=robot.thrust_noise * self._stages.guidance.params.a_max_mps2,
+            noise=self.flight.noise,
+            advice=grasp_advice(self.task, surface, self.config.fixture_axis_c),
+        )
+        since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
+        given = None if motion is None else (lambda times: motion(times + since_s))
+        return assess(setup, self.flight, given)
+
+    def _predictor(self) -> Estimator:
+        """The estimator that predicts targets from a belief; a plug-in only predicts its own."""
+        if isinstance(self.estimator, Estimator):
+            return self.estimator
+        first_ns = self.flight.stamps[0] if self.flight.stamps else 0
+        return Estimator(self.config.estimator, None, self.surface.extent, first_ns)
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes
@@ -330,12 +398,14 @@ class Run:
                 "extent_m": surface.extent,
             },
             "clock": settings.dump(self.source.clock),
+            "clouds": self.source.meaning.record(),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),
             "robot": self.config.robot_line,
-            "approach": settings.dump(self.config.approach_limits(surface.extent)),
-            "config": settings.dump(self.config),
+            "approach": settings.dump(self.approach),
+            "task": self.task.record(),
+            "config": settings.dump(replace(self.config, register=self.config.register.with_own())),
         }
 
     def _new_stages(self) -> Stages:
@@ -390,7 +460,7 @@ class Run:
         )
 
     def _true_poses(self) -> list[tuple[int, Pose]]:
-        """True poses of the log, or of the reference within its span."""
+        """True poses of the log, or of the reference within its span, about the grasp point."""
         reference, poses = self._reference, list(self.source.truth_poses())
         if self._made is not None:
             poses = (
@@ -401,7 +471,8 @@ class Run:
                 t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns
             ]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
-        return poses
+        point = Pose(np.array([0.0, 0.0, 0.0, 1.0]), self.task.grasp_c)
+        return [(t_ns, pose @ point) for t_ns, pose in poses]
 
     def _truth_of(self, scan: Scan) -> Truth:
         """Return the truth at a scan; the pose is that of the reference motion if one was

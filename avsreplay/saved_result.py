@@ -4,14 +4,19 @@ and settings.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from avsreplay import settings, toml_document
+from avsreplay.assessment import Assessment
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.geometry import Array, Pose
 from avsreplay.plan.flights import Motion, interpolated
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
@@ -21,6 +26,7 @@ from avsreplay.report.result import load_result, motion_samples
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
+from avsreplay.task import TaskParams
 
 if TYPE_CHECKING:
     from avsreplay.run import Run
@@ -32,6 +38,7 @@ class PlanningConfig(Settings):
 
     plan: PlanParams = setting(PlanParams, "Planning.")
     robot: RobotParams = setting(RobotParams, "The robot.")
+    task: TaskParams = setting(TaskParams, "The task of the capture.")
     limits: Limits = setting(Limits, "Constraints of every capture plan.")
     supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
 
@@ -43,10 +50,11 @@ class Saved:
     Attributes:
         name: Name of the directory, for messages.
         rows, beliefs: One per scan.
-        truth: Recorded true motion, None where there is none.
+        times_s, poses: Recorded true poses of {C} and their times after the first scan [s].
         estimator: Estimator with the settings of the run.
-        plan, supervisor, limits, robot: Settings of the run.
-        axis_c: Outward axis of the fixture in {C}.
+        plan, supervisor, limits, robot, task: Settings of the run.
+        noise: 1 sigma of a measured pose [m, rad of half angle], None where it is not known.
+        assessment: That of the run; None where the result has none.
         extent_m: Diagonal of the target's bounding box [m].
         surface: Thinned model of the target, None where the result has none.
         warnings: Known defects of the result: not verified, or made from a damaged log.
@@ -55,16 +63,30 @@ class Saved:
     name: str
     rows: Sequence[Row]
     beliefs: Sequence[Belief]
-    truth: Motion | None
+    times_s: Array
+    poses: Sequence[Pose]
     estimator: Estimator
     plan: PlanParams
     supervisor: SupervisorParams
     limits: Limits
     robot: RobotParams
-    axis_c: tuple[float, float, float]
+    task: TaskParams
     extent_m: float
     surface: Surface | None
+    noise: tuple[float, float] | None = None
+    assessment: Assessment | None = None
     warnings: Sequence[str] = ()
+
+    def truth(self, grasp_c: Array) -> Motion | None:
+        """Return the true motion of the grasp point; None where it is not known.
+
+        Args:
+            grasp_c: (3,) grasp point in {C} [m].
+        """
+        if len(self.poses) < 4:
+            return None
+        point = Pose(np.array([0.0, 0.0, 0.0, 1.0]), grasp_c)
+        return interpolated(self.times_s, [pose @ point for pose in self.poses])
 
     @property
     def since_ns(self) -> int:
@@ -121,18 +143,20 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     extent = extent_m or result.extent_m(path)
     since_ns = result.rows[0].t_ns
     times, poses = motion_samples(result.poses, since_ns)
-    truth = interpolated(times, poses) if len(poses) >= 4 else None
     return Saved(
         name=str(path),
         rows=result.rows,
         beliefs=beliefs,
-        truth=truth,
+        times_s=times,
+        poses=poses,
         estimator=Estimator(_table(EstimatorParams, config, "estimator"), None, extent, since_ns),
         plan=_table(PlanParams, config, "plan"),
         supervisor=_table(SupervisorParams, config, "supervisor").resolved(extent),
         limits=_table(Limits, config, "limits"),
         robot=_table(RobotParams, config, "robot"),
-        axis_c=tuple(config.get("fixture_axis_c", (1.0, 0.0, 0.0))),
+        task=_task(result.header),
+        noise=_noise(result.header),
+        assessment=result.summary.assessment,
         extent_m=extent,
         surface=result.surface,
         warnings=result.warnings,
@@ -152,20 +176,49 @@ def of_run(run: Run, rows: Sequence[Row], beliefs: Sequence[Belief]) -> Saved:
         name=run.job.source.name,
         rows=rows,
         beliefs=beliefs,
-        truth=None,
+        times_s=np.zeros(0),
+        poses=(),
         estimator=Estimator(config.estimator, None, extent_m, rows[0].t_ns),
         plan=config.plan,
         supervisor=config.supervisor.resolved(extent_m),
         limits=config.limits,
         robot=config.robot,
-        axis_c=config.fixture_axis_c,
+        task=task_settings(run.task.record()),
+        noise=run.flight.noise,
         extent_m=extent_m,
         surface=run.surface,
     )
 
 
+def _task(header: Mapping[str, Any]) -> TaskParams:
+    record = header.get("task") or {"axis": header.get("config", {}).get("fixture_axis_c")}
+    try:
+        return task_settings(record)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UsageError(f"the task in run.json: {error}", hint="run again") from None
+
+
+def task_settings(record: Mapping[str, Any]) -> TaskParams:
+    """Return the settings of a task from its record.
+
+    Args:
+        record: as ``Task.record`` makes it.
+    """
+    names = {f.name for f in dataclasses.fields(TaskParams)}
+    known: dict[str, Any] = {k: v for k, v in record.items() if k in names and v is not None}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in known.items()}
+    return TaskParams(**values)
+
+
+def _noise(header: Mapping[str, Any]) -> tuple[float, float] | None:
+    found = header.get("measured_1s")
+    if not isinstance(found, list) or len(found) != 2 or not all(v > 0.0 for v in found):
+        return None
+    return float(found[0]), float(found[1])
+
+
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
-    known = {k: v for k, v in config.get(name, {}).items() if v is not None}
+    known: dict[str, Any] = {k: v for k, v in config.get(name, {}).items() if v is not None}
     return toml_document.build(cls, toml_document.Document("run.json", {name: known}), (name,))
 
 
@@ -180,7 +233,10 @@ def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
         UsageError: an assignment has another form, an unknown key or a wrong value.
     """
     tables: dict[str, Any] = {}
-    for name, values in (("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)):
+    for name, values in (
+        *(("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)),
+        ("task", saved.task),
+    ):
         tables[name] = {k: v for k, v in settings.dump(values).items() if v is not None}
     tables["supervisor"] = {
         k: v for k, v in settings.dump(saved.supervisor).items() if v is not None
@@ -192,5 +248,6 @@ def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
         plan=made.plan,
         limits=made.limits,
         robot=made.robot,
+        task=made.task,
         supervisor=made.supervisor.resolved(saved.extent_m),
     )

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate import Estimator
 from avsreplay.estimate.chart import nearest_permutation, nees_by_block
 from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
@@ -35,7 +35,7 @@ class Scorer:
 
     def __init__(
         self,
-        estimator: Estimator,
+        estimator: AnyEstimator,
         poses: Sequence[tuple[int, Pose]],
         reference: str,
         *,
@@ -65,6 +65,14 @@ class Scorer:
         if len(poses) >= 4:
             times = np.array([(t_ns - self._epoch_ns) * 1e-9 for t_ns, _ in poses])
             self.motion = interpolated(times, [pose for _, pose in poses])
+
+    def since_s(self, t_ns: int) -> float:
+        """Return an instant on the clock of ``motion`` [s].
+
+        Args:
+            t_ns: the instant.
+        """
+        return (t_ns - self._epoch_ns) * 1e-9
 
     def rescore(self, rows: list[Row], poses: Sequence[tuple[int, Pose]]) -> list[int]:
         """Compare the flights of a log that grew with all its true poses.
@@ -147,7 +155,7 @@ class Scorer:
 class HealthyPoses:
     """Collects the healthy poses of a run, for a fit to all of them."""
 
-    def __init__(self, estimator: Estimator) -> None:
+    def __init__(self, estimator: AnyEstimator) -> None:
         """Start without poses.
 
         Args:
@@ -172,7 +180,7 @@ class HealthyPoses:
         return reference_motion(self.fixes, self._estimator)
 
 
-def reference_motion(fixes: Sequence[PoseFix], estimator: Estimator) -> Reference:
+def reference_motion(fixes: Sequence[PoseFix], estimator: AnyEstimator) -> Reference:
     """Return one motion fitted to healthy poses, in {A}. Raises UsageError where they are too few.
 
     Args:

@@ -16,9 +16,12 @@ import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 from avsreplay.errors import value_class
+from avsreplay.parts import Parts
+
+S = TypeVar("S", bound="Settings")
 
 LARGEST = 1e100  # of every setting: squares and products of two settings remain finite
 
@@ -38,6 +41,8 @@ class Setting:
         of_extent: Where the setting is not given: its value as a fraction of the target's extent.
         unset: Where the setting is not given and does not scale with the extent: what applies
             instead.
+        one_of: The value is the name of one of these parts.
+        parts: The field is a ``Tables`` with one table of parameters for each of these parts.
     """
 
     doc: str
@@ -49,6 +54,8 @@ class Setting:
     infinite: bool = False
     of_extent: float | None = None
     unset: str = ""
+    one_of: Parts | None = None
+    parts: Parts | None = None
 
     @property
     def range(self) -> str:
@@ -90,6 +97,9 @@ class Setting:
         Raises:
             SettingError: A number is outside the range.
         """
+        if self.one_of is not None and value not in self.one_of.names():
+            known = ", ".join(self.one_of.names())
+            raise SettingError(name, f"{name} is '{value}', must be one of: {known}")
         several = isinstance(value, tuple)
         for number in value if several else (value,):
             if (
@@ -195,6 +205,48 @@ class Settings:
         return dataclasses.replace(self, **filled)  # type: ignore[type-var]
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class NoParameters(Settings):
+    """The parameter class of a part without parameters."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Tables:
+    """The parameters of parts that were given, each a pair of the name and the parameters.
+
+    Tables with the same effect are equal: parameters that are the defaults count as not given.
+    """
+
+    given: tuple[tuple[str, Settings], ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tables) and self._changed() == other._changed()
+
+    def __hash__(self) -> int:
+        return hash(self._changed())
+
+    def _changed(self) -> tuple[tuple[str, Settings], ...]:
+        return tuple((name, part) for name, part in self.given if part != type(part)())
+
+    def of(self, name: str, kind: type[S]) -> S:
+        """Return the parameters of a part; the defaults where none were given.
+
+        Args:
+            name: Its name.
+            kind: Its parameter class.
+        """
+        return cast(S, dict(self.given).get(name) or kind())
+
+    def including(self, name: str, values: Settings) -> Tables:
+        """Return these tables and that of a further part, in the place of one that it had.
+
+        Args:
+            name: Its name.
+            values: Its parameters.
+        """
+        return Tables(tuple(sorted({**dict(self.given), name: values}.items())))
+
+
 def declared_of(field: dataclasses.Field[Any]) -> Setting:
     """Return the declaration of a field, an empty one if it was not declared with ``setting``.
 
@@ -234,7 +286,9 @@ class Entry:
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The values of an enumeration, () of anything else."""
+        """The values of an enumeration, the names of parts, () of anything else."""
+        if self.declared.one_of is not None:
+            return self.declared.one_of.names()
         kind = _inner(self.hint)
         return (
             tuple(m.value for m in kind)
@@ -253,7 +307,11 @@ def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
     hints = typing.get_type_hints(cls)
     for each in dataclasses.fields(cls):
         key, inner = f"{prefix}{each.name}", _inner(hints[each.name])
-        if dataclasses.is_dataclass(inner):
+        parts = declared_of(each).parts
+        if parts is not None:
+            for name in parts.names():
+                yield from entries(parts.parameters(name) or NoParameters, f"{prefix}{name}.")
+        elif dataclasses.is_dataclass(inner):
             yield from entries(inner, f"{key}.")
         else:
             default = (
@@ -262,6 +320,24 @@ def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
                 else each.default_factory()
             )
             yield Entry(key, declared_of(each), hints[each.name], default)
+
+
+def value_of(owner: Any, key: str) -> Any:
+    """Return the value of a setting.
+
+    Args:
+        owner: A dataclass of settings.
+        key: Its dotted key, as in ``Entry``.
+    """
+    for name in key.split("."):
+        own = {f.name: declared_of(f).parts for f in dataclasses.fields(owner)}
+        of_parts = [(field, parts) for field, parts in own.items() if parts is not None]
+        if of_parts and name not in own.keys() - dict(of_parts).keys():
+            field, parts = of_parts[0]
+            owner = getattr(owner, field).of(name, parts.parameters(name))
+        else:
+            owner = getattr(owner, name)
+    return owner
 
 
 def _inner(hint: Any) -> Any:
@@ -280,7 +356,12 @@ def dump(value: Any) -> Any:
         value: A dataclass, or a value inside one.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: dump(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        out: dict[str, Any] = {}
+        for each in dataclasses.fields(value):
+            found = getattr(value, each.name)
+            own = dict(found.given) if isinstance(found, Tables) else {each.name: found}
+            out.update({name: dump(part) for name, part in own.items()})
+        return out
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, Mapping):

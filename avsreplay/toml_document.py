@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from avsreplay.errors import UnreadableInput, UsageError, value_class
+from avsreplay.parts import Parts
 from avsreplay.read_budget import ReadBudget
-from avsreplay.settings import Entry, SettingError, dump, entries
+from avsreplay.settings import Entry, SettingError, Tables, declared_of, dump, entries, value_of
 
 T = TypeVar("T")
 _Path = tuple[str | int, ...]
@@ -227,6 +228,10 @@ class _Builder:
             raise self.error(path, f"'{_dotted(path)}' must be a table", "write it as [table]")
         hints = typing.get_type_hints(cls)
         known = {f.name: f for f in dataclasses.fields(cls) if f.init}
+        of_parts = [known.pop(f.name) for f in dataclasses.fields(cls) if declared_of(f).parts]
+        own = {f.name: self.parts(f, table, path) for f in of_parts}
+        taken = {name for tables in own.values() for name, _ in tables.given}
+        table = {key: value for key, value in table.items() if key not in taken}
         unknown = next((key for key in table if key not in known), None)
         if unknown is not None:
             hint = self.nearest(path, unknown, table[unknown], known)
@@ -239,12 +244,23 @@ class _Builder:
             raise self.error(path, f"missing key '{_dotted((*path, missing))}'", "add it")
         values = {key: self.value(hints[key], value, (*path, key)) for key, value in table.items()}
         try:
-            return cls(**values)
+            return cls(**values, **own)
         except SettingError as error:
             prefix = f"{_dotted(path)}." if path else ""
             raise self.error((*path, error.name), f"{prefix}{error}", "correct the value") from None
         except ValueError as error:
             raise self.error(path, str(error), "correct the value") from None
+
+    def parts(self, field: dataclasses.Field[Any], table: Mapping[str, Any], path: _Path) -> Tables:
+        """The tables of a field that belong to installed parts."""
+        parts = typing.cast(Parts, declared_of(field).parts)
+        kinds = {name: parts.parameters(name) for name in table if name in parts.names()}
+        given = [
+            (name, self.table(kind, table[name], (*path, name)))
+            for name, kind in sorted(kinds.items())
+            if kind is not None
+        ]
+        return Tables(tuple(given))
 
     def value(self, hint: Any, value: Any, path: _Path) -> Any:
         """A value of the type that a field declares."""
@@ -322,10 +338,11 @@ class _Builder:
             )
 
         here = [_dotted((*path, name)) for name in known]
-        best = max([*here, *(entry.key for entry in entries(self.cls, self.prefix))], key=likeness)
+        every = [*here, *(entry.key for entry in entries(self.cls, self.prefix))]
+        best = max(every, key=likeness, default="")
         if likeness(best)[0] >= _SIMILAR:
             return f"did you mean '{best}'?"
-        return f"known keys: {', '.join(known)}"
+        return f"known keys: {', '.join(known) or 'none'}"
 
     def error(self, path: _Path, what: str, hint: str) -> UsageError:
         """A UsageError that names the place of ``path``."""
@@ -379,10 +396,7 @@ def to_toml(value: Any, name: str = "") -> str:
         if parent != table:
             lines += ["", f"[{parent}]"]
             table = parent
-        current = value
-        for part in entry.key.split("."):
-            current = getattr(current, part)
-        lines += ["", *_commented(entry), _assignment(leaf, current, entry)]
+        lines += ["", *_commented(entry), _assignment(leaf, value_of(value, entry.key), entry)]
     return "\n".join(lines).lstrip("\n") + "\n"
 
 

@@ -158,10 +158,9 @@ def approach_cones(run: Run) -> Array | None:
     Args:
         run: its configuration gives angles, lengths and the axis of the fixture.
     """
-    limits = run.config.approach_limits(run.surface.extent)
-    axis = np.array(run.config.fixture_axis_c)
+    limits, axis = run.approach, run.task.axis_c
     pieces = [cone_lines(axis, *cone, limits.mouth_m or 0.0) for cone in limits.cones]
-    return np.concatenate(pieces) if pieces else None
+    return np.concatenate(pieces) + run.task.grasp_c if pieces else None
 
 
 class RerunStream:

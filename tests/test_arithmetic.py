@@ -72,17 +72,35 @@ def pinned_script(before: str, **variables: str) -> list[str]:
 
 
 @needs_variants
-def test_the_process_starts_once_more_and_keeps_other_tunables():
-    lines = pinned_script("", GLIBC_TUNABLES="glibc.malloc.check=0:glibc.cpu.hwcaps=-AVX512F")
-    assert lines[:-1] == ["start", "start"]
-    assert lines[-1] == f"pinned glibc.malloc.check=0:{arithmetic.PINS['GLIBC_TUNABLES']}"
-    assert len(pinned_script("", **arithmetic.PINS)) == 2, (
-        "nothing is started again if the variables are set already"
-    )
+def test_a_script_is_not_started_again_and_states_what_holds():
+    tunables = "glibc.malloc.check=0:glibc.cpu.hwcaps=-AVX512F"
+    lines = pinned_script("", GLIBC_TUNABLES=tunables)
+    assert lines[0] == "start"
+    assert lines[1] == f"native glibc.malloc.check=0:{arithmetic.PINS['GLIBC_TUNABLES']}"
+    started = pinned_script("", **arithmetic.PINS)
+    assert started == ["start", f"pinned {arithmetic.PINS['GLIBC_TUNABLES']}"]
 
 
-def test_a_process_that_has_imported_numpy_is_not_replaced():
+def test_numpy_that_has_been_imported_keeps_its_variants():
     assert pinned_script("import numpy") == ["start", "native "]
+
+
+@pytest.mark.parametrize("start", ["-", "/dev/stdin"])
+def test_a_script_from_standard_input_runs_once(start):
+    script = "import avsreplay; avsreplay.arithmetic.pin(); print('hello')"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", start], input=script, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "hello\n", "")
+
+
+def test_the_command_that_a_script_from_standard_input_calls_runs_once():
+    script = (
+        "import sys; from avsreplay.__main__ import main; sys.argv = ['-', '--version']; main()"
+    )
+    done = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("avsreplay ")
 
 
 API = """
@@ -104,7 +122,7 @@ def test_a_script_that_pins_its_arithmetic_has_the_rows_of_the_command_on_any_pr
     assert cli("run", log, "-o", tmp_path / "r", "--n-scans", "12").code == 0
     rows = (tmp_path / "r" / "rows.jsonl").read_text(encoding="utf-8")
     for variables in ({"OPENBLAS_CORETYPE": "Prescott"}, OTHER):
-        env = {k: v for k, v in os.environ.items() if k not in arithmetic.PINS} | variables
+        env = {**os.environ, **variables, "GLIBC_TUNABLES": arithmetic.PINS["GLIBC_TUNABLES"]}
         done = subprocess.run(
             [sys.executable, script, log], env=env, capture_output=True, text=True, check=True
         )

@@ -63,6 +63,9 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "pip install docs/examples/own_backend": (
         "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract"
     ),
+    "pip install docs/examples/own_estimator": (
+        "test_docs.py::test_the_estimator_of_the_tutorial_keeps_the_contract"
+    ),
     "python3 -m venv .venv": ".ci/run",
     "pip install -q '.[test]'": ".ci/run",
 }
@@ -98,6 +101,10 @@ def _own_bag(folder):
 
 def _own_backend(folder):
     _installed(ROOT / "docs" / "examples" / "own_backend", folder / "site")
+
+
+def _own_estimator(folder):
+    _installed(ROOT / "docs" / "examples" / "own_estimator", folder / "site")
 
 
 def _poses(folder):
@@ -156,6 +163,7 @@ NEEDS = {
     "README.md": (_own_bag, _without_log),
     "docs/your-own-log.md": (_clone,),
     "docs/your-own-backend.md": (_own_backend, _without_log),
+    "docs/your-own-estimator.md": (_own_estimator, _without_log),
     "docs/poses.md": (_poses, _own_bag),
     "docs/report.md": (_scenarios,),
     "docs/scenario.md": (_scenarios,),
@@ -288,9 +296,17 @@ def _installed(package, site):
 
 
 def test_the_back_end_of_the_tutorial_keeps_the_contract(tmp_path):
-    _installed(ROOT / "docs" / "examples" / "own_backend", tmp_path / "site")
+    _checks(tmp_path, "own_backend", "backends", "own")
+
+
+def test_the_estimator_of_the_tutorial_keeps_the_contract(tmp_path):
+    _checks(tmp_path, "own_estimator", "estimators", "twist")
+
+
+def _checks(tmp_path, example, command, name):
+    _installed(ROOT / "docs" / "examples" / example, tmp_path / "site")
     done = subprocess.run(
-        [sys.executable, "-m", "avsreplay", "backends", "--check", "own"],
+        [sys.executable, "-m", "avsreplay", command, "--check", name],
         env={**_environment(), "PYTHONPATH": str(tmp_path / "site")},
         capture_output=True,
         text=True,

@@ -14,7 +14,7 @@ import pytest
 from log_cases import SECOND, header, scans, write
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation, Slerp
@@ -271,7 +271,7 @@ def test_several_cloud_topics_are_listed_and_one_can_be_chosen(tmp_path: Path) -
     assert "\\x1b[31m" in str(caught.value)
     assert "\x1b" not in str(caught.value)
     check(read(path, topic="/left"), with_truth=False)
-    with pytest.raises(UsageError, match="no PointCloud2 topic '/middle'"):
+    with pytest.raises(UsageError, match="no cloud topic '/middle'"):
         open_source(path, SourceOptions(topic="/middle"))
 
 
@@ -443,8 +443,6 @@ def test_pose_files_beside_a_log(tmp_path: Path) -> None:
     [
         "1 2 3",
         "a b c d e f g h",
-        "1 0 0 0 0 0 0 0",
-        "1 nan 0 0 0 0 0 1",
         "1 0 0 0 0 0 0 1 9",
         "1 0 0 0 2 0 0 0 0 1 0 0",
         "1,2",
@@ -512,3 +510,162 @@ def test_model_and_truth_move_with_the_grasp_point() -> None:
             assert after.state is not None
             np.testing.assert_allclose(after.pose.matrix, (before.pose @ by).matrix, atol=1e-12)
             np.testing.assert_allclose(after.state.T_ac.matrix, after.pose.matrix, atol=1e-6)
+
+
+# ---- containers and transforms of other recorders ----
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_messages_that_are_compressed_one_by_one(tmp_path: Path, plugin: StoragePlugin) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Ros2Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        cloud = writer.add_connection("/points", CLOUD, typestore=store)
+        truth = writer.add_connection("/gt", POSE, typestore=store)
+        for i, c in enumerate(CLOUDS):
+            writer.write(cloud, c.log_ns, point_cloud2(c.t_ns, "camera", c.points, None))
+            writer.write(truth, c.log_ns, pose_stamped(c.t_ns, "camera", pose(i)))
+    check(read(tmp_path / "bag", truth_topic="/gt"))
+
+
+def test_a_compressed_message_over_the_limit_is_a_damaged_scan(tmp_path: Path) -> None:
+    import zstandard
+
+    bomb = zstandard.compress(bytes(8 << 20))
+    messages = [*clouds()[:1], ("/points", CLOUD, CLOUDS[1].log_ns, bomb)]
+    options = SourceOptions(max_message_mib=1)
+    with open_source(mcap(tmp_path / "a.mcap", messages), options) as source:
+        found = list(source.scans())
+    assert sorted(scan.status.value for scan in found) == ["damaged", "ok"]
+    assert any("over the limit" in str(scan.note) for scan in found)
+
+
+def test_the_metadata_of_a_bag_stands_for_its_folder(tmp_path: Path) -> None:
+    bag2(tmp_path / "bag", StoragePlugin.MCAP)
+    check(read(tmp_path / "bag" / "metadata.yaml", truth_topic="/gt"))
+
+
+def test_an_invalid_transform_does_not_drop_the_others_of_its_message(tmp_path: Path) -> None:
+    nothing = Packer().header(CLOUDS[0].t_ns, "odom").string("wheel").f64s(*[0.0] * 7).bytes()[4:]
+    messages = []
+    for topic, kind, log_ns, payload in moving_sensor():
+        if topic == "/tf":
+            whole = bytearray(payload)
+            whole[4:8] = struct.pack("<I", 3)
+            whole += bytes(-(len(whole) - 4) % 4) + nothing
+            payload = bytes(whole)
+        messages.append((topic, kind, log_ns, payload))
+    path = mcap(tmp_path / "a.mcap", messages)
+    found = read(path, fixed_frame="map", truth_frame="target")
+    for i, scan in enumerate(found):
+        np.testing.assert_allclose(scan.truth.matrix, pose(20 - i).matrix, atol=1e-14)
+    with open_source(path, SourceOptions(fixed_frame="map")) as source:
+        assert str(len(CLOUDS)) in source.info().notes["poses or transforms"]
+
+
+def test_transforms_of_a_namespace_are_found(tmp_path: Path) -> None:
+    named = {"/tf": "/robot1/tf", "/tf_static": "/robot1/tf_static"}
+    messages = [(named.get(topic, topic), *rest) for topic, *rest in moving_sensor()]
+    found = read(mcap(tmp_path / "a.mcap", messages), fixed_frame="map", truth_frame="target")
+    np.testing.assert_allclose(found[3].truth.matrix, pose(17).matrix, atol=1e-14)
+
+
+def test_a_fixed_frame_that_no_transform_reaches_is_named(tmp_path: Path) -> None:
+    messages = [m for m in moving_sensor() if m[0] != "/tf_static"]
+    path = mcap(tmp_path / "a.mcap", messages)
+    with open_source(path, SourceOptions(fixed_frame="map")) as source:
+        scan = source.scan_at(0)
+    assert scan.status is ScanStatus.DAMAGED
+    assert "no transform connects '/lidar' to 'map'" in str(scan.note)
+    gt = [("/gt", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(0))) for c in CLOUDS]
+    path = mcap(tmp_path / "b.mcap", [*messages, *gt])
+    with open_source(path, SourceOptions(truth_topic="/gt"), inspect=True) as source:
+        problem = source.truth_problem([source.scan_at(0)])
+    assert problem is not None
+    assert "no transform of the log connects them" in problem[0]
+    assert problem[1] == ""
+
+
+def test_a_target_in_the_transforms_is_advised_as_truth(tmp_path: Path, cli) -> None:  # type: ignore[no-untyped-def]
+    path = mcap(tmp_path / "a.mcap", moving_sensor())
+    with open_source(path, inspect=True) as source:
+        assert source.moving_beside("/lidar") == ["target"]
+        assert source.moving_beside("target") == ["base"]
+
+
+POSE_FILES = {
+    "header": ("t_s,x,y,z,qx,qy,qz,qw\n", "{t},{x},{y},{z},{qx},{qy},{qz},{qw}\n", "utf-8"),
+    "mark": ("t_s,x,y,z,qx,qy,qz,qw\n", "{t},{x},{y},{z},{qx},{qy},{qz},{qw}\n", "utf-8-sig"),
+    "wide": ("t_s,x,y,z,qx,qy,qz,qw\n", "{t},{x},{y},{z},{qx},{qy},{qz},{qw}\n", "utf-16"),
+    "tum": ("", "{t} {x} {y} {z} {qx} {qy} {qz} {qw}\n", "utf-16"),
+}
+
+
+@pytest.mark.parametrize("name", POSE_FILES)
+def test_true_and_measured_poses_have_one_reader(tmp_path: Path, name: str) -> None:
+    """A header, a byte-order mark, UTF-16 and lines without a pose are read as both."""
+    head, line, code = POSE_FILES[name]
+    text = head
+    for i, c in enumerate(CLOUDS):
+        values = [*pose(i).t, *pose(i).q] if i != 4 else [float("nan")] * 7
+        keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
+        named = dict(zip(keys, map(repr, map(float, values)), strict=True))
+        text += line.format(t=f"{c.t_ns * 1e-9:.9f}", **named)
+    path = tmp_path / "poses.csv"
+    path.write_bytes(text.encode(code))
+    log = mcap(tmp_path / "a.mcap", clouds())
+    scans_ = read(log, truth_file=path, truth_gap_s=0.1)
+    with open_source(path, SourceOptions(poses=True)) as source:
+        measured = list(source.scans())
+    for i, (scan, one) in enumerate(zip(scans_, measured, strict=True)):
+        if i == 4:
+            assert scan.truth is None
+            assert one.status is ScanStatus.DAMAGED
+        else:
+            np.testing.assert_allclose(scan.truth.matrix, pose(i).matrix, atol=1e-12)
+            np.testing.assert_allclose(one.pose.T_ac.matrix, pose(i).matrix, atol=1e-12)
+
+
+POINTER = (
+    b"version https://git-lfs.github.com/spec/v1\n"
+    b"oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n"
+)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.mcap", "a.bag", "rows.jsonl"])
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path, name: str) -> None:
+    from avsreplay.log.header import read_surface
+    from avsreplay.report.jsonl import read_rows
+
+    path = tmp_path / name
+    path.write_bytes(POINTER)
+    reader = {".stl": read_surface, ".ply": read_surface, ".jsonl": read_rows}
+    with pytest.raises(UnreadableInput, match="git-LFS pointer"):
+        reader.get(path.suffix, open_source)(path)
+
+
+@pytest.mark.parametrize("opcode", [0x0C, 0x09])
+def test_a_padded_record_is_kept(tmp_path: Path, opcode: int) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, header(np.random.Generator(np.random.PCG64(1))), CLOUDS[:3])
+    data = path.read_bytes()
+    at = 8
+    while data[at] != opcode:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    size = int.from_bytes(data[at + 1 : at + 9], "little")
+    end = at + 9 + size
+    padded = data[: at + 1] + (size + 5).to_bytes(8, "little") + data[at + 9 : end] + bytes(5)
+    footer = len(data) - 37
+    start = int.from_bytes(data[footer + 9 : footer + 17], "little")
+    rest = bytearray(data[end:])
+    rest[footer - end + 9 : footer - end + 17] = bytes(8)  # the summary has moved: none is named
+    rest[footer - end + 25 : footer - end + 29] = bytes(4)
+    del rest[start - end : footer - end]
+    rest[start - end - 4 : start - end] = bytes(4)  # no checksum over the data
+    path.write_bytes(padded + bytes(rest))
+    with open_source(path) as source:
+        assert not source.losses
+        assert len(source) == 3
+        assert source.header.seed == 7
+        assert source.header.surface is not None

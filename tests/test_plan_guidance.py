@@ -161,7 +161,7 @@ def loop(noise_mps2, seed=0, latency_s=0.0):
         for t in np.arange(0.4, 120.0, 0.2)
     )
     guidance = Guidance(replace(ROBOT, latency_s=latency_s), Supervisor(PARAMS))
-    return closed_loop(guidance, known, target, 0, Tolerance(0.02, 0.01), noise_mps2, rng)[0]
+    return closed_loop(guidance, known, target, 0, noise_mps2, rng).outcome(Tolerance(0.02, 0.01))
 
 
 def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():

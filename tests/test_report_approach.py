@@ -59,7 +59,7 @@ def test_the_next_path_replaces_the_former() -> None:
 def test_the_picture_shows_path_begin_cone_and_body_to_scale() -> None:
     header = {
         "approach": {"final_deg": 15.0, "final_range_m": 0.5},
-        "config": {"fixture_axis_c": [0.0, -1.0, 0.0]},
+        "task": {"axis": [0.0, -1.0, 0.0]},
     }
     shown = approach_picture(rows(), view(), header)
     assert shown is not None

@@ -13,6 +13,7 @@ from avsreplay.geometry import IDENTITY_QUAT, Pose
 from avsreplay.log import SourceOptions
 from avsreplay.records import Fit
 from avsreplay.register import registrar
+from avsreplay.register.backend import Backend
 from avsreplay.register.registrar import POSTPONED, Registrar
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import Grade, verdict_of
@@ -41,7 +42,7 @@ CASES = {
 
 def _replace_backend(monkeypatch, align):
     """Let every registration of a run use ``align`` in place of the back end."""
-    backend = type("Other", (), {"align": staticmethod(align)})()
+    backend = type("Other", (Backend,), {"align": staticmethod(align)})(None)
     monkeypatch.setattr(registrar, "create_backend", lambda *_: backend)
 
 

@@ -69,7 +69,7 @@ def _list(as_json: bool) -> None:
             "on other processors",
             "how to install",
         )
-        _print_table("Registration back ends", heads, map(_state_row, states))
+        print_plain_table("Registration back ends", heads, map(_state_row, states))
 
 
 def _state_row(state: Availability) -> tuple[str, ...]:
@@ -93,7 +93,7 @@ def _check(name: str, as_json: bool) -> None:
             {"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]}
         )
     else:
-        _print_table(
+        print_plain_table(
             f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings)
         )
     broken = [finding.law for finding in findings if not finding.held]
@@ -111,10 +111,19 @@ def _print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2))
 
 
-def _print_table(title: str, heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
+def print_plain_table(title: str, heads: tuple[str, ...], rows: Iterable[Iterable[str]]) -> None:
+    """Print a table of texts.
+
+    Args:
+        title: above the table.
+        heads: of the columns.
+        rows: one text for each column.
+    """
     from avsreplay.report.table import Table, make_console, print_table
 
-    print_table(make_console(plain_width=120), Table(title, heads, tuple(rows), align="l"))
+    print_table(
+        make_console(plain_width=120), Table(title, heads, tuple(map(tuple, rows)), align="l")
+    )
 
 
 MEMORY_SCANS = 3

@@ -28,6 +28,7 @@ METHOD = {
 }  # names of parameters
 ASSIGNED = {
     "backend": "register.backend",
+    "estimator": "estimator.method",
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",
@@ -176,6 +177,13 @@ def run_settings(command: F) -> F:
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
+            "--task",
+            "task_file",
+            type=file,
+            envvar=_variable("task"),
+            help="TOML file that describes what is grasped in a table [task], and perhaps [robot].",
+        ),
+        click.option(
             "--set",
             "assignments",
             multiple=True,
@@ -214,6 +222,11 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
         from avsreplay.config import robot_settings
 
         put("robot_file", list(robot_settings(robot_file)), "--robot", robot_file)
+    task_file = flags.pop("task_file")
+    if task_file is not None:
+        from avsreplay.config import task_settings
+
+        put("task_file", list(task_settings(task_file)), "--task", task_file)
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():

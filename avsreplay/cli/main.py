@@ -11,9 +11,9 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import signal
 import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from typing import Any
 import click
 
 from avsreplay import __version__, arithmetic
-from avsreplay.errors import AvsError, UsageError
+from avsreplay.cli import interrupts
+from avsreplay.errors import AvsError, UsageError, printable
 
 __all__ = ["entry_point"]
 
@@ -33,6 +34,7 @@ SUMMARIES = {
     "info": "Show the content of a log and the options that a run needs.",
     "doctor": "Check a log for damage and repair it.",
     "backends": "List the registration back ends; run the contract tests on one.",
+    "estimators": "List the estimators; run the contract tests on one.",
     "bench": "Compare the speed and error of back ends on a log.",
     "observability": "Show which states the measurements of a log determine.",
     "plan": "Plan the capture again from a saved result.",
@@ -245,13 +247,28 @@ class _Discarding(io.FileIO):
         return len(memoryview(data).cast("B"))
 
 
+class _Escaping(io.TextIOWrapper):
+    """A standard stream that prints control characters of names and other text from files as
+    escapes; colours and the motion of the cursor only where it is a terminal.
+    """
+
+    _CONTROLS = re.compile(r"(\x1b\[[0-9;?]*[A-Za-z]|\r)")
+
+    def write(self, text: str) -> int:
+        """Write the text, its control characters other than tabs and line ends as escapes."""
+        if text.isascii() and text.isprintable():
+            return super().write(text)
+        parts = self._CONTROLS.split(text) if self.isatty() else [text]
+        kept = [part if k % 2 else printable(part, "\t\n") for k, part in enumerate(parts)]
+        super().write("".join(kept))
+        return len(text)
+
+
 def entry_point() -> None:
     """Run a command of the arguments of this process and exit with its code; every error is
     one line on stderr.
     """
-    if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
-    output, received = _standard_output(), _end_as_interrupt()
+    output, received = _standard_output(), interrupts.hear()
     try:
         code = group.main(
             standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY"
@@ -281,27 +298,6 @@ def entry_point() -> None:
     sys.exit(code)
 
 
-def _end_as_interrupt() -> list[int]:
-    """Let SIGTERM and SIGHUP, unless they are ignored, act as Ctrl-C; the returned list
-    receives their numbers.
-    """
-    received: list[int] = []
-
-    def interrupt(number: int, _frame: object) -> None:
-        received.append(number)
-        signal.raise_signal(signal.SIGINT)
-
-    for name in (
-        "SIGTERM",
-        "SIGHUP",
-    ):  # Windows has no SIGHUP; a thread other than the main one sets no handler
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            with contextlib.suppress(ValueError):
-                signal.signal(number, interrupt)
-    return received
-
-
 def _with_help(error: click.ClickException) -> str:
     """The message of an error, with the command that describes the arguments where it states no
     allowed values.
@@ -322,8 +318,6 @@ def _standard_output() -> _Discarding | None:
     A character that the encoding of standard output or standard error does not have is written as
     an escape.
     """
-    if sys.stdout is None:  # closed by the shell
-        sys.stdout = io.StringIO()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             if isinstance(stream, io.TextIOWrapper):
@@ -333,9 +327,13 @@ def _standard_output() -> _Discarding | None:
     except (OSError, ValueError):  # one that a test has put in its place
         return None
     encoding, lines = sys.stdout.encoding, bool(sys.stdout.line_buffering)
-    sys.stdout = io.TextIOWrapper(
+    sys.stdout = _Escaping(
         io.BufferedWriter(output), encoding, "backslashreplace", line_buffering=lines
     )
+    if isinstance(sys.stderr, io.TextIOWrapper):
+        sys.stderr = _Escaping(
+            sys.stderr.buffer, sys.stderr.encoding, "backslashreplace", line_buffering=True
+        )
     return output
 
 
@@ -363,10 +361,6 @@ def _crash(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    printable = "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
-        for c in message
-    )
     with contextlib.suppress(OSError):
-        click.echo(f"avsreplay: {printable}", err=True)
+        click.echo(f"avsreplay: {printable(message)}", err=True)
     return code

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from avsreplay.cli import interrupts
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output, is_stream
@@ -96,6 +97,7 @@ run_source_options = added(
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--scan-duration", "scan_duration_s", type=float),
+    source_setting("--intrinsics", type=str),
     source_setting("--scan-unit"),
     source_setting("--point-time", metavar="FIELD:UNIT:ORIGIN"),
     source_setting("--no-return", metavar="CODES"),
@@ -143,7 +145,7 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
 
     given = {name: value for name, value in flags.items() if value is not None}
     for name, choice in _CHOICES.items():
-        if name in given:
+        if isinstance(given.get(name), str):
             given[name] = getattr(log_options, choice)(given[name])
     if "grasp" in given and given.get("model") == Path("auto"):
         hint = "build the model first with 'avsreplay model', which has the same option"
@@ -328,9 +330,14 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
             )
 
 
+_GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
+
+
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
+
+    A scan that takes longer than ``_GRACE_S`` after the first one is given up; its row is missing.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
@@ -342,19 +349,31 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
     asked: list[int] = []
 
     def ask(number: int, _frame: object) -> None:
+        if not interrupts.counts():
+            return
         asked.append(number)
         stop()
         if not rows or len(asked) > 1:
+            request_stop()
             raise KeyboardInterrupt
+        late.start()
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    from avsreplay.register.interrupt import request_stop
+
+    late = threading.Timer(_GRACE_S, request_stop)
+    late.daemon = True
     before = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: bool(asked)
     finally:
         signal.signal(signal.SIGINT, before)
+        late.cancel()
+        if late.is_alive():
+            late.join()
+        request_stop(False)
 
 
 _LIVE_HEAD = "  scan     t [s]  state             rms [mm]     nis pos err [mm] rot err [deg]"

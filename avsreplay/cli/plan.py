@@ -98,12 +98,12 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 )
 @click.option(
     "--flights",
-    type=click.IntRange(0),
-    default=0,
+    type=click.IntRange(1),
+    default=16,
     show_default=True,
     help=(
-        "Number of simulated flights with replanning, thrust errors and delay, to targets drawn"
-        " from the belief."
+        "Number of simulated flights, to targets drawn from the belief, where RESULT ends before"
+        " the capture."
     ),
 )
 @click.option(
@@ -177,9 +177,7 @@ def plan_command(
     made = _usable(lambda: planning.plan_at(index))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    flown = (
-        _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
-    )
+    assessment = _usable(lambda: planning.assess(index, flights, seed))
     joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
@@ -187,7 +185,7 @@ def plan_command(
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    answer = Answer(planning, at_s, made, spread, flown, joints, hindsight, execution, changes)
+    answer = Answer(planning, at_s, made, assessment, spread, joints, hindsight, execution, changes)
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:

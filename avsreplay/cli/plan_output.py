@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 from avsreplay.errors import value_class
 
 if TYPE_CHECKING:
+    from avsreplay.assessment import Assessment
     from avsreplay.outcome import Plan
-    from avsreplay.plan.flights import Execution, Flights, Miss
+    from avsreplay.plan.flights import Execution, Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread
     from avsreplay.replan import Replanning
@@ -45,8 +46,8 @@ class Answer:
         planning: the planner with its settings.
         at_s: instant of planning [s after the first scan].
         made: the plan.
-        spread: its distribution over the belief; None without a plan.
-        flown: simulated flights; None where not requested.
+        assessment: whether the robot would capture, by the whole flight.
+        spread: the one plan flown blind, over the belief; None without a plan.
         joints: of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
         execution: the simulated approach; None without ground truth.
@@ -56,8 +57,8 @@ class Answer:
     planning: Replanning
     at_s: float
     made: Plan
+    assessment: Assessment
     spread: Spread | None
-    flown: Flights | None
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
     execution: Execution | None
@@ -71,9 +72,10 @@ def document(answer: Answer) -> str:
     from avsreplay import settings
 
     planning, execution = answer.planning, answer.execution
-    spread, flown, joints = answer.spread, answer.flown, answer.joints
+    spread, joints = answer.spread, answer.joints
     outcome = None if execution is None else execution.outcome(planning.tolerance)
     document = {
+        "capture": answer.assessment.record(),
         "made_at_s": answer.at_s,
         "plan": _plan_record(answer.made, answer.at_s),
         "changes": [{"option": c.option, "capture_time_s": c.capture_s} for c in answer.changes],
@@ -83,7 +85,6 @@ def document(answer: Answer) -> str:
         "robot_line": planning.robot_line,
         "tolerance": settings.dump(planning.tolerance),
         "spread": settings.dump(spread) if spread else None,
-        "flights": settings.dump(flown) if flown else None,
         "arm": joints.record() if joints else None,
         "hindsight": [
             {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
@@ -135,8 +136,11 @@ def print_answer(answer: Answer) -> None:
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console()
+    print_line(console, f"{answer.assessment.sentence}.")
+    console.print()
+    print_table(console, facts_table("Capture", answer.assessment.described()))
     facts = plan_facts(answer.planning, answer.at_s, answer.made)
-    for found in (answer.joints, answer.spread, answer.flown):
+    for found in (answer.joints, answer.spread):
         facts += found.described() if found else []
     if not answer.made.found:
         if (

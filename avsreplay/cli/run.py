@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
 
-GRADES = click.Choice(["pass", "check"], case_sensitive=False)
+GRADES = ("pass", "check", "any")
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
@@ -51,8 +51,33 @@ Examples:
   avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
-Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than required,
+Exit codes: 0 ok, 1 the tracking is FAIL, the golden file differs or a requirement is not met,
             2 usage, 3 unreadable input, 4 finished but data was lost, 130 interrupted."""
+
+
+class Requirement(click.ParamType[str | float]):
+    """``pass``, ``check`` or ``any``, or ``capture=P`` with the least probability of a capture."""
+
+    name = "pass|check|any|capture=P"
+
+    def convert(
+        self,
+        value: Any,
+        param: click.Parameter | None,
+        ctx: click.Context | None,  # noqa: ARG002 -- the signature of click
+    ) -> str | float:
+        """Return the name of a grade, or the probability."""
+        text = str(value).lower()
+        if text in GRADES:
+            return text
+        name, sign, number = text.partition("=")
+        try:
+            least = float(number) if name == "capture" and sign else -1.0
+        except ValueError:
+            least = -1.0
+        if not 0.0 <= least <= 1.0:
+            self.fail(f"'{value}' is not {', '.join(GRADES)} or capture=P, P from 0 to 1", param)
+        return least
 
 
 @click.command("run", cls=SectionedCommand, epilog=EPILOG)
@@ -98,7 +123,14 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
     help="LOG is still being written: replay each scan as soon as it is complete.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@click.option("--require", "least", type=GRADES, help="Exit with code 1 if the verdict is worse.")
+@click.option(
+    "--require",
+    "required",
+    type=Requirement(),
+    multiple=True,
+    help="Exit with code 1 if the verdict is worse, or the capture is less probable (capture=0.9)."
+    " Without it FAIL gives code 1; any accepts every verdict. May be repeated.",
+)
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
@@ -111,8 +143,9 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
 def run_command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs
-    no option; for any other log 'avsreplay info LOG --model FILE' names the options that it needs.
+    LOG is an MCAP file, a ROS bag, a folder of scans, or a job file with a log and its options. A
+    log written by 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model
+    FILE' names the options that it needs, and --write stores them as a job file.
     If LOG is -, an MCAP file is read from standard input, and each scan is replayed as soon as it
     is complete; --follow does the same with a file that is still being written. The results are
     those of a replay of the complete log. \f Raises:
@@ -120,6 +153,7 @@ def run_command(log: Path, **flags: Any) -> None:
     """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
 
+    log = _with_job_file(log, flags)
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
     again = wanted.overwrite or wanted.resume
@@ -128,7 +162,7 @@ def run_command(log: Path, **flags: Any) -> None:
         ResultDirectory(wanted.output, overwrite=again, inputs=inputs) if wanted.output else None
     )
     with log_file(log, follow=wanted.follow) as (path, growing):
-        job = _job(path, flags)
+        job = job_of(path, flags)
         streamed = growing is not None and job.options.model != Path("auto") and not wanted.resume
         if wanted.follow and not streamed:
             raise UsageError(
@@ -157,7 +191,7 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
-        click.echo(f"verdict {done.verdict.line}", err=True)
+        click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
 
@@ -178,7 +212,7 @@ class Wanted:
     table_all: bool
     plain: bool
     to_rerun: str | None
-    least: str | None
+    required: tuple[str | float, ...]
 
     def check(self) -> None:
         """Raise UsageError if two options contradict each other, UnreadableInput for an unusable
@@ -203,10 +237,45 @@ class Wanted:
             read_golden(self.update_golden)
 
 
-def _job(log: Path, flags: dict[str, Any]) -> Job:
+def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
+    """Return the log of a job file and put its options into ``flags`` where none is given; any
+    other log is returned as it is.
+    """
+    if log.suffix != ".toml" or not log.is_file():
+        return log
+    from avsreplay.cli.job import read_job
+
+    job = read_job(log)
+    if job is None:
+        return log
+    given = {**job.given, "golden": job.golden, "config_file": job.config}
+    start_s = given.pop("start_s", None)
+    if start_s is not None and not any(isinstance(each, float) for each in flags["starts"]):
+        flags["starts"] = (*flags["starts"], start_s)
+    for name, value in given.items():
+        if flags.get(name) is None:
+            flags[name] = value
+    flags["assigned"] = job.assignments
+    return job.log
+
+
+def job_of(log: Path, flags: dict[str, Any]) -> Job:
+    """Return the run that the options of the command describe.
+
+    Args:
+        log: the log.
+        flags: the options by the names of their parameters; those that are used are taken out.
+
+    Raises:
+        UsageError: a value is not allowed.
+    """
     from avsreplay.run import Job
 
+    for field in fields(Wanted):
+        flags.pop(field.name, None)
+    of_file = tuple(flags.pop("assigned", ()))
     config_file, assignments = take_run_settings(flags)
+    assignments = (*of_file, *assignments)
     starts = flags.pop("starts")
     if flags.pop("paper"):
         from avsreplay.config import PAPER
@@ -227,6 +296,9 @@ def _checked(run: Run) -> list[Advice]:
 
     checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
     found = [advice for advice in checked if advice.grade != "ok"]
+    for each in run.source.meaning.inferences:
+        if each.grade == "ok":
+            click.echo(f"avsreplay: {each.about}: {each.sentence}", err=True)
     for advice in found:
         click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
     return found
@@ -285,6 +357,8 @@ def _replayed(
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
+        record["capture"] = None if summary.assessment is None else summary.assessment.record()
+        record["measured_1s"] = None if run.flight.noise is None else list(run.flight.noise)
         record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
         grade = (
             "check" if summary.healthy else "fail"
@@ -340,8 +414,8 @@ def _collect(
 
     try:
         with (
-            closing(found),
             interruptible(rows, growing.stop if growing else lambda: None) as stopped,
+            closing(found),
         ):
             for row in found:
                 if live:
@@ -411,11 +485,27 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
             _print_differences(result, done.verdict, to_stderr=wanted.as_json)
         result.check(str(wanted.golden))
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
-    order = ["pass", "check", "fail"]
-    if wanted.least and order.index(done.verdict.grade.value.lower()) > order.index(wanted.least):
-        raise CheckFailed(f"the verdict is {done.verdict.line}", where=f"--require {wanted.least}")
     if "interrupted_after" in done.record:
         raise KeyboardInterrupt
+    _check_required(wanted.required, done.verdict)
+
+
+def _check_required(required: Sequence[str | float], verdict: RunVerdict) -> None:
+    """Raise CheckFailed for a verdict that is worse than required; without a requirement on the
+    grade FAIL is worse.
+    """
+    capture = verdict.capture
+    probability = (None if capture is None else capture.probability) or 0.0
+    for least in required:
+        if isinstance(least, float) and (probability < least or not (capture and capture.succeeds)):
+            where = f"--require capture={least:g}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+    order = ["pass", "check", "fail"]
+    grades = [least for least in required if isinstance(least, str)] or ["check"]
+    for grade in grades:
+        if grade != "any" and order.index(verdict.grade.value.lower()) > order.index(grade):
+            where = f"--require {grade}" if required else "tracking"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
 
 
 def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:

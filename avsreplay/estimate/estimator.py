@@ -24,6 +24,7 @@ from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast, propagated
 from avsreplay.estimate.error_state import RHO, semidefinite
 from avsreplay.estimate.frame import ZERO, EstimatorFrame
+from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     gate_of,
@@ -216,24 +217,28 @@ class Estimator:
         due = verdict.gamma == 1 and after.mode in ("fit", "filter")
         return self.disturbances.advanced(after, self._robust) if due else after, verdict
 
-    def track_forecast(self, track: Track, times_s: Array) -> Forecast:
+    def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is
         not Gaussian.
 
         Args:
             track: after the scan.
             times_s: (n,) >= 0, ascending [s after the scan].
+            grasp_c: (3,) grasp point in {C} [m].
         """
         noise, b = self.batch.noise_levels(track), common_1s(track, self.frame)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
-            found = driven_forecast(self.frame.belief_out(track.belief), times_s, *noise)
+            belief = at_grasp(self.frame.belief_out(track.belief), grasp_c)
+            found = driven_forecast(belief, times_s, *noise)
         else:
+            x, y, z = (np.asarray(self.frame.origin_c) + grasp_c).tolist()
             found = mixture_forecast(
-                track.batch.components, track.belief.t_ns, times_s, *noise, self.frame.origin_c
+                track.batch.components, track.belief.t_ns, times_s, *noise, (x, y, z)
             )
         turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
         if (motions := self._common_motions(track)).size:
             turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(motions), 2))
+            moves = np.hypot(moves, float(np.linalg.norm(grasp_c)) * turns)
             turn, position = np.hypot(turn, turns), np.hypot(position, moves)
         return Forecast(
             found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD)

@@ -30,7 +30,7 @@ from avsreplay.estimate.batch_covariance import (
 )
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.error_state import DIM, hamilton
+from avsreplay.estimate.error_state import DIM, RHO, VEL, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
@@ -220,7 +220,10 @@ def given_prior(belief: Belief) -> Prior:
     The Jacobian would not do: where two moments are nearly equal, the effect of the axes mu on the
     inertia depends on how far the moments differ, which the linearisation does not contain.
     """
-    x, mean, root = belief.x, to_chart(belief.x), np.linalg.cholesky(belief.P)
+    x, mean, J = belief.x, to_chart(belief.x), np.eye(DIM)
+    # position and velocity along the axes of the body, so that the draws turn with the camera
+    J[RHO, RHO] = J[VEL, VEL] = geometry.matrix(x.q_ab)
+    root = J @ np.linalg.cholesky(J.T @ belief.P @ J)
     draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
     y = _motion.spread(x.flat, np.concatenate([draws, -draws]), _EDGE, mean.flat)
     return Prior(mean, y.T @ y / len(y))

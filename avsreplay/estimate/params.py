@@ -13,6 +13,7 @@ from avsreplay.settings import Settings, are_orthonormal, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
+OWN, PRINTED = "own", "paper"  # the estimators that are no plug-ins
 _PER_POSE = (
     0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
 )
@@ -54,6 +55,12 @@ class Adaptation(Enum):
 class EstimatorParams(Settings):
     """Settings of the estimator: noise, adaptation and initialisation."""
 
+    method: str = setting(
+        OWN,
+        "Estimator: the program's own (own), the filter as printed in the paper (paper), or a"
+        " plug-in by its entry-point name ('avsreplay estimators' lists them), for example a plain"
+        " extended Kalman filter (ekf). A plug-in uses the settings of the start and of R0.",
+    )
     torque_noise_radps15: float | None = setting(
         None,
         "Root spectral density of the angular acceleration noise eps_tau. With a larger value the"
@@ -278,6 +285,20 @@ class EstimatorParams(Settings):
                 given(plain.resolved(extent_m).start_vel_1s_mps), _PER_POSE * extent_m / period_s
             )
         return replace(self, start_rate_1s_radps=rate, start_vel_1s_mps=speed)
+
+    def as_printed(self) -> EstimatorParams:
+        """Return the settings with start, noise and gain as printed in the paper; a near start that
+        is requested is kept.
+        """
+        return replace(
+            self,
+            start=self.start if self.start is Start.NEAR else Start.PAPER,
+            constraint=Constraint.GAIN,
+            noise=NoiseSource.R0,
+            adapt=Adaptation.MATRIX,
+            robust=False,
+            audit_poses=0,
+        )
 
     @property
     def R0(self) -> Array:

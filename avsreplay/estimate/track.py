@@ -104,7 +104,7 @@ class Track:
 
     Attributes:
         belief: after the last scan.
-        mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
+        mode: the estimator in use: 'near', 'start', 'fit' or 'filter', or the name of a plug-in.
         window: of the noise adaptation.
         sigma_hits: sigma bounds that cut the gain so far.
         r_floors: eigenvalues of R raised so far.
@@ -139,6 +139,7 @@ class Track:
         change_probability, change_P: of a change of the velocities in the last scans, and what it
             adds to P (20, 20).
         errors: of the model and of the ranges, as the healthy scans so far show them.
+        plugged: state of an estimator that is a plug-in (``plugged``).
     """
 
     belief: Belief
@@ -174,6 +175,7 @@ class Track:
     change_probability: float = 0.0
     change_P: Array = field(default_factory=lambda: NO_CHANGE)
     errors: ModelErrors = NO_MODEL_ERRORS
+    plugged: Any = None
 
     def changed(self, **values: Any) -> Track:
         """Return a copy with other values: ``dataclasses.replace``, faster for so many fields.
@@ -285,6 +287,7 @@ class Prediction:
         counted: how far systematic errors of its pose count (``ModelErrors.counted``).
         blur: (6, 6) covariance in {C} of treating the pose as one of a single instant although its
             points were measured at many; None for zero.
+        plugged: prediction of an estimator that is a plug-in.
     """
 
     belief: Belief
@@ -294,6 +297,7 @@ class Prediction:
     lag_s: float = 0.0
     blur: Array | None = None
     counted: float = 0.0
+    plugged: Any = None
 
 
 def confirmed(track: Track) -> tuple[Manoeuvre, ...]:

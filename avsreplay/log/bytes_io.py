@@ -4,17 +4,12 @@ to print.
 
 from __future__ import annotations
 
-import re
 import threading
 from pathlib import Path
 from typing import Any
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, printable
 
-# C0 and C1 control characters, bidirectional marks, zero-width characters and lone surrogates.
-_UNSAFE = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
-)
 _SMALL, _BLOCK = 256, 1 << 16  # small reads (record heads) are served from one cached block
 ROS1_MAGIC, SQLITE_MAGIC = (
     b"#ROSBAG V2.0\n",
@@ -33,9 +28,7 @@ def shown(text: object) -> str:
     r"""Return ``str(text)`` with every control character replaced by an escape (``\x1b``,
     ``\u202e``).
     """
-    return _UNSAFE.sub(
-        lambda m: m[0].encode("unicode_escape", "surrogatepass").decode("ascii"), str(text)
-    )
+    return printable(str(text))
 
 
 class ByteFile:
@@ -125,6 +118,33 @@ def inflate(data: bytes, compression: str, size: int) -> bytes:
     if len(out) != size:
         raise BadMessage(f"a chunk does not decompress to the {size} bytes it declares")
     return out
+
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+def unpacked(payload: bytes | memoryview, encoding: str, limit: int) -> bytes | memoryview:
+    """Return a message, decompressed where rosbag2 compressed each message of its own.
+
+    Args:
+        payload: the message as it is stored.
+        encoding: of the message; one in CDR never begins with the mark of zstd.
+        limit: largest message that is decompressed [bytes].
+
+    Raises:
+        BadMessage: it cannot be decompressed, or is over the limit.
+    """
+    if encoding != "cdr" or bytes(payload[:4]) != ZSTD_MAGIC:
+        return payload
+    import zstandard
+
+    try:
+        size = zstandard.get_frame_parameters(payload).content_size
+    except zstandard.ZstdError as error:
+        raise BadMessage(f"a message that cannot be decompressed: {error}") from None
+    if size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR) or size > limit:
+        raise BadMessage(f"a compressed message without a size, or over the limit of {limit} bytes")
+    return inflate(bytes(payload), "zstd", size)
 
 
 def _zstd(data: bytes, size: int) -> bytes:

@@ -83,6 +83,10 @@ class Cursor:
         """Return the next signed 32-bit number."""
         return int(self._take("i", 4))
 
+    def u64(self) -> int:
+        """Return the next unsigned 64-bit number."""
+        return int(self._take("Q", 8))
+
     def f64s(self, count: int) -> tuple[float, ...]:
         """Return the next ``count`` doubles of an array of fixed length.
 
@@ -122,9 +126,13 @@ class Cursor:
 
     def header(self) -> tuple[int, str]:
         """Return stamp [ns] and frame of the next std_msgs Header."""
+        return self.header_stamp(), self.string()
+
+    def header_stamp(self) -> int:
+        """Return the stamp [ns] of the next std_msgs Header, without its frame."""
         if self.ros1:
             self.u32()
-        return self.stamp(), self.string()
+        return self.stamp()
 
 
 class Packer:

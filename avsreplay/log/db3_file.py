@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.bytes_io import ZSTD_MAGIC, BadMessage, shown
 from avsreplay.log.index import Recording, Sink, canonical_type
 from avsreplay.log.options import Loss
 
@@ -40,7 +40,6 @@ class Db3File(Recording):
             UnreadableInput: the file does not exist or is not the database of a bag.
         """
         super().__init__(path, limit, sinks)
-        self._sinks = frozenset(sinks or ())
         self._topics: dict[int, str] = {}
         self._db = _connected(path, limit)
         try:
@@ -49,11 +48,8 @@ class Db3File(Recording):
             self._db.close()
             raise _unreadable(path, error) from None
 
-    def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry.
-
-        Raises BadMessage if it cannot be read.
-        """
+    def _stored(self, topic: str, place: int) -> bytes | memoryview:
+        """Return a message as it is stored. Raises BadMessage if it cannot be read."""
         row_id = self._table.clouds(topic).offset[place]
         try:
             row = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
@@ -122,7 +118,7 @@ class Db3File(Recording):
         if topic is None or not isinstance(head, bytes):
             return False
         payload = memoryview(head)
-        if topic in self._sinks:
+        if self._table.wants(topic) or head.startswith(ZSTD_MAGIC):
             whole = self._db.execute(
                 "SELECT data FROM messages WHERE id = ?", (row_id,)
             ).fetchone()[0]

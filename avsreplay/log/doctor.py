@@ -18,13 +18,13 @@ from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.files import check_output, output_path
 from avsreplay.geometry import Array
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.cloud_messages import raw_message
 from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, parse_surface
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
-from avsreplay.log.point_cloud2 import raw_cloud, read_layout
 from avsreplay.log.source import Source
 from avsreplay.log.writer import LIBRARY
 from avsreplay.records import Scan, ScanStatus
@@ -87,7 +87,8 @@ def examine(path: Path, options: SourceOptions | None = None) -> tuple[LogInfo, 
         findings = [*_losses(info.losses), *_structure(path, options), *_content(info)]
         if info.scans:
             tally, times = _pass(source)
-            findings += [*_clocks(source.clock), *_gaps(times), *_scans(tally), *_layout(source)]
+            findings += [*_clocks(source.clock), *_gaps(times), *_scans(tally)]
+            findings += [*_meaning(source), *_layout(source)]
     return info, findings
 
 
@@ -244,21 +245,27 @@ def _scans(tally: _Tally) -> Iterator[Finding]:
         yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_NAMED]))
     total = tally.points + tally.dropped
     share = tally.dropped / total if total else 0.0
-    text = f"{total} in {tally.scans} scans, {100 * share:.2f} % not finite"
+    text = f"{total} in {tally.scans} scans, {100 * share:.2f} % no returns"
     yield Finding(Severity.NOTE if tally.dropped else Severity.OK, "points", text)
     if 0 < tally.with_truth < tally.scans:
         text = f"{tally.scans - tally.with_truth} of {tally.scans} scans have none"
         yield Finding(Severity.NOTE, "truth", text)
 
 
+_SEVERITIES = {"ok": Severity.OK, "check": Severity.NOTE, "fail": Severity.WARNING}
+
+
+def _meaning(source: Source) -> Iterator[Finding]:
+    """Report what the numbers of the clouds mean, and what is to be stated."""
+    for each in source.meaning.inferences:
+        advice = f"; {each.option}" if each.grade != "ok" else ""
+        yield Finding(_SEVERITIES[each.grade], each.about, f"{each.sentence}{advice}")
+
+
 def _layout(source: Source) -> Iterator[Finding]:
     """Report the fields of the clouds and whether they change."""
     layouts: Counter[str] = Counter()
-    for payload, encoding in source.payloads():
-        try:
-            layout = read_layout(payload, encoding)
-        except BadMessage:
-            continue
+    for layout in source.layouts():
         fields = " ".join(f"{shown(f.name)}:{f.kind}@{f.offset}" for f in layout.fields)
         order = "little" if layout.order == "<" else "big"
         layouts[
@@ -300,7 +307,7 @@ class _Copier:
         """
         if channel.type in CLOUD_TYPES:
             try:
-                raw_cloud(payload, channel.encoding)
+                raw_message(channel.type, payload, channel.encoding)
             except BadMessage as error:
                 self.done.dropped.append(f"a cloud on {shown(channel.topic)}: {shown(error)}")
                 return

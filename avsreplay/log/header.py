@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from avsreplay import mesh
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import refuse_pointer
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
@@ -37,6 +38,7 @@ from avsreplay.read_budget import BadFile, ReadBudget
 from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
+OWN_MODEL, _OWN_WITHIN = b"comment reconstructed by avsreplay", 1024  # marks a built model
 FORMAT, _MAX_NAME = "1", 256
 _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
@@ -198,7 +200,8 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     Args:
         path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of
             the model.
-        cloud_ok: accept a file without faces as a point-cloud model.
+        cloud_ok: accept a file without faces as a point-cloud model; one that ``avsreplay model``
+            built is accepted anyway.
 
     Returns:
         The model with the bytes and the SHA-256 of its file.
@@ -209,7 +212,8 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     """
     path = Path(path)
     data = read_limited(path, MAX_BYTES, "name a model file of at most 512 MiB")
-    return _parsed(data, path.name, shown(path), cloud_ok)
+    own = OWN_MODEL in data[:_OWN_WITHIN]
+    return _parsed(data, path.name, shown(path), cloud_ok or own)
 
 
 def parse_surface(data: bytes, name: str) -> Surface:
@@ -284,6 +288,7 @@ def surface_bytes(surface: Surface) -> bytes:
 
 def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
     suffix = PurePath(name).suffix.lower().lstrip(".")
+    refuse_pointer(data, where)
     if not data:
         raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
     if data.startswith(b"ply"):

@@ -10,17 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
-from avsreplay.log.cdr import Cursor
+from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate, unpacked
+from avsreplay.log.camera import CAMERA_INFO
+from avsreplay.log.cloud_messages import LAYOUTS, message_stamp, raw_message
+from avsreplay.log.depth_image import IMAGE_TYPES
 from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.point_cloud2 import raw_cloud
+from avsreplay.log.point_cloud2 import Layout
 from avsreplay.log.raw_cloud import RawCloud
 
 MAX_NS = (
     2**31 - 2
 ) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
-CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
+CLOUD_TYPES = tuple(LAYOUTS)
 POSE_NAMES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -30,7 +32,7 @@ POSE_NAMES = (
 """Types that hold one stamped pose."""
 _COMPRESSIONS = ("", "zstd", "lz4", "bz2")
 _KEPT = 2  # decompressed chunks held in memory
-_INDEXED = (*CLOUD_TYPES, *POSE_NAMES)
+_INDEXED = (*CLOUD_TYPES, *POSE_NAMES, *IMAGE_TYPES, CAMERA_INFO)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
 
@@ -41,8 +43,8 @@ def _column() -> array[int]:
 
 @dataclass(slots=True)
 class CloudIndex:
-    """The messages of one cloud or pose topic in file order; one entry for each message in every
-    array.
+    """The messages of one cloud, image or pose topic in file order; each array has one entry for
+    each message.
 
     Attributes:
         log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
@@ -96,16 +98,21 @@ class MessageTable:
     pass over the log.
 
     Args:
-        sinks: called with every message of a topic during the pass.
+        sinks: called with every message of a topic during the pass; the sink of ``*/tf`` also for
+            every other topic with this last part, as those of a namespace.
+        limit: largest message that is decompressed [bytes].
     """
 
-    def __init__(self, sinks: dict[str, Sink] | None = None) -> None:
-        self._sinks = dict(sinks or {})
+    def __init__(self, sinks: dict[str, Sink] | None = None, limit: int = 1 << 27) -> None:
+        self._sinks, self._limit = dict(sinks or {}), limit
         self._topics: dict[str, _TopicCount] = {}
         self._clouds: dict[str, CloudIndex] = {}
 
     def declare(self, topic: str, kind: str, encoding: str) -> None:
         """Declare a topic; the first declared type is kept."""
+        shared = self._sinks.get(f"*/{topic.rsplit('/', 1)[-1]}")
+        if shared is not None:
+            self._sinks.setdefault(topic, shared)
         self._topics.setdefault(topic, _TopicCount(topic, kind, encoding))
 
     def add(
@@ -115,11 +122,17 @@ class MessageTable:
         (container, offset).
         """
         known = self._topics[topic]
+        stored = len(payload)
+        if topic in self._sinks or known.type in _INDEXED:
+            try:
+                payload = memoryview(unpacked(payload, known.encoding, self._limit))
+            except BadMessage:  # it is indexed, and reported when it is read
+                payload = memoryview(b"")
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
         if known.type in _INDEXED:
-            clocks = (log_ns, times[1], _stamp(payload, known.encoding))
-            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
+            clocks = (log_ns, times[1], message_stamp(known.type, payload, known.encoding))
+            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, stored)
         if topic in self._sinks:
             self._sinks[topic](known.type, known.encoding, log_ns, payload)
 
@@ -131,20 +144,17 @@ class MessageTable:
         )
         return sorted(infos, key=lambda t: t.name)
 
+    def encoding(self, topic: str) -> str:
+        """Return the encoding of a declared topic."""
+        return self._topics[topic].encoding
+
+    def wants(self, topic: str) -> bool:
+        """Return whether a sink takes the messages of a topic."""
+        return topic in self._sinks
+
     def clouds(self, topic: str) -> CloudIndex:
         """Return the index of a cloud topic."""
         return self._clouds.get(topic) or CloudIndex()
-
-
-def _stamp(payload: memoryview, encoding: str) -> int:
-    """Return the header stamp of a message [ns], 0 if the message is too short."""
-    try:
-        cursor = Cursor(payload, encoding)
-        if cursor.ros1:
-            cursor.u32()
-        return cursor.stamp()
-    except BadMessage:
-        return 0
 
 
 class ChunkStore:
@@ -226,7 +236,7 @@ class Recording:
     def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
         self.path, self.losses = path, list[Loss]()
         self.metadata: dict[str, dict[str, str]] = {}
-        self._limit, self._table = limit, MessageTable(sinks)
+        self._limit, self._table = limit, MessageTable(sinks, limit)
 
     def topics(self) -> list[TopicInfo]:
         """Return every topic that was declared, sorted by name."""
@@ -237,10 +247,14 @@ class Recording:
         return self._table.clouds(topic)
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """Return the payload of the cloud message with this index entry.
+        """Return the payload of the message with this index entry.
 
-        Raises BadMessage if it cannot be read.
+        Raises BadMessage if it cannot be read or decompressed.
         """
+        return unpacked(self._stored(topic, place), self._table.encoding(topic), self._limit)
+
+    def _stored(self, topic: str, place: int) -> bytes | memoryview:
+        """Return a message as it is stored. Raises BadMessage if it cannot be read."""
         index = self._table.clouds(topic)
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:  # the message is not inside a chunk
@@ -262,6 +276,7 @@ class MessageClouds:
     Attributes:
         kind: the format in words.
         topic: the cloud topic, None if there is none to read.
+        type: message type of the topic.
         log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header
             [ns], one per cloud.
     """
@@ -270,7 +285,9 @@ class MessageClouds:
         self.kind, self.topic, self._recording = recording.kind, topic, recording
         index = recording.clouds(topic or "")
         self._places = index.order()
-        self._encoding = next((t.encoding for t in recording.topics() if t.name == topic), "cdr")
+        self.type, self._encoding = next(
+            ((t.type, t.encoding) for t in recording.topics() if t.name == topic), ("", "cdr")
+        )
         self.log_ns = [index.log_ns[i] for i in self._places]
         self.publish_ns = [index.publish_ns[i] for i in self._places]
         self.header_ns = [index.header_ns[i] for i in self._places]
@@ -282,7 +299,15 @@ class MessageClouds:
 
     def load(self, place: int) -> RawCloud:
         """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
-        return raw_cloud(*self.payload(place))
+        return raw_message(self.type, *self.payload(place))
+
+    def layout(self, place: int) -> Layout | None:
+        """Return the layout of a message of points, None if the topic has other messages.
+
+        Raises BadMessage if it is malformed.
+        """
+        reader = LAYOUTS.get(self.type)
+        return None if reader is None else reader(*self.payload(place))
 
     def payload(self, place: int) -> tuple[bytes | memoryview, str]:
         """Return the serialised message and its encoding.

@@ -210,11 +210,17 @@ class McapFile(Recording):
     def _take_metadata(self, at: int, end: int) -> None:
         fields = self._content(at, end)
         name, values = fields.text(), fields.mapping()
-        if fields.at != len(fields.view):
+        if fields.at != len(fields.view) and not self._is_padded(at, end):
             raise BadMessage("a metadata record longer than its content")
         self.metadata.setdefault(name, values)
         if self._copy_to is not None:
             self._copy_to.metadata(name, values)
+
+    def _is_padded(self, at: int, end: int) -> bool:
+        """Return whether bytes after the content of a record are padding, which the format allows,
+        and not what a damaged length takes from the next records.
+        """
+        return begins_record(self._file, end) and self._swallowed(at, end) is None
 
     def _take_message(self, at: int, end: int) -> None:
         if end - at < 31:

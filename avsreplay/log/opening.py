@@ -5,14 +5,17 @@ ground truth and model.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from avsreplay.errors import AvsError, UnreadableInput, UsageError, counted
-from avsreplay.geometry import Pose
+from avsreplay.errors import AvsError, UnreadableInput, UsageError
+from avsreplay.files import refuse_pointer
+from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import ROS1_MAGIC, SQLITE_MAGIC, BadMessage, shown
+from avsreplay.log.camera import find_camera, stated_camera
+from avsreplay.log.depth_image import IMAGE_TYPES
+from avsreplay.log.depth_stream import DepthImages
 from avsreplay.log.header import (
     HEADER_RECORD,
     decode_header,
@@ -21,13 +24,14 @@ from avsreplay.log.header import (
     parse_surface,
     read_surface,
 )
-from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, MessageClouds, Recording, Sink
+from avsreplay.log.index import Merged, MessageClouds, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
-from avsreplay.log.options import Loss, SourceOptions, TopicInfo
+from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
-from avsreplay.log.scan_files import by_number, scan_files
+from avsreplay.log.scan_files import DEPTH_FORMAT, by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
+from avsreplay.log.topics import chosen_topic, optional_topic
 from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface
 
@@ -58,6 +62,8 @@ def open_source(
             frame does not exist, or the values of the clouds do not tell what they mean.
     """
     path, options = Path(path), options or SourceOptions()
+    if path.name == BAG_METADATA and path.is_file():  # of a bag, whose folder is meant
+        path = path.parent
     try:
         source = _opened(path, options, inspect, upto)
     except OSError as error:
@@ -122,9 +128,9 @@ def _messages(
         topics = recording.topics()
         collector.check(topics, shown(path), stated)
         topic = (
-            _optional_topic(recording, options, path)
+            optional_topic(recording, options, path)
             if inspect
-            else _cloud_topic(recording, options, path)
+            else chosen_topic(recording, options, path)
         )
         header, lost = _header(recording, options)
         if header.fixed_frame and options.fixed_frame is None and options.sensor_topic is None:
@@ -133,13 +139,16 @@ def _messages(
             fixed = header.fixed_frame
             return _messages(path, replace(options, fixed_frame=fixed), inspect, upto, fixed)
         ground_truth = collector.ground_truth()
+        if collector.damaged:
+            left = f"{collector.damaged} left out: not finite, without a unit quaternion, or cut"
+            header = replace(header, notes={**header.notes, "poses or transforms": left})
         if options.poses:
             clouds: MessageClouds = streams.PoseMessages(recording, topic)
             header = _pose_header(header, options)
             if topic == (options.truth_topic or TRUTH_TOPIC):  # a measurement is not its own truth
                 ground_truth = replace(ground_truth, truth=None, track=None)
         else:
-            clouds = MessageClouds(recording, topic)
+            clouds = _clouds(recording, topic, options)
     except BaseException:
         recording.close()
         raise
@@ -150,60 +159,13 @@ def _messages(
     )
 
 
-def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
-    chosen = [t for t in topics if not types or t.type in types]
-    return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in chosen[:12]) + (
-        ", ..." if len(chosen) > 12 else ""
-    )
-
-
-def _optional_topic(recording: Recording, options: SourceOptions, path: Path) -> str | None:
-    clouds = [t for t in recording.topics() if t.type in _kinds(options) and t.count]
-    return (
-        _cloud_topic(recording, options, path)
-        if options.topic is not None or len(clouds) == 1
-        else None
-    )
-
-
-def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> str:
-    wanted, topics = options.topic, recording.topics()
-    what = "pose" if options.poses else "PointCloud2"
-    clouds = [t for t in topics if t.type in _kinds(options) and (t.count or t.name == wanted)]
-    if wanted is not None and not any(t.name == wanted for t in clouds):
-        hint = f"topics here: {_named(topics) or 'none'}"
-        raise UsageError(f"no {what} topic '{shown(wanted)}'", where=shown(path), hint=hint)
-    if not clouds:
-        raise _no_clouds(recording, path, what)
-    if wanted is None and len(clouds) > 1:
-        raise UsageError(
-            f"{len(clouds)} {what} topics",
-            where=shown(path),
-            hint=f"choose a --topic: {_named(clouds)}",
-        )
-    chosen = next(t for t in clouds if wanted in (None, t.name))
-    if chosen.encoding not in ("cdr", "ros1"):
-        what = f"topic '{shown(chosen.name)}' has the unknown encoding '{shown(chosen.encoding)}'"
-        raise UnreadableInput(what, where=shown(path), hint="cdr and ros1 are read")
-    return chosen.name
-
-
-def _kinds(options: SourceOptions) -> tuple[str, ...]:
-    """The types of the messages that are measurements."""
-    return POSE_NAMES if options.poses else CLOUD_TYPES
-
-
-def _no_clouds(recording: Recording, path: Path, what: str) -> UnreadableInput:
-    topics, advice = recording.topics(), ""
-    if what == "PointCloud2" and any(t.type in POSE_NAMES and t.count for t in topics):
-        advice = "to use its poses as the measurement add --backend poses; "
-    elif what == "PointCloud2" and any("packet" in t.type.lower() for t in topics):
-        advice = "these are raw sensor packets: convert them with the sensor's own driver first; "
-    elif recording.losses:
-        parts = counted(len(recording.losses), "part")
-        advice = f"{parts} of it could not be read, 'avsreplay doctor' lists them; "
-    hint = f"{advice}topics here: {_named(topics) or 'none'}"
-    return UnreadableInput(f"no {what} topic with a message", where=shown(path), hint=hint)
+def _clouds(recording: Recording, topic: str | None, options: SourceOptions) -> MessageClouds:
+    """Return the clouds or depth images of a topic."""
+    kind = next((t.type for t in recording.topics() if t.name == topic), "")
+    if topic is None or kind not in IMAGE_TYPES:
+        return MessageClouds(recording, topic)
+    stated = None if options.intrinsics is None else stated_camera(options.intrinsics)
+    return DepthImages(recording, topic, options.max_message_mib << 20, stated)
 
 
 def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tuple[Loss, ...]]:
@@ -243,10 +205,13 @@ def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
     )
 
 
+_HEAD_BYTES = 64
+
+
 def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(16)
+            return file.read(_HEAD_BYTES)
     except OSError as error:
         raise UnreadableInput(
             error.strerror or "cannot be read", where=shown(path), hint="check the path"
@@ -287,7 +252,7 @@ def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
             )
 
 
-_STORAGE = (".mcap", ".db3")
+_STORAGE, BAG_METADATA = (".mcap", ".db3"), "metadata.yaml"
 _LISTED = re.compile(
     r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
 )
@@ -310,11 +275,12 @@ def _open_recording(
 
 def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
     head = _head(path)
+    refuse_pointer(head, shown(path))
     if head.startswith(ROS1_MAGIC):
         from avsreplay.log.ros1_bag import Ros1Bag
 
         return Ros1Bag(path, limit, sinks)
-    if head == SQLITE_MAGIC:
+    if head.startswith(SQLITE_MAGIC):
         from avsreplay.log.db3_file import Db3File
 
         return Db3File(path, limit, sinks)
@@ -332,6 +298,7 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = Non
         ".bin",
         ".npy",
         ".npz",
+        DEPTH_FORMAT,
     ):
         raise UnreadableInput(
             "a single scan, not a log", where=shown(path), hint="give the folder it is in"
@@ -366,7 +333,7 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     there = sorted(
         (p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name)
     )
-    metadata = path / "metadata.yaml"
+    metadata = path / BAG_METADATA
     if not metadata.is_file():
         return there, []
     text = metadata.read_bytes()[: 4 << 20].decode("utf-8", "backslashreplace")
@@ -405,7 +372,14 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
     files = scan_files(path, tuple(by_name), options.model)
     times = _times(path, files, found)
-    clouds = streams.FolderClouds(files, options.scan_rate_hz, options.max_message_mib << 20, times)
+    depths = files[0].suffix.lower() == DEPTH_FORMAT
+    clouds = streams.FolderClouds(
+        files,
+        options.scan_rate_hz,
+        options.max_message_mib << 20,
+        times,
+        find_camera(path, options.intrinsics) if depths else None,
+    )
     surface = _model(options)
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [
@@ -462,7 +436,7 @@ def _ground_truth(
     options: SourceOptions,
 ) -> streams.GroundTruth:
     if found is None and by_name:
-        named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
+        named = [(t, MeasuredPose(by_name[f.name])) for t, f in zip(times, files, strict=True)]
         found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
     if found is None:
         return streams.GroundTruth()

@@ -183,6 +183,12 @@ class SourceOptions(Settings):
         None,
         "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame.",
     )
+    intrinsics: str | None = setting(
+        None,
+        "Camera of depth images: FX,FY,CX,CY [pixel], or a file with the matrix, the YAML of a ROS"
+        " calibration or the JSON of Open3D.",
+        unset="the CameraInfo of the log, or a file of intrinsics in the folder or above it",
+    )
     rate_hz: float | None = setting(
         None,
         "Rate of scans or poses whose files hold no times; 1 Hz is assumed if it is not given.",

@@ -66,7 +66,11 @@ def raw_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> RawCloud:
     Raises:
         BadMessage: the message is malformed, or has no coordinates; the text states why.
     """
-    layout = read_layout(payload, encoding)
+    return of_layout(read_layout(payload, encoding))
+
+
+def of_layout(layout: Layout) -> RawCloud:
+    """Return the cloud of a checked layout. Raises BadMessage if it has no coordinates."""
     if 0 in layout.shape:
         none = np.zeros(0, np.float32)
         fields = {name: none for name in (*"xyz", *(f.name for f in layout.fields))}
@@ -96,7 +100,7 @@ def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
         row_step = width * point_step
     layout = Layout(stamp_ns, frame, (height, width), fields, order, point_step, row_step, data)
     if height and width:
-        _check(layout)
+        check_layout(layout)
     return layout
 
 
@@ -113,7 +117,8 @@ def _fields(cursor: Cursor) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _check(layout: Layout) -> None:
+def check_layout(layout: Layout) -> None:
+    """Raise BadMessage if a layout with points contradicts itself or its data."""
     height, width = layout.shape
     if layout.row_step < width * layout.point_step:
         raise BadMessage(

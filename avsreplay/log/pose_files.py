@@ -28,36 +28,6 @@ _MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
 _MAX_METRES = 1e9
 
 
-@value_class(eq=True)
-class TimedPoses:
-    """Poses in file order, with their times [ns] if the format has times."""
-
-    poses: tuple[Pose, ...]
-    t_ns: tuple[int, ...] | None
-
-
-def read_poses(path: Path) -> TimedPoses:
-    """Read a pose file; the columns of a line determine its format.
-
-    Raises UnreadableInput with file and line.
-    """
-    poses, times = list[Pose](), list[int]()
-    for where, words, commas in _lines(path):
-        t_ns, pose = _line(words, commas, where)
-        poses.append(pose)
-        if t_ns is not None:
-            times.append(t_ns)
-    if not poses:
-        raise UnreadableInput(
-            "no pose in this file", where=shown(path), hint="give TUM, KITTI or EuRoC poses"
-        )
-    if times and len(times) != len(poses):
-        raise UnreadableInput(
-            "some lines have a time and others do not", where=shown(path), hint="check the file"
-        )
-    return TimedPoses(tuple(poses), tuple(times) or None)
-
-
 def read_times(path: Path) -> list[int]:
     """Read a file with one time [s] per line; return [ns].
 
@@ -100,9 +70,9 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     """Yield (file and line, words, whether "," or ";" separates them) of each line that is not
     empty or a comment.
     """
-    text = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True).decode(
-        "utf-8", "backslashreplace"
-    )
+    raw = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True)
+    code = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    text = raw.decode(code, "backslashreplace")
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
@@ -111,33 +81,6 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
             if mark == ";":  # the comma is then the decimal point
                 words = [word.replace(",", ".") for word in words]
             yield f"{shown(path)}:{number}", words, mark in (";", ",")
-
-
-def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]:
-    try:
-        if commas:  # EuRoC: nanoseconds, scalar first
-            values = [float(w) for w in words[1:8]]
-            return _whole_ns(words[0]), _pose(values[:3], [*values[4:7], values[3]])
-        if len(words) == 12:
-            return None, _from_rows([float(w) for w in words])
-        t_ns, values = seconds_to_ns(words[0]), [float(w) for w in words[1:8]]
-        if t_ns is None or len(words) != 8:
-            raise ValueError
-        return t_ns, _pose(values[:3], values[3:])
-    except (ValueError, IndexError, OverflowError):
-        hint = "TUM: t tx ty tz qx qy qz qw; KITTI: twelve numbers; EuRoC: t[ns],x,y,z,qw,qx,qy,qz"
-        raise UnreadableInput("not a pose line", where=where, hint=hint) from None
-
-
-def _pose(t: list[float], q: list[float]) -> Pose:
-    if (
-        len(t) != 3
-        or len(q) != 4
-        or not all(abs(v) < _MAX_METRES for v in (*t, *q))
-        or not 0.5 < math.hypot(*q) < 2.0
-    ):
-        raise ValueError
-    return Pose(np.array(q), np.array(t))
 
 
 def _from_rows(values: list[float]) -> Pose:
@@ -188,8 +131,8 @@ def _bmesh_pose(words: list[str], where: str) -> Pose:
 
 
 @value_class(eq=True)
-class MeasuredFile:
-    """The measured poses of a file, in its order.
+class TimedPoses:
+    """The poses of a file, in its order.
 
     Attributes:
         poses: the pose of each line, or the text that says why it has none.
@@ -215,8 +158,8 @@ _FORMATS = (
 )
 
 
-def read_measured(path: Path) -> MeasuredFile:
-    """Read a file of measured poses: TUM, KITTI, EuRoC, or CSV whose first line names the columns.
+def read_poses(path: Path) -> TimedPoses:
+    """Read a file of poses: TUM, KITTI, EuRoC, or CSV whose first line names the columns.
 
     A pose with a missing or invalid value stays in its place with the reason, because trackers
     write such lines while they see too few markers.
@@ -248,7 +191,7 @@ def read_measured(path: Path) -> MeasuredFile:
         raise UnreadableInput(
             "some lines have a time and others do not", where=shown(path), hint="check the file"
         )
-    return MeasuredFile(tuple(poses), tuple(times) or None)
+    return TimedPoses(tuple(poses), tuple(times) or None)
 
 
 @value_class(eq=True)
@@ -310,7 +253,10 @@ def _measured_line(
             x, y, z, qw, *q = (_number(w) for w in words[1:8])
             return _whole_ns(words[0]), _checked([x, y, z, *q, qw])
         if len(words) == 12:
-            return None, MeasuredPose(_from_rows([float(w) for w in words]))
+            numbers = [_number(w) for w in words]
+            if not all(map(math.isfinite, numbers)):
+                return None, "a pose that is not finite"
+            return None, MeasuredPose(_from_rows(numbers))
         t_ns = seconds_to_ns(words[0])
         if t_ns is None or len(words) != 8:
             raise ValueError

@@ -289,12 +289,15 @@ class TfBuffer:
             if kind not in _TF_TYPES:
                 return
             try:
-                found = [checked(t) for t in read_transforms(payload, encoding)]
+                found = read_transforms(payload, encoding)
             except BadMessage:
                 self.damaged += 1
                 return
             for transform in found:
-                self._add(transform, log_ns, static)
+                try:
+                    self._add(checked(transform), log_ns, static)
+                except BadMessage:  # the other transforms of the message are valid
+                    self.damaged += 1
 
         return take
 
@@ -310,6 +313,24 @@ class TfBuffer:
     def frames(self) -> list[str]:
         """Return the names of all frames."""
         return sorted({*self._parents, *self._parents.values()})
+
+    def connected(self, one: str, two: str) -> bool:
+        """Return whether two frames are in one tree, at whatever time."""
+        return self._root(one) == self._root(two)
+
+    def moving_beside(self, frame: str) -> list[str]:
+        """Return the frames of the tree of a frame that move and are not above it, sorted."""
+        above, at = {frame.lstrip("/")}, frame.lstrip("/")
+        while at in self._parents and len(above) <= len(self._parents):
+            at = self._parents[at]
+            above.add(at)
+        return sorted(n for n in self._moving if n not in above and self.connected(n, frame))
+
+    def _root(self, frame: str) -> str:
+        frame, steps = frame.lstrip("/"), 0
+        while frame in self._parents and steps <= len(self._parents):
+            frame, steps = self._parents[frame], steps + 1
+        return frame
 
     def moving_in(self, frame: str) -> str | None:
         """Return the root of the tree above a frame if the frame moves in it, else None."""

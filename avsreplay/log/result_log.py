@@ -25,6 +25,7 @@ from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
+RUN_RECORD = "avsreplay-run"  # not the record with which a log can be replayed
 CHUNK_BYTES = 1 << 20
 ROWS, ROW_TYPE = "/rows", "avsreplay/msg/Row"
 _TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
@@ -122,7 +123,7 @@ class ResultLog:
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
-            self._writer.add_metadata("avsreplay", dict(metadata))
+            self._writer.add_metadata(RUN_RECORD, dict(metadata))
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}

@@ -114,6 +114,7 @@ _READERS: dict[str, Callable[[bytes, ReadBudget], NDArray[Any]]] = {
     ".laz": _las,
 }
 SCAN_FORMATS = tuple(_READERS)
+DEPTH_FORMAT = ".png"  # a folder of depth images, where it has no other scans
 LOG_FORMATS, LISTED = (".mcap", ".bag", ".db3"), 3
 
 
@@ -142,18 +143,23 @@ def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = Non
                 hint=hint,
             )
         return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
-    found = [p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in SCAN_FORMATS]
+    files = [p for p in folder.iterdir() if p.is_file()]
+    found = [p for p in files if p.suffix.lower() in SCAN_FORMATS] or [
+        p for p in files if p.suffix.lower() == DEPTH_FORMAT
+    ]
     if model is not None and model.exists():
         found = [p for p in found if not p.samefile(model)]
     if not found:
         logs = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in LOG_FORMATS)
-        hint = f"scans are {', '.join(SCAN_FORMATS)} files; a log is an MCAP or a ROS bag"
+        kinds = f"{', '.join(SCAN_FORMATS)} or depth {DEPTH_FORMAT} files"
+        hint = f"scans are {kinds}; a log is an MCAP or a ROS bag"
         if logs:
             more = ", ..." if len(logs) > LISTED else ""
             hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
         raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
-    counts = {s: sum(p.suffix.lower() == s for p in found) for s in SCAN_FORMATS}
-    common = max(SCAN_FORMATS, key=lambda s: counts[s])
+    formats = (*SCAN_FORMATS, DEPTH_FORMAT)
+    counts = {s: sum(p.suffix.lower() == s for p in found) for s in formats}
+    common = max(formats, key=lambda s: counts[s])
     return sorted((p for p in found if p.suffix.lower() == common), key=lambda p: by_number(p.name))
 
 

@@ -39,6 +39,7 @@ from avsreplay.log.options import (
     SourceOptions,
     lost_text,
 )
+from avsreplay.log.point_cloud2 import Layout
 from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
@@ -268,6 +269,9 @@ class Source:
         transforms = any(
             topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics()
         )
+        if self._apart(at, clouds):
+            text = f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'"
+            return f"{text}, and no transform of the log connects them", ""
         if at in ("", clouds) or not clouds or not (at in frames if frames else transforms):
             return None
         return (
@@ -283,6 +287,21 @@ class Source:
         """
         return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
 
+    def moving_beside(self, frame: str) -> list[str]:
+        """Return the frames of /tf that move and do not carry a frame.
+
+        Args:
+            frame: name of the frame of a cloud.
+        """
+        return self._ground_truth.moving_beside(frame)
+
+    def _apart(self, one: str, two: str) -> bool:
+        """Whether two named frames are in no common tree of transforms."""
+        known = self._ground_truth.frames
+        return bool(
+            one and two and one != two and one in known
+        ) and not self._ground_truth.connected(one, two)
+
     def moving_in(self, frame: str) -> str | None:
         """Return the root frame in which a frame moves; None if it is fixed or the transforms were
         not collected.
@@ -292,11 +311,11 @@ class Source:
         """
         return self._ground_truth.moving_in(frame)
 
-    def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
-        """Yield the serialised cloud messages with their encoding; none for a folder."""
+    def layouts(self) -> Iterator[Layout]:
+        """Yield the layouts of the messages of clouds; none for depth images, poses and files."""
         for at in self._selected:
             try:
-                found = self._clouds.payload(at)
+                found = self._clouds.layout(at)
             except BadMessage:
                 continue
             if found is not None:
@@ -428,6 +447,9 @@ class Source:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""
         lookup = self._ground_truth.sensor
         pose = Pose.identity() if lookup is None else lookup(t_ns, frame)
+        if pose is None and self._apart((self.options.fixed_frame or "").lstrip("/"), frame):
+            fixed = self.options.fixed_frame
+            raise BadMessage(f"no transform connects '{shown(frame)}' to '{shown(fixed)}'")
         if pose is None:
             raise BadMessage(UNKNOWN_SENSOR)
         return pose

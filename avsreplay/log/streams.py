@@ -15,12 +15,14 @@ from typing import TypeVar
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array, MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.camera import Camera
+from avsreplay.log.depth_image import DepthImage, depth_cloud, read_png
 from avsreplay.log.header import with_vertices
-from avsreplay.log.index import MessageClouds, Recording, Sink
+from avsreplay.log.index import MessageClouds, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
-from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
+from avsreplay.log.pose_files import TimedPoses, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
 from avsreplay.log.raw_cloud import RawCloud, of_points
 from avsreplay.log.scan_files import read_points
@@ -36,14 +38,7 @@ EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero
 class PoseMessages(MessageClouds):
     """The measured poses of one topic; same interface as MessageClouds, with poses in place of
     points.
-
-    Attributes:
-        type: message type of the topic.
     """
-
-    def __init__(self, recording: Recording, topic: str | None) -> None:
-        super().__init__(recording, topic)
-        self.type = next((t.type for t in recording.topics() if t.name == topic), "")
 
     def load(self, place: int) -> RawCloud:
         """Return the decoded pose. Raises BadMessage if it cannot be decoded or is not valid."""
@@ -57,7 +52,7 @@ class _Files:
     topic: str | None = None
     losses: Sequence[Loss] = ()
 
-    def payload(self, place: int) -> None:
+    def layout(self, place: int) -> None:
         """Return None: files hold no messages."""
 
     def topics(self) -> list[TopicInfo]:
@@ -79,7 +74,7 @@ class PoseFile(_Files):
     kind = "pose file"
 
     def __init__(self, path: Path, rate_hz: float) -> None:
-        found = read_measured(path)
+        found = read_poses(path)
         self._poses = found.poses
         self.timed = found.t_ns is not None
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
@@ -103,14 +98,20 @@ class FolderClouds(_Files):
         rate_hz: scans per second, used if ``times_ns`` is not given.
         limit: largest file that is read [bytes].
         times_ns: time of each file [ns].
+        camera: of the files, if they are depth images.
     """
 
     kind = "folder"
 
     def __init__(
-        self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None
+        self,
+        files: list[Path],
+        rate_hz: float,
+        limit: int,
+        times_ns: list[int] | None = None,
+        camera: Camera | None = None,
     ) -> None:
-        self._files, self._limit = files, limit
+        self._files, self._limit, self._camera = files, limit, camera
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
 
@@ -121,6 +122,9 @@ class FolderClouds(_Files):
             size = path.stat().st_size
             if size > self._limit:
                 raise BadFile(f"{size} bytes are over the limit of {self._limit}")
+            if self._camera is not None:
+                values = read_png(path.read_bytes(), self._limit)
+                return depth_cloud(DepthImage(self.header_ns[place], "", values), self._camera)
             points = read_points(path, self._limit)
         except OSError as error:
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None
@@ -198,8 +202,9 @@ class GroundTruth:
     """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is
     a single track.
 
-    Where the transforms were collected, ``moving_in`` gives the root in which a frame moves, and
-    ``frames`` all names.
+    Where the transforms were collected, ``moving_in`` gives the root in which a frame moves,
+    ``moving_beside`` the frames that move and do not carry it, ``connected`` whether two are in one
+    tree, and ``frames`` all names.
     """
 
     truth: TruthLookup | None = None
@@ -207,6 +212,8 @@ class GroundTruth:
     body: PoseTrack | None = None
     sensor: Callable[[int, str], Pose | None] | None = None
     moving_in: Callable[[str], str | None] = lambda _frame: None
+    moving_beside: Callable[[str], list[str]] = lambda _frame: []
+    connected: Callable[[str, str], bool] = lambda _one, _two: True
     frames: Sequence[str] = ()
 
 
@@ -270,7 +277,7 @@ class TruthCollector:
             out[self.options.sensor_topic] = _poses_only(self._sensor)
         if self._wants_tf or transforms:
             out.update(
-                {"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)}
+                {"*/tf": self._tf.sink(static=False), "*/tf_static": self._tf.sink(static=True)}
             )
         return out
 
@@ -304,8 +311,20 @@ class TruthCollector:
         truth, track = self._truth_lookup()
         body = self._body if len(self._body) else None
         return GroundTruth(
-            truth, track, body, self._sensor_lookup(), self._tf.moving_in, self._tf.frames()
+            truth,
+            track,
+            body,
+            self._sensor_lookup(),
+            self._tf.moving_in,
+            self._tf.moving_beside,
+            self._tf.connected,
+            self._tf.frames(),
         )
+
+    @property
+    def damaged(self) -> int:
+        """Return the number of poses and transforms that could not be used."""
+        return sum(each.damaged for each in (self._truth, self._body, self._sensor, self._tf))
 
     @property
     def _wants_tf(self) -> bool:
@@ -333,11 +352,12 @@ def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack 
     line without a track.
     """
     if found.t_ns is None:
-        poses = found.poses
+        poses = [pose.T_ac if isinstance(pose, MeasuredPose) else None for pose in found.poses]
         return (lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None), None
     track = PoseTrack(gap_s)
     for t_ns, pose in zip(found.t_ns, found.poses, strict=True):
-        track.add(t_ns, (*pose.t.tolist(), *pose.q.tolist()))
+        if isinstance(pose, MeasuredPose):  # not a line that a tracker wrote without a pose
+            track.add(t_ns, (*pose.T_ac.t.tolist(), *pose.T_ac.q.tolist()))
     return track.at_scan, track
 
 

@@ -9,11 +9,13 @@ first healthy scan is thus accepted.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.records import (
     Alignment,
     AlignStatus,
@@ -23,7 +25,7 @@ from avsreplay.records import (
     ScanStatus,
     Verdict,
 )
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, given, setting
 
 
 class Policy(Enum):
@@ -109,6 +111,145 @@ def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: fl
     return max(alpha_max_m, sigmas * predicted)
 
 
+@value_class
+class ScanEvidence:
+    """What the rules see of one scan.
+
+    Attributes:
+        status: of the reader.
+        alignment: the graded pose; None without one.
+        seen: its innovation; None where nothing was measured.
+        prior: the prediction at the scan.
+        limits: of the run, with all lengths filled in.
+    """
+
+    status: ScanStatus
+    alignment: Alignment | None
+    seen: Innovation | None
+    prior: Belief
+    limits: FaultParams
+
+    @property
+    def poor_fit(self) -> bool:
+        """Whether the rms residual reaches its limit."""
+        return self.alignment is None or not self.alignment.rms_m < given(self.limits.rms_max_m)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the weighted innovation reaches its limit."""
+        p, length = self.limits, given(self.limits.length_m)
+        return self.seen is not None and weighted_norm(self.seen, length) >= pose_limit(
+            self.seen, given(p.alpha_max_m), length, p.sigmas
+        )
+
+
+@value_class
+class Rule:
+    """One row of the table: a scan that fails the test is not used, for this reason.
+
+    Attributes:
+        reason: value of the column ``reason``.
+        words: what the test finds, for people.
+        fails: the test.
+        policies: under which the row applies.
+        fitted: the row applies to poses of a registration only, not to poses that the log contains.
+    """
+
+    reason: Reason
+    words: str
+    fails: Callable[[ScanEvidence], bool]
+    policies: tuple[Policy, ...] = (Policy.ANY, Policy.ALL)
+    fitted: bool = False
+
+
+def _no_scan(scan: ScanEvidence) -> bool:
+    lost = scan.status in (ScanStatus.EMPTY, ScanStatus.DAMAGED)
+    return lost or (scan.alignment is not None and scan.alignment.status is AlignStatus.NO_POINTS)
+
+
+def _not_aligned(scan: ScanEvidence) -> bool:
+    found = scan.alignment
+    if found is None or not found.measured or found.status is AlignStatus.AMBIGUOUS:
+        return True
+    return (
+        scan.seen is None
+        or not np.isfinite(scan.seen.nis)
+        or not bool(np.all(np.isfinite(scan.prior.P)))
+    )
+
+
+def _not_converged(scan: ScanEvidence) -> bool:
+    found = scan.alignment
+    return found is None or not found.converged or found.status is AlignStatus.NOT_CONVERGED
+
+
+def _few_inliers(scan: ScanEvidence) -> bool:
+    p, found = scan.limits, scan.alignment
+    return found is None or found.inliers < p.min_inliers or found.inlier_ratio < p.min_inlier_ratio
+
+
+def _halves_differ(scan: ScanEvidence) -> bool:
+    found = scan.alignment
+    return found is not None and (found.split_nis or 0.0) > scan.limits.split_nis_max
+
+
+def _as_printed(scan: ScanEvidence) -> bool:
+    return scan.poor_fit and scan.jumps
+
+
+def _jumps(scan: ScanEvidence) -> bool:
+    return scan.jumps
+
+
+RULES = (
+    Rule(Reason.NO_SCAN, "the scan has no point, or its message is damaged", _no_scan),
+    Rule(Reason.NOT_ALIGNED, "the registration failed or is ambiguous", _not_aligned),
+    Rule(
+        Reason.FIT_ERROR,
+        "the rms residual and the innovation reach their limits (the rule of the paper)",
+        _as_printed,
+        (Policy.ALL,),
+        fitted=True,
+    ),
+    Rule(
+        Reason.NOT_CONVERGED,
+        "the registration did not converge",
+        _not_converged,
+        (Policy.ANY,),
+        fitted=True,
+    ),
+    Rule(
+        Reason.FEW_INLIERS,
+        "too few points are on the model",
+        _few_inliers,
+        (Policy.ANY,),
+        fitted=True,
+    ),
+    Rule(
+        Reason.FIT_ERROR,
+        "the rms residual reaches its limit",
+        lambda scan: scan.poor_fit,
+        (Policy.ANY,),
+        fitted=True,
+    ),
+    Rule(
+        Reason.HALVES_DIFFER,
+        "the poses from two halves of the scan differ",
+        _halves_differ,
+        (Policy.ANY,),
+        fitted=True,
+    ),
+    Rule(Reason.POSE_JUMP, "the innovation reaches its limit", _jumps, (Policy.ANY,)),
+    Rule(
+        Reason.CLOCK,
+        "the time stamp steps back or jumps",
+        lambda scan: scan.status is ScanStatus.CLOCK,
+    ),
+)
+"""The rules in their order; the first that holds gives the reason. A pose that the log contains has
+no fit, so that its innovation decides under both policies."""
+
+
 class FaultDetector:
     """Decides on one scan at a time, without state.
 
@@ -119,10 +260,6 @@ class FaultDetector:
 
     def __init__(self, params: FaultParams, extent_m: float) -> None:
         self.params = params.resolved(extent_m)
-        p = self.params
-        self._rms, self._alpha, self._length = (
-            float(v or 0.0) for v in (p.rms_max_m, p.alpha_max_m, p.length_m)
-        )
 
     def judge(
         self,
@@ -131,53 +268,18 @@ class FaultDetector:
         innovation: Innovation | None,
         prior: Belief,
     ) -> Verdict:
-        """Gamma and the first reason that holds, in ``Reason``'s order."""
-        reason = self._unusable(scan_status, alignment, innovation, prior)
-        if reason is None and alignment is not None and innovation is not None:
-            reason = self._doubtful(alignment, innovation)
-        if reason is None and scan_status is ScanStatus.CLOCK:
-            reason = Reason.CLOCK
-        return Verdict(1, Reason.OK) if reason is None else Verdict(0, reason)
+        """Return gamma and the reason of the first rule that holds.
 
-    def _unusable(
-        self,
-        status: ScanStatus,
-        alignment: Alignment | None,
-        seen: Innovation | None,
-        prior: Belief,
-    ) -> Reason | None:
-        """Return why the scan has no pose that can be tested, whatever the policy; None if it
-        has one.
+        Args:
+            scan_status: of the reader.
+            alignment: the graded pose; None without one.
+            innovation: of it; None where nothing was measured.
+            prior: the prediction at the scan.
         """
-        if status in (ScanStatus.EMPTY, ScanStatus.DAMAGED) or (
-            alignment and alignment.status is AlignStatus.NO_POINTS
-        ):
-            return Reason.NO_SCAN
-        lost = (
-            alignment is None or not alignment.measured or alignment.status is AlignStatus.AMBIGUOUS
-        )
-        if lost or seen is None or not np.isfinite(seen.nis):
-            return Reason.NOT_ALIGNED
-        return None if np.all(np.isfinite(prior.P)) else Reason.NOT_ALIGNED
-
-    def _doubtful(self, alignment: Alignment, seen: Innovation) -> Reason | None:
-        p = self.params
-        poor_fit = not alignment.rms_m < self._rms
-        jump = weighted_norm(seen, self._length) >= pose_limit(
-            seen, self._alpha, self._length, p.sigmas
-        )
-        if (
-            alignment.status is AlignStatus.MEASURED
-        ):  # nothing was fitted: the pose test alone decides
-            return Reason.POSE_JUMP if jump else None
-        if p.policy is Policy.ALL:
-            return Reason.FIT_ERROR if poor_fit and jump else None
-        if not alignment.converged or alignment.status is AlignStatus.NOT_CONVERGED:
-            return Reason.NOT_CONVERGED
-        if alignment.inliers < p.min_inliers or alignment.inlier_ratio < p.min_inlier_ratio:
-            return Reason.FEW_INLIERS
-        if poor_fit:
-            return Reason.FIT_ERROR
-        if (alignment.split_nis or 0.0) > p.split_nis_max:
-            return Reason.HALVES_DIFFER
-        return Reason.POSE_JUMP if jump else None
+        scan = ScanEvidence(scan_status, alignment, innovation, prior, self.params)
+        fitted = alignment is None or alignment.status is not AlignStatus.MEASURED
+        policy = self.params.policy if fitted else Policy.ANY
+        for rule in RULES:
+            if policy in rule.policies and (fitted or not rule.fitted) and rule.fails(scan):
+                return Verdict(0, rule.reason)
+        return Verdict(1, Reason.OK)

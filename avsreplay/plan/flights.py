@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import value_class
@@ -19,6 +20,7 @@ from avsreplay.geometry import Array
 from avsreplay.plan import _cone
 from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn, without_turn
 from avsreplay.plan.constrained import constrained
+from avsreplay.plan.contact import Contact
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import (
     CONSTRAINTS,
@@ -46,9 +48,9 @@ from avsreplay.plan.uncertainty import (
     Tolerance,
     draws,
     spread,
-    touches,
-    wilson,
 )
+
+PATH_INSTANTS = 10  # instants between two scans at which contact is checked
 
 __all__ = [
     "CONSTRAINTS",
@@ -57,9 +59,9 @@ __all__ = [
     "CostatePath",
     "Decision",
     "Disturbance",
+    "Ended",
     "Execution",
     "Facts",
-    "Flights",
     "Guidance",
     "GuidanceState",
     "Limits",
@@ -285,39 +287,32 @@ def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     return at
 
 
-@value_class(eq=True)
-class Flights:
-    """Results of whole flights with replanning.
+@value_class
+class Ended:
+    """End of one simulated approach.
 
     Attributes:
-        count: Number of flights.
-        captured, outside: Number of captures inside and outside the tolerance.
-        aborted: Number of flights that ended in an abort.
-        touched: Number of flights in which the end-effector touched the body outside the corridor.
+        action, rule: last decision of the supervisor.
+        at_s: instant at which the gripper closed, else that of the last decision.
+        miss: errors when the gripper closed; None where it did not.
+        touched: whether the end-effector touched the body outside the grasp.
     """
 
-    count: int
-    captured: int
-    outside: int
-    aborted: int
-    touched: int
+    action: Action
+    rule: str
+    at_s: float
+    miss: Miss | None
+    touched: bool
 
-    def share(self, name: str) -> tuple[float, float, float]:
-        """Return a fraction of the flights and its Wilson 95 % interval.
+    def outcome(self, tolerance: Tolerance) -> str:
+        """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action.
 
         Args:
-            name: Name of one of the numbers.
+            tolerance: Largest errors of a capture.
         """
-        number = int(getattr(self, name))
-        return (number / self.count, *wilson(number, self.count))
-
-    def described(self) -> list[tuple[str, str]]:
-        """Return the figures as a name and a text."""
-        parts = []
-        for name in ("captured", "outside", "aborted", "touched"):
-            share, low, high = self.share(name)
-            parts.append(f"{name} {share:.3f} (95 % {low:.3f} to {high:.3f})")
-        return [(f"{self.count} whole flights", "; ".join(parts))]
+        if self.miss is None:
+            return self.action.value
+        return "captured" if self.miss.inside(tolerance) else "outside"
 
 
 def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
@@ -363,11 +358,11 @@ def closed_loop(
     inputs: Iterable[PlannerInput],
     target: Scene,
     start_ns: int,
-    tolerance: Tolerance,
     noise_mps2: float = 0.0,
     rng: np.random.Generator | None = None,
-    body: Limits | None = None,
-) -> tuple[str, bool]:
+    contact: Contact | None = None,
+    state: GuidanceState | None = None,
+) -> Ended:
     """Fly one approach with replanning, errors of the thrust and the delay of the planner.
 
     Args:
@@ -375,29 +370,23 @@ def closed_loop(
         inputs: What is known after each scan, in the order of the scans.
         target: The true target.
         start_ns: Instant from which its times count.
-        tolerance: Largest errors of a capture.
         noise_mps2: 1 sigma of the acceleration error of each axis, as its mean over 1 s [m/s2]; it
             is constant between two scans and independent from one interval to the next.
         rng: Random generator of these errors; needed where they are not zero.
-        body: Limits whose clearance is the radius of the end-effector; None: contact is not
-            checked.
-
-    Returns:
-        ``captured``, ``outside`` or the last action, and whether the end-effector touched the body.
+        contact: Contact with the body; None: it is not checked.
+        state: State of the robot before the first scan; None: at its configured start.
 
     Raises:
         ValueError: There is no scan.
     """
-    state: GuidanceState | None = None
     aimed: Array | None = None
-    last_ns, touched = start_ns, False
+    last_ns, flown, known = start_ns, list[Array](), None
     for known in inputs:
         if state is None:
             state, last_ns = guidance.initial(known.t_ns), known.t_ns
         span = (known.t_ns - last_ns) * 1e-9
-        touched |= body is not None and _touched(
-            target, body, state.segment, start_ns, last_ns, known.t_ns
-        )
+        if contact is not None:
+            flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
         if rng is not None:
             state = replace(
                 state, segment=with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
@@ -411,27 +400,54 @@ def closed_loop(
             aimed = known.scene.attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
         if state.captured_ns is not None or state.decision.action is Action.ABORT:
             break
-    if state is None:
+    if state is None or known is None:
         raise ValueError("there is no scan")
+    y = np.concatenate([np.zeros((0, 3)), *flown])
+    touched = contact is not None and bool(contact.touched(y[None])[0])
+    decided = state.decision.action, state.decision.rule
     if state.captured_ns is None:
-        return state.decision.action.value, touched
+        return Ended(*decided, (known.t_ns - start_ns) * 1e-9, None, touched)
     end_s = (state.segment.end_ns - start_ns) * 1e-9
     r, v = state.segment.at(state.segment.end_ns)
     attitude = target.attitude
     if attitude is None:
         attitude, aimed = (lambda times: np.full((len(times), 4), np.nan)), None
     found = _miss_at(end_s, 0.0, r, v, lambda times: (*target.goal(times), attitude(times)), aimed)
-    return ("captured" if found.inside(tolerance) else "outside"), touched
+    return Ended(*decided, end_s, found, touched)
 
 
-def _touched(
-    scene: Scene, body: Limits, segment: Segment, start_ns: int, begin_ns: int, end_ns: int
-) -> bool:
-    """Return whether the end-effector touches the body between two scans, at ten instants."""
-    instants = np.linspace(begin_ns, end_ns, 10, endpoint=False).astype(np.int64)
-    r = np.array(
-        [segment.at(int(t))[0] for t in instants if segment.path is None or t <= segment.end_ns]
-    )
-    return touches(
-        scene, body, np.asarray((instants[: len(r)] - start_ns) * 1e-9, dtype=np.float64), r
-    )
+def flown_positions(
+    segment: Segment, begin_ns: int, end_ns: int
+) -> tuple[NDArray[np.int64], Array]:
+    """Return ten instants (n,) [ns] from ``begin_ns`` on before ``end_ns``, and the positions
+    (n, 3) in {A}, up to the end of the segment.
+
+    Args:
+        segment: What the robot flies.
+        begin_ns: First instant.
+        end_ns: End of the interval.
+    """
+    steps = np.arange(PATH_INSTANTS, dtype=np.int64)
+    instants = begin_ns + steps * (end_ns - begin_ns) // PATH_INSTANTS
+    if segment.path is not None:
+        instants = instants[instants <= segment.end_ns]
+    return instants, np.array([segment.at(int(t))[0] for t in instants]).reshape(-1, 3)
+
+
+def relative_path(
+    scene: Scene, segment: Segment, start_ns: int, begin_ns: int, end_ns: int
+) -> Array:
+    """Return the positions (n, 3) of the robot from the grasp point in {C} between two scans.
+
+    Args:
+        scene: The target.
+        segment: What the robot flies.
+        start_ns: Instant from which the times of the scene count.
+        begin_ns: First scan.
+        end_ns: The other scan.
+    """
+    instants, r = flown_positions(segment, begin_ns, end_ns)
+    if not len(r) or scene.attitude is None:
+        return np.zeros((0, 3))
+    times = np.asarray((instants - start_ns) * 1e-9, dtype=np.float64)
+    return in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])

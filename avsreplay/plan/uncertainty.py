@@ -17,9 +17,9 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
-from avsreplay.plan.limits import Scene, in_fixture_axes, margins
+from avsreplay.plan.contact import Contact
+from avsreplay.plan.limits import Scene, in_fixture_axes
 from avsreplay.plan.path import RobotPath
-from avsreplay.plan.robot import Limits
 
 CONTACT_INSTANTS = 401  # instants of a plan at which contact is checked
 
@@ -61,7 +61,7 @@ class Spread:
         probability: Fraction of futures in which the errors are within the tolerance.
         probability_95: Its Wilson 95 % interval.
         contact: Fraction of futures in which the end-effector touches the body outside the
-            corridor; NaN: not checked.
+            grasp; NaN: not checked.
         contact_95: Its Wilson 95 % interval.
     """
 
@@ -91,20 +91,14 @@ class Spread:
             ("speed over belief", _text(self.speed_mps, 1e3, "mm/s", 2)),
             ("angle over belief", _text(self.angle_deg, 1.0, "deg", 3)),
             (
-                "capture probability",
-                (
-                    f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws"
-                    " without replanning"
-                ),
+                "plan flown blind",
+                (f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws"),
             ),
         ]
         if self.contact >= 0.0:
             low, high = self.contact_95
-            text = (
-                f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor, without"
-                " replanning"
-            )
-            out.append(("contact probability", text))
+            text = f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the grasp"
+            out.append(("contact, flown blind", text))
         return out
 
 
@@ -186,7 +180,7 @@ def spread(
     tolerance: Tolerance,
     attitude: Array | None = None,
     disturbance: Disturbance | None = None,
-    limits: Limits | None = None,
+    contact: Contact | None = None,
 ) -> Spread:
     """Evaluate one plan in every future, and plan anew for each future.
 
@@ -197,8 +191,7 @@ def spread(
         tolerance: Largest errors of a capture.
         attitude: (4,) q_ac of the gripper at the end.
         disturbance: Errors of the thrust; none where None.
-        limits: Resolved limits whose clearance is the radius of the end-effector; None: contact is
-            not checked.
+        contact: Contact with the body; None: it is not checked.
 
     Raises:
         ValueError: There is no future.
@@ -211,11 +204,13 @@ def spread(
     for k, future in enumerate(futures):
         dr, dv = disturbance.deviation(times) if disturbance else (0.0 * r, 0.0 * v)
         misses[k] = _terminal_errors(future, times[-1:], r[-1] + dr[-1], v[-1] + dv[-1], attitude)
-        touched[k] = limits is not None and touches(future, limits, times[:-1], (r + dr)[:-1])
+        if contact is not None and future.attitude is not None:
+            R, rho = geometry.matrix(future.attitude(times)), future.goal(times)[0]
+            touched[k] = contact.touched(in_fixture_axes(R, r + dr - rho)[None])[0]
     own = np.array([planner(future).t_go_s for future in futures])
     allowed = (tolerance.position_m, tolerance.speed_mps, tolerance.angle_deg)
     inside = np.all((misses <= allowed) | np.isnan(misses), axis=1)
-    checked = limits is not None and futures[0].surface is not None
+    checked = contact is not None and futures[0].attitude is not None
     return Spread(
         futures=len(futures),
         t_go_s=_band(own),
@@ -228,21 +223,6 @@ def spread(
         contact=float(touched.mean()) if checked else math.nan,
         contact_95=wilson(int(touched.sum()), len(futures)) if checked else (math.nan, math.nan),
     )
-
-
-def touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
-    """Return whether the end-effector touches the body outside the corridor at one of the instants.
-
-    Args:
-        scene: The target.
-        limits: Resolved limits whose clearance is the radius of the end-effector.
-        times: (n,) [s].
-        r: (n, 3) positions in {A} [m].
-    """
-    if not len(r) or scene.attitude is None or scene.surface is None:
-        return False
-    y = in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
-    return bool(margins(scene, limits, y, r).values[:, 3].min() < 0.0)
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:

@@ -1,9 +1,10 @@
-"""The protocol of a registration back end, the entry points of all back ends, and the default one,
+"""The base class of registration back ends, the list of all back ends, and the default one,
 ``horn``.
 
-A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It
-returns a pose, an iteration count and its own convergence flag, nothing more: ``quality.grade``
-measures the quality of every pose.
+A back end is a class that derives from ``Backend``, under the entry-point group
+``avsreplay.backends``. It returns a pose, an iteration count and its own convergence flag, nothing
+more: ``quality.grade`` measures the quality of every pose. Its parameters, its accuracy and what it
+can do besides ``align`` are stated in the class.
 
 ``poses`` is the entry for logs that hold poses of a tracker (markers, motion capture), of which
 nothing is registered: the pipeline takes the pose of such a scan as its alignment.
@@ -12,31 +13,39 @@ nothing is registered: the pipeline takes the pose of such a scan as its alignme
 from __future__ import annotations
 
 import importlib.util
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import MissingBackend, UsageError, value_class
 from avsreplay.geometry import MeasuredPose, Pose, frozen
+from avsreplay.parts import BACKENDS
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
+from avsreplay.settings import NoParameters, Settings
 
 if TYPE_CHECKING:
-    from avsreplay.register.params import RegistrationLimits
+    from avsreplay.register.params import RegisterParams, RegistrationLimits
     from avsreplay.register.visibility import Visibility
 
+S = TypeVar("S", bound=Settings)
+
+# of an exact scan [deg, share of the extent], where a back end does not state its own
+ACCURACY = (0.1, 0.001)
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
-GROUP = "avsreplay.backends"
 POSES = "poses"
+REINSTALL = "reinstall the package that provides it"
 
 PLANE_PASSES = 3
 CLOUD_PLANE_PASSES = 30  # point-to-plane passes of a second alignment to a model of points
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
+NO_LIMIT = 2**62  # of point searches
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 SETTLED, RADIUS_OF_EXTENT = (
     0.05,
@@ -64,6 +73,7 @@ class Target:
         limits: rejection distances and stopping rule.
         visibility: which faces the camera can have measured.
         near_work: cost of a search near this surface in point searches, see ``budget.near_work``.
+        own: parameters of the back end, lengths that scale with the target filled in.
     """
 
     surface: Surface
@@ -71,13 +81,53 @@ class Target:
     limits: RegistrationLimits
     visibility: Visibility
     near_work: float = 1.0
+    own: Settings = NoParameters()
+
+    def parameters(self, kind: type[S]) -> S:
+        """Return the parameters of a back end.
+
+        Args:
+            kind: its parameter class; the defaults where ``own`` belongs to another back end.
+        """
+        return self.own if isinstance(self.own, kind) else kind().resolved(self.surface.extent)
 
 
-class Backend(Protocol):
-    """Aligns a scan to the model it was built with."""
+class Backend(ABC):
+    """Aligns a scan to the model it was built with.
 
-    name: str
+    Only ``name`` and ``align`` must be given; the other attributes and methods have defaults.
 
+    Attributes:
+        name: the entry-point name.
+        about: what it does, in one line.
+        requires: (module, distribution) of each library that it needs.
+        get: how to install them.
+        parameters: class of its own parameters, the table ``[register.NAME]``; the constructor
+            receives them from ``Target.parameters``.
+        accuracy: largest error on an exact scan that the contract allows: angle [deg] and share of
+            the extent.
+        same_bytes: whether its results are the same to the bit on every x86-64 processor.
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str] = ""
+    requires: ClassVar[tuple[tuple[str, str], ...]] = ()
+    get: ClassVar[str] = "install the package that provides it"
+    parameters: ClassVar[type[Settings]] = NoParameters
+    accuracy: ClassVar[tuple[float, float]] = ACCURACY
+    same_bytes: ClassVar[bool] = False
+
+    def __init__(self, target: Target) -> None:  # noqa: B027 (a back end without preparation)
+        """Prepare for scans of a target.
+
+        Args:
+            target: model, limits and own parameters.
+
+        Raises:
+            ImportError: a library cannot be imported.
+        """
+
+    @abstractmethod
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return the pose T_ca that aligns the scan {A} to the model {C}.
 
@@ -91,8 +141,40 @@ class Backend(Protocol):
             the status FAILED.
         """
 
+    def align_roughly(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """Return T_ca as :meth:`align`. A back end may return early, not converged, where a part of
+        the scan shows that no fit is close.
 
-class HornBackend:
+        Args:
+            points: as of ``align``.
+            guess: as of ``align``.
+        """
+        return self.align(points, guess)
+
+    def align_within(
+        self,
+        points: NDArray[Any],
+        guess: Pose,
+        gate_m: float,  # noqa: ARG002 (an ability that this back end does not have)
+        near: bool = False,  # noqa: ARG002
+        most: int = MOST_WITHIN,  # noqa: ARG002
+        most_work: int = NO_LIMIT,  # noqa: ARG002
+    ) -> Fit:
+        """Return T_ca with correspondences nearer than ``gate_m`` in all passes. A back end without
+        this ability aligns with its own rejection distances.
+
+        Args:
+            points: as of ``align``.
+            guess: as of ``align``.
+            gate_m: rejection distance from the first pass on [m].
+            near: the guess is a registered pose, which the first passes must not leave.
+            most: largest number of passes.
+            most_work: point searches after which it ends, not converged.
+        """
+        return self.align(points, guess)
+
+
+class HornBackend(Backend):
     """Exact closest points on the model, one fused pass, identical results for any number of
     threads.
 
@@ -170,7 +252,7 @@ class HornBackend:
         gate_m: float,
         near: bool = False,
         most: int = MOST_WITHIN,
-        most_work: int = 2**62,
+        most_work: int = NO_LIMIT,
     ) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most
         ``most``.
@@ -239,15 +321,14 @@ def measured_alignment(found: MeasuredPose) -> Alignment:
     return Alignment(found.T_ac, 0, True, 0, 0, 0.0, info, AlignStatus.MEASURED, C)
 
 
-class PoseBackend:
+class PoseBackend(Backend):
     """The entry of ``poses`` in the list of back ends; it does not register clouds."""
 
-    name = POSES
-    same_bytes = True
-    about = "no registration: the log holds measured poses of a tracker (pose topic, TUM, CSV)"
-
-    def __init__(self, target: Target) -> None:
-        """Take the target like every back end; it is not used."""
+    name: ClassVar[str] = POSES
+    same_bytes: ClassVar[bool] = True
+    about: ClassVar[str] = (
+        "no registration: the log holds measured poses of a tracker (pose topic, TUM, CSV)"
+    )
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:  # noqa: ARG002 (the protocol names them)
         """Raise an error for a cloud, so that its scan has the status FAILED.
@@ -262,9 +343,6 @@ class PoseBackend:
         raise ValueError(
             f"the back end '{self.name}' takes the poses of the log and cannot align clouds"
         )
-
-
-Factory = Callable[[Target], Backend]
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,41 +366,42 @@ class Availability:
     elsewhere: str = ""
 
 
-def names() -> tuple[str, ...]:
-    """Return every registered name, sorted, each once."""
-    return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
-
-
-def load_backend(name: str) -> Factory:
+def load_backend(name: str) -> type[Backend]:
     """Return the class of a back end.
 
     Raises:
-        UsageError: unknown name.
+        UsageError: unknown name, or a class that does not derive from ``Backend``.
         MissingBackend: its library is not installed.
     """
-    entry = _entry(name)
     try:
-        factory = entry.load()
+        found = BACKENDS.load(name)
     except ImportError as error:
-        raise _missing(
-            name, f"cannot be imported ({error})", "reinstall the package that provides it"
-        ) from None
-    state = _availability(name, factory)
+        raise _missing(name, f"cannot be imported ({error})", REINSTALL) from None
+    if not (isinstance(found, type) and issubclass(found, Backend)):
+        what = f"'{name}' is registered as a back end and does not derive from Backend"
+        raise UsageError(what, where="--backend", hint="see docs/your-own-backend.md")
+    state = _availability(name, found)
     if not state.installed:
         raise _missing(name, "is not installed", state.get)
-    return cast(Factory, factory)
+    return found
 
 
-def create_backend(name: str, factory: Factory, target: Target) -> Backend:
-    """Build the back end.
+def create_backend(params: RegisterParams, factory: type[Backend], target: Target) -> Backend:
+    """Build a back end.
 
-    Raises MissingBackend if its library is installed but cannot be imported.
+    Args:
+        params: parameters of registration, with those of the back end.
+        factory: its class.
+        target: what it is built from; its ``own`` is filled in.
+
+    Raises:
+        MissingBackend: its library is installed but cannot be imported.
     """
+    own = params.own.of(params.backend, factory.parameters).resolved(target.surface.extent)
     try:
-        return factory(target)
+        return factory(replace(target, own=own))
     except ImportError as error:
-        get = str(getattr(factory, "get", "install the package that provides it"))
-        raise _missing(name, f"cannot be imported ({error})", get) from None
+        raise _missing(params.backend, f"cannot be imported ({error})", factory.get) from None
 
 
 def available() -> tuple[Availability, ...]:
@@ -330,19 +409,19 @@ def available() -> tuple[Availability, ...]:
 
     Does not import any registration library.
     """
-    return tuple(_state(name) for name in names())
+    return tuple(_state(name) for name in BACKENDS.names())
 
 
 def _state(name: str) -> Availability:
     try:
-        return _availability(name, _entry(name).load())
+        return _availability(name, BACKENDS.load(name))
     except ImportError as error:
         return Availability(
             name,
             False,
             "",
             f"cannot be imported: {error}",
-            "reinstall the package that provides it",
+            REINSTALL,
         )
 
 
@@ -363,17 +442,16 @@ def aligned(
         backend: built for the target.
         scan: (n, 3) points in {A} [m].
         guess: T_ca to begin with.
-        width_m: rejection distance from the first pass on [m], for a back end with
-            ``align_within``; None for its own.
-        most_work: point searches after which it ends, for a back end with ``align_within`` and a
-            given ``width_m``.
-        rough: without ``width_m``, align with ``align_roughly`` where the back end has it.
+        width_m: rejection distance from the first pass on [m], see ``align_within``; None for the
+            back end's own.
+        most_work: point searches after which it ends where ``width_m`` is given.
+        rough: without ``width_m``, align with ``align_roughly``.
     """
-    within = None if width_m is None else getattr(backend, "align_within", None)
-    rule = {"near": True, "most_work": most_work}
     try:
-        align = getattr(backend, "align_roughly", backend.align) if rough else backend.align
-        fit = align(scan, guess) if within is None else within(scan, guess, width_m, **rule)
+        if width_m is not None:
+            fit = backend.align_within(scan, guess, width_m, near=True, most_work=most_work)
+        else:
+            fit = (backend.align_roughly if rough else backend.align)(scan, guess)
         if not isinstance(fit, Fit):
             return f"back end '{name}' returned {type(fit).__name__}, not Fit"
         finite = bool(np.isfinite(fit.T_ca.matrix).all())
@@ -386,27 +464,22 @@ def aligned(
     return fit if finite else f"back end '{name}' returned a pose that is not finite"
 
 
-def _availability(name: str, factory: Any) -> Availability:
-    """Read the optional class attributes ``requires`` (module, distribution), ``about``, ``get``
-    and ``same_bytes``.
-    """
-    requires: tuple[tuple[str, str], ...] = getattr(factory, "requires", ())
-    missing = [module for module, _ in requires if importlib.util.find_spec(module) is None]
-    version = "" if missing or not requires else _version(requires[0][1])
-    get = str(getattr(factory, "get", "install the package that provides it")) if missing else ""
-    return Availability(
-        name, not missing, version, str(getattr(factory, "about", "")), get, _elsewhere(factory)
-    )
+def _availability(name: str, factory: type[Backend]) -> Availability:
+    """State of a back end whose module could be imported."""
+    missing = [m for m, _ in factory.requires if importlib.util.find_spec(m) is None]
+    version = "" if missing or not factory.requires else _version(factory.requires[0][1])
+    get = factory.get if missing else ""
+    return Availability(name, not missing, version, factory.about, get, _elsewhere(factory))
 
 
-def _elsewhere(factory: Any) -> str:
-    """Attribute ``same_bytes``, or the stated accuracy: one that stops by its own rule can
-    end anywhere in it.
+def _elsewhere(factory: type[Backend]) -> str:
+    """How far results on another processor can differ: one that stops by its own rule can end
+    anywhere within its accuracy.
     """
-    if getattr(factory, "same_bytes", False):
+    if factory.same_bytes:
         return "same bytes"
-    degrees, share = getattr(factory, "accuracy", (None, None))
-    return "unknown" if degrees is None else f"within {degrees:g} deg, {share:g} of the extent"
+    degrees, share = factory.accuracy
+    return f"within {degrees:g} deg, {share:g} of the extent"
 
 
 def _version(distribution: str) -> str:
@@ -414,23 +487,6 @@ def _version(distribution: str) -> str:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return ""
-
-
-def _entry(name: str) -> metadata.EntryPoint:
-    found = [entry for entry in metadata.entry_points(group=GROUP) if entry.name == name]
-    if not found:
-        known = ", ".join(names())
-        hint = (
-            f"one of: {known}"
-            if known
-            else "install avsreplay ('pip install .') to register its own back ends"
-        )
-        raise UsageError(
-            f"no registration back end is called '{name}'", where="--backend", hint=hint
-        )
-    return min(
-        found, key=lambda entry: entry.value
-    )  # the same one in every run if a name is registered twice
 
 
 def _missing(name: str, what: str, get: str) -> MissingBackend:

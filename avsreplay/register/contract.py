@@ -1,9 +1,9 @@
 """The laws that every back end must satisfy, used by the tests and by ``avsreplay backends --check
 NAME``.
 
-They are checked on a small target made of formulas. A back end may state its accuracy on an exact
-scan in a class attribute ``accuracy`` (degrees, share of the extent of the target); otherwise 0.1
-deg and 0.001 apply.
+They are checked on a small target made of formulas, within the accuracy on an exact scan that the
+back end states. The abilities that a back end may have besides ``align`` have laws as well; the
+defaults of the base class satisfy them.
 """
 
 from __future__ import annotations
@@ -11,22 +11,32 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
-from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.backend import load_backend
+from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.register.backend import (
+    NO_LIMIT,
+    Backend,
+    Target,
+    aligned,
+    create_backend,
+    load_backend,
+)
 from avsreplay.register.params import Camera, RegisterParams
-from avsreplay.register.quality import ACCURACY
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
+from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Visibility
 
 POINTS = 3000
 SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal except for rounding and the stopping rule
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20
+DETAIL = 200  # characters of a detail
 HESSIAN_STEP, HESSIAN_WITHIN = (
     1e-4,
     0.03,
@@ -73,8 +83,45 @@ class Bench:
             exp(np.radians([2.0, -1.5, 1.0])),
             self.surface.extent * np.array([0.006, -0.005, 0.004]),
         )
-        self.accuracy: tuple[float, float] = getattr(load_backend(backend), "accuracy", ACCURACY)
+        self._factory = load_backend(backend)
+        self.accuracy = self._factory.accuracy
         self.registrar = Registrar(self.surface, self.params)
+
+    @property
+    def gate_m(self) -> float:
+        """Rejection distance of the last iteration [m]."""
+        return self.params.limits(self.surface.extent).gate_m
+
+    def able(self, ability: str) -> bool:
+        """Return whether the back end has a method of its own in place of that of the base class.
+
+        Args:
+            ability: name of the method.
+        """
+        return getattr(self._factory, ability) is not getattr(Backend, ability)
+
+    def fit(
+        self,
+        T_ac: Pose,
+        width_m: float | None = None,
+        most_work: int = NO_LIMIT,
+        rough: bool = False,
+    ) -> Fit | str:
+        """Return what the back end itself gives for the scan, or the text of its failure.
+
+        Args:
+            T_ac: pose to begin with.
+            width_m: rejection distance of ``align_within`` [m]; None for the others.
+            most_work: its limit of point searches.
+            rough: use ``align_roughly``.
+        """
+        limits = self.params.limits(self.surface.extent)
+        visibility = Visibility(self.surface, self.params.camera)
+        index = SurfaceIndex.build(visibility.surface, limits.reach_m)
+        target = Target(visibility.surface, index, limits, visibility)
+        name, guess = self.params.backend, T_ac.inverse()
+        backend = create_backend(self.params, self._factory, target)
+        return aligned(name, backend, self.scan, guess, width_m, most_work, rough)
 
     def fresh(
         self, surface: Surface | None = None, params: RegisterParams | None = None
@@ -203,6 +250,29 @@ def repeats(bench: Bench) -> LawResult:
     )
 
 
+def roughly(bench: Bench) -> LawResult:
+    """A rough alignment that converged is as exact as any other."""
+    law = "a rough alignment that converged is exact"
+    return _ability(law, bench, bench.guess, rough=True)
+
+
+def within(bench: Bench) -> LawResult:
+    """With a fixed rejection distance, a scan stays where it was registered."""
+    law = "a fixed rejection distance keeps a registered pose"
+    return _ability(law, bench, bench.T_ac, width_m=bench.gate_m)
+
+
+def limited(bench: Bench) -> LawResult:
+    """An alignment with a fixed rejection distance that may search one point does not claim that it
+    converged; a back end without this ability has no limit.
+    """
+    law = "a limit of the work is kept"
+    if bench.able("align_within"):
+        fit = bench.fit(bench.guess, width_m=bench.gate_m, most_work=1)
+        return LawResult(law, isinstance(fit, Fit) and not fit.converged, str(fit)[:DETAIL])
+    return LawResult(law, True, "not an ability of this back end")
+
+
 def far(bench: Bench) -> LawResult:
     """A scan ten extents away has no overlap."""
     away = bench.scan + 10.0 * bench.surface.extent
@@ -272,6 +342,9 @@ LAWS: tuple[Law, ...] = (
     order,
     views,
     repeats,
+    roughly,
+    within,
+    limited,
     far,
     planar,
     collinear,
@@ -367,6 +440,17 @@ def _aligned_near(law: str, bench: Bench, found: Alignment, truth: Pose) -> LawR
     return LawResult(
         law, held, f"{found.status.value}, {np.degrees(turn):.1e} deg, {shift:.1e} of the extent"
     )
+
+
+def _ability(law: str, bench: Bench, start: Pose, **how: Any) -> LawResult:
+    """The pose is exact, or the back end states that it did not converge."""
+    fit = bench.fit(start, **how)
+    if isinstance(fit, str):
+        return LawResult(law, False, fit)
+    turn, shift = bench.gap(bench.T_ac, fit.T_ca.inverse())
+    near = bool(np.degrees(turn) < bench.accuracy[0] and shift < bench.accuracy[1])
+    detail = f"{np.degrees(turn):.1e} deg, {shift:.1e} of the extent, converged {fit.converged}"
+    return LawResult(law, near or not fit.converged, detail)
 
 
 def _same(law: str, bench: Bench, first: Pose, second: Pose) -> LawResult:

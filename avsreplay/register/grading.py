@@ -36,7 +36,7 @@ class Grader:
             backend,
             restarter,
         )
-        self._accuracy: tuple[float, float] = getattr(backend, "accuracy", quality.ACCURACY)
+        self._accuracy: tuple[float, float] = backend.accuracy
         self._closest = isinstance(backend, HornBackend)
 
     def graded(

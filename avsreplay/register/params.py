@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from avsreplay.settings import Settings, given, setting
+from avsreplay.parts import BACKENDS
+from avsreplay.settings import NoParameters, Settings, Tables, given, setting
 
 
 class Camera(Enum):
@@ -165,11 +166,19 @@ class RegisterParams(Settings):
         True, "Keep the index of a large model in the user's cache folder between runs."
     )
     acquire: AcquireParams = setting(AcquireParams, "The global search.")
+    own: Tables = setting(
+        Tables, "The parameters of back ends, one table [register.NAME] each.", parts=BACKENDS
+    )
 
     def check(self) -> None:
         """Raise ValueError where the two rejection distances are in the wrong order."""
         if self.reach_m is not None and self.gate_m is not None and self.gate_m > self.reach_m:
             raise ValueError(f"gate_m is {self.gate_m}, must not exceed reach_m = {self.reach_m}")
+
+    def with_own(self) -> RegisterParams:
+        """Return the same with the parameters of the back end that is used, given or default."""
+        kind = BACKENDS.parameters(self.backend) or NoParameters
+        return replace(self, own=self.own.including(self.backend, self.own.of(self.backend, kind)))
 
     def limits(self, extent_m: float) -> RegistrationLimits:
         """Return the parameters of a back end for a model of a given size.

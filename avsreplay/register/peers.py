@@ -18,6 +18,7 @@ end of the sweep.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,17 +27,14 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import Backend, Target
 from avsreplay.register.sampling import sample
+from avsreplay.settings import Settings, setting
 
 TIGHTEN = 3.0  # the gate of the reference in units of the rms of the last pass
 MIN_INLIERS = 6
 SETTLED_GATE = 0.01  # the gate has settled once a pass changes it by less than this share
-SURFACE_POINTS = 100_000
-NEIGHBOURS = 20
 SETTLED = 10.0  # steps end at this many eps, because the covariances are not smooth in the pose
-LEAST_POINTS = 20  # fewer points have no neighbourhood of NEIGHBOURS
-POINTS_PER_VOXEL = 20
 SETTLED_OF_GATE = 0.01
 FINE_CALLS = 6  # calls with the finest map, each with at most n_max iterations
 # 1e-4 as by default in the library, whose last steps change from one map point to the next
@@ -50,7 +48,55 @@ VOXELS = 100.0  # the library's rule: range over voxel
 RECENTRE_VOXELS = 50.0
 
 
-class ReferenceBackend:
+@dataclass(frozen=True, slots=True)
+class SampledParams(Settings):
+    """Parameters of a back end that samples the model and needs neighbourhoods of its points."""
+
+    surface_points: int = setting(
+        100_000,
+        "Points sampled from the surface of the model. More of them give a more exact pose and take"
+        " more time and memory.",
+        low=100,
+        high=10_000_000,
+    )
+    neighbours: int = setting(
+        20,
+        "Nearest points from which the normal or the covariance at a point is estimated. More of"
+        " them suppress noise and smooth edges; a scan with fewer points is not aligned.",
+        low=3,
+        high=1000,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class KissParams(Settings):
+    """Parameters of the back end ``kiss``."""
+
+    voxel_m: float | None = setting(
+        None,
+        "Edge of the voxels of the finest map. A larger value takes less time and gives a less"
+        " exact pose.",
+        unit="m",
+        above=0.0,
+        unset="the same as register.gate_m",
+    )
+    points_per_voxel: int = setting(
+        20,
+        "Points of the model that each voxel of a map keeps. A larger value gives a more exact pose"
+        " and takes more time.",
+        low=1,
+        high=100_000,
+    )
+    surface_points: int = setting(
+        100_000,
+        "Points sampled from the surface of the model. More of them give a more exact pose and take"
+        " more time and memory.",
+        low=100,
+        high=10_000_000,
+    )
+
+
+class ReferenceBackend(Backend):
     """Horn's quaternion ICP, point to surface, from the first pass to the fixed point.
 
     Rejection: a point is used while its distance to the model is below the gate. The gate starts at
@@ -125,7 +171,7 @@ def best_motion(moving: Array, fixed: Array) -> Pose:
     return Pose(turn.q, d_bar - turn.R @ c_bar)
 
 
-class SmallGicpBackend:
+class SmallGicpBackend(Backend):
     """GICP, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
 
     ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second,
@@ -137,17 +183,19 @@ class SmallGicpBackend:
     about: ClassVar[str] = "small_gicp's GICP against points sampled from the model, one thread"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("small_gicp", "small_gicp"),)
     get: ClassVar[str] = "pip install 'avsreplay[small_gicp]'"
+    parameters = SampledParams
 
     def __init__(self, target: Target) -> None:
         import small_gicp
 
         self._library: Any = small_gicp
-        self._limits = target.limits
-        self._cloud, self._tree = self._prepared(sample(target.surface, SURFACE_POINTS)[0])
+        self._limits, self._own = target.limits, target.parameters(SampledParams)
+        points, _ = sample(target.surface, self._own.surface_points)
+        self._cloud, self._tree = self._prepared(points)
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
-        if len(points) < LEAST_POINTS:
+        if len(points) < self._own.neighbours:
             return Fit(guess, 0, False)
         scan, _ = self._prepared(np.ascontiguousarray(points, dtype=np.float64))
         T_ca, passes, found = guess, 0, None
@@ -173,12 +221,12 @@ class SmallGicpBackend:
         cloud = self._library.PointCloud(points)
         tree = self._library.KdTree(cloud, num_threads=1)
         self._library.estimate_normals_covariances(
-            cloud, tree, num_neighbors=NEIGHBOURS, num_threads=1
+            cloud, tree, num_neighbors=self._own.neighbours, num_threads=1
         )
         return cloud, tree
 
 
-class Open3dBackend:
+class Open3dBackend(Backend):
     """Point-to-plane, coarse to fine: first with correspondences up to ``reach_m``, then up to
     ``gate_m``.
 
@@ -191,6 +239,7 @@ class Open3dBackend:
     about: ClassVar[str] = "Open3D's point-to-plane ICP against points sampled from the model"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("open3d", "open3d"),)
     get: ClassVar[str] = "pip install 'avsreplay[open3d]'"
+    parameters = SampledParams
 
     def __init__(self, target: Target) -> None:
         import open3d
@@ -198,13 +247,13 @@ class Open3dBackend:
         self._library: Any = open3d.pipelines.registration
         self._geometry: Any = open3d.geometry.PointCloud
         self._vector: Any = open3d.utility.Vector3dVector
-        self._limits = target.limits
-        points, normals = sample(target.surface, SURFACE_POINTS)
+        self._limits, own = target.limits, target.parameters(SampledParams)
+        points, normals = sample(target.surface, own.surface_points)
         self._cloud = self._geometry(self._vector(points))
         if normals.any():
             self._cloud.normals = self._vector(normals)
         else:
-            self._cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+            self._cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(own.neighbours))
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
@@ -220,8 +269,8 @@ class Open3dBackend:
         return Fit(T_ca, 2, matched > 0)
 
 
-class KissBackend:
-    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric
+class KissBackend(Backend):
+    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``voxel_m`` and of their geometric
     mean in between.
 
     The coarse maps are used with points thinned by the library's rule, the middle one with the
@@ -236,17 +285,20 @@ class KissBackend:
     about: ClassVar[str] = "kiss-icp against a voxel map of the model, one thread"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("kiss_icp", "kiss-icp"),)
     get: ClassVar[str] = "pip install kiss-icp"
+    parameters = KissParams
 
     def __init__(self, target: Target) -> None:
         from kiss_icp.mapping import VoxelHashMap
         from kiss_icp.registration import Registration
 
         self._limits, self._radius_m = target.limits, 0.5 * target.surface.extent
-        points = np.ascontiguousarray(sample(target.surface, SURFACE_POINTS)[0])
-        reach, gate = target.limits.reach_m, target.limits.gate_m
+        own = target.parameters(KissParams)
+        points = np.ascontiguousarray(sample(target.surface, own.surface_points)[0])
+        finest = own.voxel_m or target.limits.gate_m
+        coarsest = max(target.limits.reach_m, finest)
         self._maps: list[tuple[float, Any]] = []
-        for voxel in (reach, math.sqrt(reach * gate), gate):
-            voxel_map: Any = VoxelHashMap(voxel, FAR_M, POINTS_PER_VOXEL)
+        for voxel in (coarsest, math.sqrt(coarsest * finest), finest):
+            voxel_map: Any = VoxelHashMap(voxel, FAR_M, own.points_per_voxel)
             voxel_map.add_points(points)
             self._maps.append((voxel, voxel_map))
         self._registration = Registration(
@@ -256,13 +308,13 @@ class KissBackend:
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
-        (reach, coarse), (voxel, middle), (gate, fine) = self._maps
+        (reach, coarse), (voxel, middle), (finest, fine) = self._maps
         T_ca = self._run(_thinned_at(scan, guess, reach), coarse, guess, reach)
         sigma = self.threshold(guess, T_ca)
         T_ca = self._run(_thinned_at(scan, T_ca, voxel), middle, T_ca, 3.0 * sigma)
-        T_ca = self._run(scan, fine, T_ca, gate)
+        T_ca = self._run(scan, fine, T_ca, finest)
         for calls in range(1, FINE_CALLS):
-            before, T_ca = T_ca, self._run(scan, fine, T_ca, gate)
+            before, T_ca = T_ca, self._run(scan, fine, T_ca, finest)
             if self._settled(before, T_ca):
                 return Fit(T_ca, len(self._maps) + calls, True)
         return Fit(T_ca, len(self._maps) + FINE_CALLS - 1, False)

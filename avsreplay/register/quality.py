@@ -18,6 +18,7 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.backend import ACCURACY
 from avsreplay.register.covariance import (
     Evidence,
     normal_numbers,
@@ -57,7 +58,6 @@ SIMULATED, SHARES = (
 # of the extent: with less noise a part of the simulated points decides whether the others are
 SMALL_NOISE = 0.002
 UNCERTAIN_BIAS = 0.5  # of the bias of the noise: standard error
-ACCURACY = (0.1, 1e-3)  # accuracy [deg, share of the extent] of a back end that states none
 
 
 @value_class

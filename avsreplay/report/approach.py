@@ -69,9 +69,10 @@ def approach_picture(
     parts = [] if view is None else flown_parts(rows, view)
     if view is None or not parts:
         return None
-    axis = np.array(header.get("config", {}).get("fixture_axis_c", (1.0, 0.0, 0.0)))
-    side = geometry.across(axis)
-    body, corners = np.asarray(view.vertices, np.float64), view.faces
+    axis = np.array(header.get("task", {}).get("axis", (1.0, 0.0, 0.0)))
+    side, grasp = geometry.across(axis), np.array(header.get("task", {}).get("grasp_m", (0, 0, 0)))
+    body, corners = np.asarray(view.vertices, np.float64) - grasp, view.faces
+    parts = [part - grasp for part in parts]
     limits = header.get("approach", {})
     cones = [
         (limits.get(f"{name}_deg"), limits.get(f"{name}_range_m")) for name in ("cone", "final")

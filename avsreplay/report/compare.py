@@ -7,11 +7,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
-from avsreplay.settings import dump, entries
+from avsreplay.settings import dump, entries, value_of
 
 
 @value_class(eq=True)
@@ -79,6 +80,13 @@ def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None
 
     def get(summary: Summary) -> float | None:
         return pick(summary) if summary.faults.known else None
+
+    return get
+
+
+def _assessed(pick: Callable[[Assessment], float | None]) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        return None if summary.assessment is None else pick(summary.assessment)
 
     return get
 
@@ -202,6 +210,24 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")
     ),
+    Metric(
+        "capture_probability",
+        "",
+        "of a capture within the tolerances and without contact",
+        _assessed(lambda a: a.probability),
+    ),
+    Metric(
+        "capture_contact",
+        "",
+        "probability of contact with the body outside the grasp",
+        _assessed(lambda a: a.contact),
+    ),
+    Metric(
+        "captured",
+        "",
+        "1 where the gripper in fact captured, 0 where it did not",
+        _assessed(lambda a: None if a.in_fact is None else float(a.in_fact.captured)),
+    ),
     Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
     Metric("losses", "", "damaged places in the log", lambda s: s.counts.get("losses")),
 )
@@ -237,13 +263,12 @@ def changed_settings(*tables: Any) -> list[str]:
     """
     found = []
     for table in tables:
-        defaults = flat(dump(type(table)()))
-        words = {e.key: e.declared.automatic or "off" for e in entries(type(table))}
-        for key, value in flat(dump(table)).items():
-            if value != defaults.get(key):
-                unset = words.get(key, "off")
+        for entry in entries(type(table)):
+            value, default = dump(value_of(table, entry.key)), dump(entry.default)
+            if value != default:
+                unset = entry.declared.automatic or "off"
                 found.append(
-                    f"{key} = {_value(value, unset)} (default {_value(defaults.get(key), unset)})"
+                    f"{entry.key} = {_value(value, unset)} (default {_value(default, unset)})"
                 )
     return found
 

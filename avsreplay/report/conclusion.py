@@ -36,11 +36,21 @@ HEADLINES = {  # the metrics of the conclusion: words, unit and factor
     "false_alarm_rate": ("false alarms", " %", 100.0),
     "nees_inside": ("NEES inside its band", " %", 100.0),
     "t1_s": ("time of convergence", " s", 1.0),
+    "capture_probability": ("probability of a capture", "", 1.0),
     "capture_s": ("time of capture", " s", 1.0),
     "capture_miss_m": ("miss at capture", " mm", 1000.0),
     "losses": ("lost parts of the log", "", 1.0),
 }
-_MORE = {"scans", "healthy", "healthy_ratio", "nis_inside", "nees_inside", "ogm_rank"}
+_MORE = {
+    "capture_probability",
+    "captured",
+    "scans",
+    "healthy",
+    "healthy_ratio",
+    "nis_inside",
+    "nees_inside",
+    "ogm_rank",
+}
 _NEUTRAL = {
     "nis_median",
     "nees_median",

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import output_text
+from avsreplay.files import output_text, refuse_pointer
 from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
@@ -129,6 +129,8 @@ def _blocks(path: Path) -> Iterator[tuple[int, int, bytes]]:
         number = 1
         with path.open("rb") as stream:
             while block := stream.read(_BLOCK) + stream.readline(_MAX_LINE + 1):
+                if number == 1:
+                    refuse_pointer(block, str(path))
                 ends = block.count(b"\n")
                 yield number, ends, block
                 number += ends

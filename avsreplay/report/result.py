@@ -10,13 +10,14 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from avsreplay.assessment import Assessment
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, bounding_diagonal
@@ -182,11 +183,14 @@ def load_result(path: str | Path) -> Result:
         unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
     with without_garbage_collection():
         rows = read_rows(rows_path)
+        if not rows:
+            raise UnreadableInput("has no rows", where=str(rows_path), hint=_RUN_AGAIN)
         if not unverified and len(rows) != header.get("rows"):
             what = f"{len(rows)} rows, run.json states {header.get('rows')}"
             raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
         labels, truth, counts = _facts(header.get("facts") or {}, str(path))
         summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
+        summary = replace(summary, assessment=_assessment(header, str(path)))
     poses = read_tum(folder / "truth.tum") if folder and (folder / "truth.tum").is_file() else []
     view = read_view(folder / "view.npz") if folder and (folder / "view.npz").is_file() else None
     name = path.resolve().name if folder else path.name.removesuffix(".jsonl").removesuffix(".rows")
@@ -245,6 +249,15 @@ def _facts(record: Any, where: str) -> tuple[list[Label] | None, State | None, d
     except (TypeError, ValueError, AttributeError, KeyError):
         raise UnreadableInput(
             "'facts' in run.json are not as written by a run", where=where, hint=_RUN_AGAIN
+        ) from None
+
+
+def _assessment(header: Mapping[str, Any], where: str) -> Assessment | None:
+    try:
+        return Assessment.of_record(header.get("capture"))
+    except (TypeError, ValueError, AttributeError, KeyError, IndexError):
+        raise UnreadableInput(
+            "'capture' in run.json is not as written by a run", where=where, hint=_RUN_AGAIN
         ) from None
 
 

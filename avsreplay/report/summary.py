@@ -15,10 +15,12 @@ from operator import not_
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.records import BLOCKS, Label, State
+from avsreplay.records import BLOCKS, STATES, UNLIKELY, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
 from avsreplay.report.parameters import Parameter, parameters
 from avsreplay.report.summary_parts import (
@@ -33,7 +35,7 @@ from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
-NIS_LIMIT = 27.8563
+NIS_LIMIT = UNLIKELY[6]
 BLOCK_BANDS = {
     2: (0.05064, 7.3778),
     3: (0.2158, 9.3484),
@@ -127,6 +129,7 @@ class Summary:
         weighed_down: healthy poses with a Cauchy weight below 1.
         reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.
+        assessment: of the capture, which is not computed from the rows; None where there is none.
         interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
     """
@@ -166,6 +169,7 @@ class Summary:
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
     acceleration: str | None = None
+    assessment: Assessment | None = None
 
     @classmethod
     def fold(
@@ -239,7 +243,7 @@ class SummaryFold:
             [gamma == 0 for gamma in taken["gamma"]],
         )
         steps = [b - a for a, b in pairwise(stamps) if b > a]
-        full = [rank == 20 for rank in taken["ogm_rank"]]
+        full = [rank == STATES for rank in taken["ogm_rank"]]
         last = self._last
         healthy = taken["gamma"].count(1)
         figures = _figures(taken)
@@ -293,9 +297,12 @@ def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
     scans.
     """
     healthy, out = np.equal(taken["gamma"], 1), {}
+    claimed = _since_convergence(taken["converged"])
     for name in (*_BY_STATE, *_OF_ALL):
         column = np.array(taken[name], dtype=np.float64)
         known = np.isfinite(column)
+        if name == "nis" or name in _OF_ALL:
+            known = known & claimed
         if name in _BY_STATE:
             out[f"{name}/healthy"], out[f"{name}/coasting"] = (
                 column[known & healthy],
@@ -304,6 +311,15 @@ def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
         else:
             out[name] = column[known]
     return out
+
+
+def _since_convergence(converged: Sequence[bool]) -> NDArray[np.bool_]:
+    """The scans from convergence on, all of them without it.
+
+    The noise of the poses is adapted by then, and no plan relies on the covariance before.
+    """
+    flags = np.array(converged, dtype=bool)
+    return np.logical_or.accumulate(flags) if flags.any() else np.ones(len(flags), dtype=bool)
 
 
 def _observability(last: Row | None, full_rank_s: float | None) -> ObservabilitySummary:

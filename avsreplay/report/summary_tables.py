@@ -77,6 +77,8 @@ def verdict_table(verdict: RunVerdict) -> Table:
         ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
     ]
     rows.append(("first pose from", verdict.first_pose))
+    if verdict.task:
+        rows.append(("task", verdict.task))
     if verdict.robot:
         rows.append(("robot", verdict.robot))
     rows += [("changed setting", text) for text in verdict.changed] or [
@@ -413,8 +415,8 @@ def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if capture.last_s is None:
         yield "capture", f"no plan ({capture.status or 'the planner was not called'})"
     else:
-        spread = f"std {capture.std_s:.3f} s, range {capture.range_s:.3f} s"
-        yield "capture", f"planned at {capture.last_s:.2f} s; {spread} over {capture.replans} plans"
+        spread = f"{capture.replans} plans are {capture.range_s:.3f} s apart, no uncertainty"
+        yield "capture", f"last planned at {capture.last_s:.2f} s; {spread}"
     yield from _flight_facts(capture)
 
 

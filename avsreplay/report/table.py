@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from avsreplay.errors import value_class
+from avsreplay.errors import printable, value_class
 from avsreplay.rows import Column, Row, columns
 
 PLAIN_WIDTH, _WRAPPED = (
@@ -142,15 +142,15 @@ def _least_width(table: Table, gap: int) -> int:
 
 def print_line(console: Console, text: str) -> None:
     """Print one line of text as it is."""
-    console.print(Text(text))
+    console.print(Text(printable(text, "\n")))
 
 
 def _rich(console: Console, table: Table, tight: bool) -> RichTable:
     drawn = RichTable(
-        title=Text(table.title, style="bold"),
+        title=Text(printable(table.title), style="bold"),
         title_justify="left",
         min_width=min(cell_len(table.title), console.width),  # of a short table
-        caption=Text(table.note, style="dim") if table.note else None,
+        caption=Text(printable(table.note, "\n"), style="dim") if table.note else None,
         caption_justify="left",
         box=box.ASCII2 if ascii_only(console) else box.SIMPLE_HEAD,
         show_edge=False,
@@ -162,7 +162,11 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
         one_line = tight or table.letter(k) != "l"
         justify: Literal["left", "right"] = "right" if table.right(k) else "left"
         drawn.add_column(
-            Text(head), justify=justify, no_wrap=one_line, overflow="fold", vertical="top"
+            Text(printable(head, "\n")),
+            justify=justify,
+            no_wrap=one_line,
+            overflow="fold",
+            vertical="top",
         )
     for row in table.rows:
         drawn.add_row(*(_text(as_cell(cell), console) for cell in row))
@@ -170,7 +174,8 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
 
 
 def _text(cell: TableCell, console: Console) -> Text:
-    return Text(cell.signed(ascii_only=ascii_only(console)), style=_COLOURS.get(cell.mark, ""))
+    text = cell.signed(ascii_only=ascii_only(console))
+    return Text(printable(text, "\n"), style=_COLOURS.get(cell.mark, ""))
 
 
 def markdown(table: Table) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.report.charts import values
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
@@ -29,6 +30,7 @@ INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
 FALSE_ALARMS = 0.05  # share of the scans without a fault
 ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
 TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
+SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 GROWTH, GROWTH_SCANS = (
     3.0,
     30,
@@ -39,7 +41,6 @@ GROWN_LEAST, TURNED_LEAST = (
 )  # smallest median of the last third, over the extent, and [deg]
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SAME_ERROR = 0.2
-SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -64,38 +65,55 @@ class RunVerdict:
     """The verdict on one run.
 
     Attributes:
-        grade: the worst grade of all reasons.
-        reasons: worst first.
+        grade: the worse one of tracking and capture; a capture that is not likely is a CHECK.
+        tracking: the worst grade of all reasons.
+        reasons: on the tracking, worst first.
+        capture: the assessment of the capture; None where there is none.
         first_pose: where the first pose came from.
+        task: what is grasped, with the values that were assumed, "" without an assessment.
         robot: the robot that the planner assumed, "" without configuration.
         changed: settings that differ from their defaults, as ``key = value (default ...)``.
         moments: at most five, worst first.
     """
 
     grade: Grade
+    tracking: Grade
     reasons: tuple[Concern, ...]
+    capture: Assessment | None
     first_pose: str
+    task: str
     robot: str
     changed: tuple[str, ...]
     moments: tuple[Moment, ...]
 
     @property
     def line(self) -> str:
-        """Grade and at most three reasons in one line."""
+        """The capture, then the tracking with at most three reasons, in one line."""
+        if self.capture is None:
+            return self._tracking
+        return f"{self.capture.sentence}. TRACKING {self._tracking}"
+
+    @property
+    def _tracking(self) -> str:
         if not self.reasons:
-            return f"{self.grade.value}: no reason for concern was found."
+            none = ": no reason for concern was found" if self.capture is None else ""
+            return f"{self.tracking.value}{none}."
         more = len(self.reasons) - 3
         texts = [reason.text for reason in self.reasons[:3]] + (
             [f"{more} more reason{'s' * (more > 1)}"] if more > 0 else []
         )
-        return f"{self.grade.value}: {'; '.join(texts)}."
+        return f"{self.tracking.value}: {'; '.join(texts)}."
 
     def record(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
             "grade": self.grade.value,
+            "line": self.line,
+            "tracking": self.tracking.value,
+            "capture": None if self.capture is None else self.capture.record(),
             "reasons": [{"grade": r.grade.value, "text": r.text} for r in self.reasons],
             "first_pose": self.first_pose,
+            "task": self.task,
             "robot": self.robot,
             "changed_settings": list(self.changed),
             "worst_moments": [
@@ -141,10 +159,15 @@ def verdict_of(
         # a wrong unit or size explains the other reasons, so that it stands before them
         outside.append(Concern(worst if advice["grade"] == "fail" else Grade.CHECK, advice["text"]))
     reasons = sorted((*outside, *judged), key=lambda reason: reason.grade is not Grade.FAIL)
+    tracking, capture = reasons[0].grade if reasons else Grade.PASS, summary.assessment
+    bad = capture is not None and not capture.succeeds
     return RunVerdict(
-        grade=reasons[0].grade if reasons else Grade.PASS,
+        grade=Grade.CHECK if bad and tracking is Grade.PASS else tracking,
+        tracking=tracking,
         reasons=tuple(reasons),
+        capture=capture,
         first_pose=first_pose(rows, header),
+        task="" if capture is None else capture.task,
         robot=_robot(header),
         changed=tuple(header.get("changed_settings") or ()),
         moments=tuple(worst_moments(rows)),
@@ -293,7 +316,7 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
 
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
-    """Consistency, reinitialisation and convergence."""
+    """Consistency and reinitialisation."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
             low = (
@@ -343,6 +366,12 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             Grade.CHECK,
             f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
         )
+    if summary.assessment is None:  # else it states whether the estimate suffices
+        yield from _convergence(rows, summary)
+
+
+def _convergence(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Whether the estimate converged, and still is."""
     t1 = summary.convergence
     if rows and t1.t1_s is None:
         blocks = (

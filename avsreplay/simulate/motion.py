@@ -123,8 +123,11 @@ class Motion:
         )
         tau = (times - self._starts[step])[:, None]
         value = np.zeros((len(times), 13))
+        # ``take`` copies the column of all steps that it is given: those of one scan are few.
+        first, last = (step.min(), step.max()) if len(step) else (0, 0)
+        near = self._coefficients[first : last + 1]
         for term in range(ORDER, -1, -1):
-            value = value * tau + self._coefficients[:, term].take(step, axis=0)
+            value = value * tau + near[:, term].take(step - first, axis=0)
         return geometry.normalise(value[:, :4]), value[:, 4:7], value[:, 7:10], value[:, 10:]
 
     def poses(self, times_s: ArrayLike) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ rotation.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,29 +13,32 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.geometry import Pose, angle
 from avsreplay.records import Fit
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import Backend, Target
+from avsreplay.settings import Settings, setting
 
 LEAST_POINTS = 6
-TIGHTEN = 3.0  # rejection distance over the rms distance of the inliers
 
 
-class OwnBackend:
-    """Iterates closest points and the rigid motion between them.
+@dataclass(frozen=True, slots=True)
+class OwnParams(Settings):
+    """The table [register.own]."""
 
-    Attributes:
-        name: as in the entry point; ``--backend own`` selects it.
-        about: one line for ``avsreplay backends``.
-        requires: (module, distribution) of each library that it needs; avsreplay checks that they
-            are installed.
-        get: how to install them.
-        accuracy: largest error on an exact scan that the contract test allows: angle [deg] and
-            share of the extent.
-    """
+    tighten: float = setting(
+        3.0,
+        "Rejection distance over the rms distance of the inliers. A larger value uses more points"
+        " that are not on the target.",
+        above=1.0,
+    )
+
+
+class OwnBackend(Backend):
+    """Iterates closest points and the rigid motion between them."""
 
     name: ClassVar[str] = "own"
     about: ClassVar[str] = "point-to-point ICP of the tutorial"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("scipy", "scipy"),)
     get: ClassVar[str] = "pip install scipy"
+    parameters = OwnParams
     accuracy: ClassVar[tuple[float, float]] = (0.05, 0.0005)
 
     def __init__(self, target: Target) -> None:
@@ -42,9 +46,11 @@ class OwnBackend:
 
         Args:
             target: ``surface`` (vertices (n, 3) in {C} [m], faces), ``index`` (exact closest
-                points), ``limits`` (rejection distances, stopping rule) and ``visibility``.
+                points), ``limits`` (rejection distances, stopping rule), ``visibility`` and the
+                parameters of this back end.
         """
         self._index, self._limits = target.index, target.limits
+        self._own = target.parameters(OwnParams)
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return the pose T_ca that takes the scan {A} to the model {C}.
@@ -67,7 +73,7 @@ class OwnBackend:
             step = rigid_motion(moved[inlier], found.foot[inlier])
             T_ca = step @ T_ca
             rms = float(np.sqrt(found.d2[inlier].mean()))
-            tighter = min(gate, max(self._limits.gate_m, TIGHTEN * rms))
+            tighter = min(gate, max(self._limits.gate_m, self._own.tighten * rms))
             settled = gate - tighter <= 0.01 * gate
             gate = tighter
             middle = moved[inlier].mean(axis=0)

@@ -1,0 +1,681 @@
+"""Computes the assessment of a capture (``assessment.Assessment``).
+
+The flight is that of guidance over the log: replanning, blackouts, delay and supervisor as they
+were. Where the log ends before the capture, the flight is continued by simulation against targets
+drawn from the last belief, with the noise of the measured poses and the blackouts of the log. A
+flight that ended is compared with targets drawn from the belief at its end. Draws are made in the
+chart of the estimator (``estimate.chart``), in which nearly equal moments of inertia are no
+singularity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.assessment import Assessment, Chance, InFact, chance_of, errors_text
+from avsreplay.errors import value_class
+from avsreplay.estimate import Estimator
+from avsreplay.estimate.chart import (
+    ARM,
+    ETA,
+    INERTIA,
+    POSITION,
+    RATE,
+    VELOCITY,
+    to_chart,
+    to_errors,
+    to_state,
+)
+from avsreplay.estimate.driven import DrivenBelief
+from avsreplay.estimate.params import NoiseSource
+from avsreplay.geometry import Array, Pose
+from avsreplay.outcome import CaptureError
+from avsreplay.pipeline import planner_input
+from avsreplay.plan.contact import Contact
+from avsreplay.plan.flights import (
+    Ended,
+    Motion,
+    closed_loop,
+    closed_miss,
+    flown_positions,
+)
+from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
+from avsreplay.plan.limits import TargetGeometry
+from avsreplay.plan.supervisor import RULES, Action
+from avsreplay.plan.uncertainty import Disturbance, draws, wilson
+from avsreplay.records import Alignment, AlignStatus, Belief, State
+from avsreplay.task import Task
+
+FLIGHTS = 16  # simulated flights where the log ends before the capture
+DRAWS = 128  # targets drawn for a flight that ended
+NOISES = 50  # last measured poses whose noise is that of the simulated ones
+_EXPLAINED = 0.2  # least share of the variance of an error by which one quantity is named
+_WHY = {rule.name: rule.why for rule in RULES}
+_AXES = "xyz"
+_COORDINATES = (
+    *((ETA.start + k, f"the attitude about {a}") for k, a in enumerate(_AXES)),
+    *((RATE.start + k, f"the rate about {a}") for k, a in enumerate(_AXES)),
+    *((POSITION.start + k, f"the position along {a}") for k, a in enumerate(_AXES)),
+    *((VELOCITY.start + k, f"the velocity along {a}") for k, a in enumerate(_AXES)),
+    *((k, "the inertia") for k in range(INERTIA.start, INERTIA.stop)),
+    *((ARM.start + k, f"the mass centre along {a}") for k, a in enumerate(_AXES)),
+)
+Flags = NDArray[np.bool_]
+_QUANTITIES = ("position", "speed", "attitude")
+
+
+@value_class
+class Leg:
+    """What the robot flew after one scan.
+
+    Attributes:
+        belief: after the scan.
+        segment: its flight from then on.
+        action, rule: decision of the supervisor.
+    """
+
+    belief: Belief
+    segment: Segment
+    action: Action
+    rule: str
+
+
+class FlightLog:
+    """The flight of guidance over a log, as far as the assessment needs it.
+
+    Attributes:
+        legs: one per scan from the first approach to the end of the flight.
+        state: guidance after the last scan of the flight; None before the first.
+        belief: after the last scan.
+        converged: whether it may be used for planning.
+        gammas: of all scans.
+        stamps: of all scans [ns].
+        failing_ns: since when no capture is planned; None where one is.
+        noises: (6,) variances of the last measured poses, metres and half angles.
+    """
+
+    def __init__(self) -> None:
+        self.legs: list[Leg] = []
+        self.state: GuidanceState | None = None
+        self.belief: Belief | None = None
+        self.converged = False
+        self.gammas: list[int] = []
+        self.stamps: list[int] = []
+        self.noises: list[Array] = []
+        self.failing_ns: int | None = None
+
+    def take(
+        self,
+        belief: Belief,
+        guidance: GuidanceState | None,
+        gamma: int,
+        converged: bool,
+        noise: Array | None = None,
+    ) -> None:
+        """Take one scan.
+
+        Args:
+            belief: after it.
+            guidance: after it; it does not change after the capture.
+            gamma: 1 for a healthy scan.
+            converged: whether the belief may be used for planning.
+            noise: (6, 6) noise of the measured pose; None where nothing was measured.
+        """
+        self.gammas.append(gamma)
+        self.stamps.append(belief.t_ns)
+        if noise is not None and gamma:
+            self.noises = [*self.noises[-NOISES + 1 :], np.diagonal(noise).copy()]
+        if self.ended or guidance is None:
+            return
+        self.state, self.belief, self.converged = guidance, belief, converged
+        if converged and guidance.plan is not None and guidance.plan.found:
+            self.failing_ns = None
+        elif self.failing_ns is None and converged:
+            self.failing_ns = belief.t_ns
+        if guidance.supervisor.moving:
+            decided = guidance.decision
+            self.legs.append(Leg(belief, guidance.segment, decided.action, decided.rule))
+
+    @property
+    def ended(self) -> bool:
+        """Whether the gripper has closed or the approach was aborted."""
+        state = self.state
+        return state is not None and (
+            state.captured_ns is not None or state.decision.action is Action.ABORT
+        )
+
+    @property
+    def noise(self) -> tuple[float, float] | None:
+        """Mean 1 sigma of a measured pose: position [m] and half angle [rad] of one axis; None
+        where no pose was measured.
+        """
+        if not self.noises:
+            return None
+        mean = np.median(self.noises, axis=0)
+        return math.sqrt(float(mean[:3].mean())), math.sqrt(float(mean[3:].mean()))
+
+
+@value_class
+class Setup:
+    """What is assessed.
+
+    Attributes:
+        task: what is to be grasped.
+        estimator, guidance: those of the run.
+        target: geometry of the target about the grasp point, with its surface.
+        solid: whether inside and outside of the surface are known.
+        extent_m: of the target.
+        since_ns: instant of the first scan.
+        thrust_noise_mps2: 1 sigma of the thrust error of each axis, as its mean over 1 s.
+        noise: 1 sigma of a measured pose [m, rad of half angle]; None: R0 of the settings.
+        flights: number of simulated flights where the log ends before the capture.
+        seed: of all draws.
+        advice: grasp points that could be used, in words.
+    """
+
+    task: Task
+    estimator: Estimator
+    guidance: Guidance
+    target: TargetGeometry
+    solid: bool
+    extent_m: float
+    since_ns: int
+    thrust_noise_mps2: float = 0.0
+    noise: tuple[float, float] | None = None
+    flights: int = FLIGHTS
+    seed: int = 0
+    advice: str = ""
+    contact: Contact | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        t, closest = self.task, self.target.surface
+        half = 0.5 * t.opening_m + t.tolerance.position_m
+        found = None
+        if closest is not None and self.solid:
+            found = Contact(closest, t.axis_c, t.radius_m, half, t.mouth_m)
+        object.__setattr__(self, "contact", found)
+
+    @property
+    def limits(self) -> Array:
+        """Largest position error [m], speed [m/s] and angle [deg] (3,) of a capture."""
+        t = self.task.tolerance
+        return np.array([t.position_m, t.speed_mps, t.angle_deg])
+
+    def at_s(self, t_ns: int) -> float:
+        """Return an instant in seconds after the first scan.
+
+        Args:
+            t_ns: the instant.
+        """
+        return (t_ns - self.since_ns) * 1e-9
+
+    def rng(self, which: int) -> np.random.Generator:
+        """Return a random generator of its own for one purpose.
+
+        Args:
+            which: number of the purpose.
+        """
+        return np.random.Generator(np.random.PCG64([self.seed, which]))
+
+
+def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessment:
+    """Return whether the robot would have captured the target.
+
+    Args:
+        setup: task, estimator, guidance and target.
+        log: the flight over the log.
+        truth: true motion of the grasp point by the time after the first scan [s]; None: unknown.
+    """
+    task = setup.task
+    known: dict[str, Any] = {
+        "tolerance": CaptureError(*setup.limits.tolist()),
+        "task": task.text,
+        "basis": "flight over the log",
+    }
+    if task.problem:
+        return Assessment(
+            chance=Chance.NOT_ASSESSED, limit=task.problem, change=setup.advice, **known
+        )
+    state, belief = log.state, log.belief
+    if state is None or belief is None or not any(log.gammas):
+        return Assessment(chance=Chance.NONE, limit="no scan was used", probability=0.0, **known)
+    if state.decision.action is Action.CAPTURE:
+        found = _closed(setup, log, state)
+    elif state.decision.action is Action.ABORT:
+        found = _aborted(setup, log, state)
+    elif log.converged and state.plan is not None and state.plan.found:
+        found = _continued(setup, log, state, belief)
+    else:
+        found = _at_rest(setup, log, state, belief)
+    fact = None if truth is None else _in_fact(setup, log, state, truth)
+    return Assessment(**{**known, **found, "in_fact": fact})
+
+
+def _closed(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any]:
+    """The gripper closed: the errors in draws of the belief at that instant."""
+    end_ns = state.segment.end_ns
+    leg = next((leg for leg in reversed(log.legs) if leg.belief.t_ns <= end_ns), log.legs[0])
+    belief, after = leg.belief, np.array([(end_ns - leg.belief.t_ns) * 1e-9])
+    steps, drawn = drawn_beliefs(belief, DRAWS, setup.rng(1))
+    aimed = setup.estimator.attitude(belief)(after)[0]
+    r, v = state.segment.at(end_ns)
+    since_s = np.array([0.0, max((end_ns - state.segment.t_ns) * 1e-9, 1e-9)])
+    noise = Disturbance(setup.thrust_noise_mps2, setup.rng(2))
+    pushed = [noise.deviation(since_s) for _ in drawn]
+    errors = np.empty((len(drawn), 7))
+    for k, (each, (dr, dv)) in enumerate(zip(drawn, pushed, strict=True)):
+        (rho, rate), q = setup.estimator.motion(each)(after), setup.estimator.attitude(each)(after)
+        turn = geometry.multiply(geometry.conjugate(q[0]), aimed)
+        errors[k] = [*(rho[0] - r - dr[-1]), *(rate[0] - v - dv[-1]), geometry.angle(turn)]
+    sizes = np.column_stack(
+        [
+            np.linalg.norm(errors[:, :3], axis=1),
+            np.linalg.norm(errors[:, 3:6], axis=1),
+            np.degrees(errors[:, 6]),
+        ]
+    )
+    inside, touched = (sizes <= setup.limits).all(axis=1), _touched_by_draws(setup, log, end_ns)
+    at_s = setup.at_s(end_ns)
+    late = at_s > setup.task.deadline_s
+    good: Flags = np.asarray(inside if touched is None else inside & ~touched) & np.bool_(not late)
+    found = _probability(good)
+    largest = np.quantile(sizes, 0.95, axis=0)
+    worst = int(np.argmax(largest / setup.limits))
+    words = _cause(steps, errors, worst, np.array([np.concatenate(p, axis=1)[-1] for p in pushed]))
+    contact = None if touched is None else float(touched.mean())
+    limit = words
+    if late:
+        limit = f"the deadline of {setup.task.deadline_s:g} s"
+    elif contact is not None and contact > 1.0 - float(inside.mean()):
+        limit = "contact with the body"
+    change = ""
+    if found["chance"] is not Chance.LIKELY:
+        change = "a later deadline" if late else _change(limit)
+        found["known_s"] = setup.at_s(belief.t_ns)
+    miss = CaptureError(*largest.tolist())
+    return {**found, "at_s": at_s, "miss": miss, "contact": contact, "limit": limit} | {
+        "change": change
+    }
+
+
+def _aborted(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any]:
+    """The approach was aborted; the rules that withdrew the attempts before say why."""
+    withdrawn = [
+        leg.rule for leg in log.legs if leg.action in (Action.HOLD, Action.RETREAT) and leg.rule
+    ]
+    first = next((leg for leg in log.legs if leg.action is Action.ABORT), log.legs[-1])
+    often = Counter(withdrawn).most_common(1)
+    cause = f", mostly held because {_WHY.get(often[0][0], often[0][0])}" if often else ""
+    rule = _WHY.get(state.decision.rule, state.decision.rule)
+    touched = _touched_by_draws(setup, log, log.legs[-1].segment.end_ns)
+    last = _rule_change(often[0][0] if often else state.decision.rule)
+    return {
+        "chance": Chance.NONE,
+        "probability": 0.0,
+        "contact": None if touched is None else float(touched.mean()),
+        "limit": f"the approach was aborted ({rule}{cause})",
+        "known_s": setup.at_s(first.belief.t_ns),
+        "change": last,
+    }
+
+
+def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief) -> dict[str, Any]:
+    """The robot waits or holds without a plan: the estimate does not suffice, or no capture
+    exists.
+    """
+    touched = None if not log.legs else _touched_by_draws(setup, log, belief.t_ns)
+    contact = 0.0 if setup.contact is not None else None
+    if touched is not None:
+        contact = float(touched.mean())
+    found: dict[str, Any] = {"chance": Chance.NONE, "probability": 0.0, "contact": contact}
+    plan, params = state.plan, setup.guidance.params
+    if log.converged and plan is not None:
+        words = "proven" if plan.status.value.startswith("infeasible") else "found"
+        return {
+            **found,
+            "limit": (
+                f"no capture within {params.horizon_s:g} s with {params.a_max_mps2:g} m/s2"
+                f" ({'proven impossible' if words == 'proven' else 'none found'})"
+            ),
+            "known_s": setup.at_s(log.failing_ns or plan.t_ns),
+            "change": "more thrust or a longer horizon; 'avsreplay plan' names the settings",
+        }
+    after = _planned_s(setup, belief)
+    worst, size, cause = _predicted(setup, belief, after)
+    allowed = setup.limits[worst]
+    unit, scale = (("mm", 1e3), ("mm/s", 1e3), ("deg", 1.0))[worst]
+    lost = " any more" if any(leg.action is not Action.STAND_STILL for leg in log.legs) else ""
+    return {
+        **found,
+        "limit": (
+            f"the estimate does not suffice{lost}: predicted {_QUANTITIES[worst]} error"
+            f" {scale * size:.3g} of {scale * allowed:.3g} {unit} at a capture in {after:.0f} s,"
+            f" from {cause}"
+        ),
+        "known_s": setup.at_s(belief.t_ns),
+        "change": _change(cause),
+    }
+
+
+def _continued(
+    setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief
+) -> dict[str, Any]:
+    """The log ends before the capture: the flight continues in simulation."""
+    flown = simulated(setup, log, state, belief)
+    touched = _touched_by_draws(setup, log, belief.t_ns)
+    before = np.zeros(len(flown), bool) if touched is None else np.resize(touched, len(flown))
+    tolerance, limits = setup.task.tolerance, setup.limits
+    start_s = setup.at_s(belief.t_ns)
+    ends = [start_s + each.at_s for each in flown]
+    good, why, sizes = [], Counter[str](), list[Array]()
+    for each, end_s, hit in zip(flown, ends, before, strict=True):
+        reason = ""
+        if each.miss is not None:
+            size = np.array([each.miss.distance_m, each.miss.speed_mps, each.miss.angle_deg])
+            sizes.append(size)
+            if not each.miss.inside(tolerance):
+                worst = int(np.nanargmax(size / limits))
+                reason = f"the {_QUANTITIES[worst]} when the gripper closes"
+        else:
+            reason = f"an end without capture ({_WHY.get(each.rule, each.rule)})"
+        reason = "contact with the body" if each.touched or hit else reason
+        reason = "the deadline" if not reason and end_s > setup.task.deadline_s else reason
+        good.append(not reason)
+        why[reason] += 1
+    found = _probability(np.array(good))
+    hits = float(np.mean([each.touched or hit for each, hit in zip(flown, before, strict=True)]))
+    cause = _predicted(setup, belief, _planned_s(setup, belief))[2]
+    reasons = [reason for reason, _ in why.most_common() if reason]
+    limit = reasons[0] if reasons else cause
+    closed = [end for end, each in zip(ends, flown, strict=True) if each.miss is not None]
+    miss = CaptureError(*np.quantile(sizes, 0.95, axis=0).tolist()) if sizes else None
+    more = {} if found["chance"] is Chance.LIKELY else {"known_s": start_s}
+    return {
+        **found,
+        **more,
+        "basis": f"{len(flown)} simulated flights after the end of the log at {start_s:.1f} s",
+        "at_s": float(np.median(closed)) if closed else None,
+        "miss": miss,
+        "contact": None if setup.contact is None else hits,
+        "limit": limit,
+        "change": "" if found["chance"] is Chance.LIKELY else _change(cause),
+    }
+
+
+def simulated(
+    setup: Setup, log: FlightLog, state: GuidanceState | None, belief: Belief
+) -> list[Ended]:
+    """Fly approaches from a belief on, with measured scans, thrust errors, delay and the blackouts
+    of the log, against targets that are drawn from the belief.
+
+    Args:
+        setup: task, estimator, guidance and target.
+        log: the flight so far, whose scans give interval and blackouts.
+        state: of guidance at the belief; None: the robot is at its start.
+        belief: from which the targets are drawn.
+    """
+    rng = setup.rng(3)
+    _, drawn = drawn_beliefs(belief, setup.flights, rng)
+    out: list[Ended] = []
+    for each in drawn:
+        forecast = partial(setup.estimator.forecast, each)
+        target = planner_input(setup.estimator, each, setup.target, 1, True, forecast).scene
+        inputs = _measured(setup, log, belief, each, rng)
+        out.append(
+            closed_loop(
+                setup.guidance,
+                inputs,
+                target,
+                belief.t_ns,
+                setup.thrust_noise_mps2,
+                rng,
+                setup.contact,
+                state,
+            )
+        )
+    return out
+
+
+def _measured(
+    setup: Setup, log: FlightLog, belief: Belief, drawn: Belief, rng: np.random.Generator
+) -> Iterator[PlannerInput]:
+    """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
+    noise of the log, and no pose where the log had a blackout.
+    """
+    given: dict[str, Any] = {}
+    if setup.noise is not None:
+        position, half = setup.noise
+        given = {"r0_pos_m": position, "r0_rot_deg": 2.0 * math.degrees(half)}
+    params = replace(setup.estimator.params, noise=NoiseSource.R0, **given)
+    estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)
+    motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
+    track = estimator.initial(belief.t_ns, belief.x.T_ac)
+    step_ns = int(np.median(np.diff(log.stamps))) if len(log.stamps) > 1 else 100_000_000
+    R = np.diag(estimator.params.resolved(setup.extent_m).R0)
+    offset = int(rng.integers(len(log.gammas)))
+    last_ns = round(setup.guidance.params.horizon_s * 2e9)
+    for k, since_ns in enumerate(range(step_ns, last_ns, step_ns)):
+        t_ns, dt = belief.t_ns + since_ns, np.array([since_ns * 1e-9])
+        prior, gamma = estimator.predict(track, t_ns), log.gammas[(offset + k) % len(log.gammas)]
+        error = np.sqrt(R) * rng.standard_normal(6)
+        if gamma:
+            pose = Pose(
+                geometry.multiply(attitude(dt)[0], geometry.exp(2.0 * error[3:])),
+                motion(dt)[0][0] + error[:3],
+            )
+            seen = Alignment(pose, 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED)
+            track = estimator.update(track, prior, estimator.innovate(prior, seen), 1)
+        else:
+            track = estimator.update(track, prior, None, 0)
+        forecast = partial(estimator.forecast, track.belief)
+        yield planner_input(estimator, track.belief, setup.target, gamma, True, forecast)
+
+
+def drawn_beliefs(
+    belief: Belief, count: int, rng: np.random.Generator
+) -> tuple[Array, list[Belief]]:
+    """Draw targets from a belief, in the chart of the estimator.
+
+    Args:
+        belief: mean and covariance; with a constant acceleration, this is drawn as well.
+        count: number of draws.
+        rng: random generator.
+
+    Returns:
+        Chart steps (count, 20) from the mean, and the beliefs, each with the covariance of the
+        given one.
+    """
+    chart, n = to_chart(belief.x), len(belief.P)
+    P, driven = belief.P, isinstance(belief, DrivenBelief)
+    if isinstance(belief, DrivenBelief):
+        P = np.block([[belief.P, belief.cross], [belief.cross.T, belief.P_u]])
+    errors = draws(P, count, rng)
+    steps: Array = np.asarray(np.linalg.solve(to_errors(chart), errors[:, :n].T).T, np.float64)
+    out: list[Belief] = []
+    for y, d in zip(steps, errors, strict=True):
+        x: State = to_state(chart.moved(y))
+        more = {"u": belief.u + d[n:]} if isinstance(belief, DrivenBelief) and driven else {}
+        out.append(replace(belief, x=x, **more))
+    return steps, out
+
+
+def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None:
+    """Return for each of ``DRAWS`` targets (n,) whether the flown path touches it; None where
+    contact is not checked.
+
+    A draw has the same share of the pose error at all scans. Parts of the path that are farther
+    from the centre of mass than the target reaches cannot touch it.
+    """
+    contact = setup.contact
+    if contact is None:
+        return None
+    z = setup.rng(4).standard_normal((DRAWS, 6))
+    reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
+    parts: list[Array] = []
+    stamps = [leg.belief.t_ns for leg in log.legs]
+    for leg, begin_ns, next_ns in zip(log.legs, stamps, [*stamps[1:], end_ns], strict=True):
+        stop_ns = min(next_ns, end_ns)
+        if stop_ns <= begin_ns:
+            continue
+        instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
+        times: Array = np.asarray((instants - leg.belief.t_ns) * 1e-9, np.float64)
+        rho = setup.estimator.motion(leg.belief)(times)[0] if len(times) else r
+        if not len(r) or float(np.linalg.norm(r - rho, axis=1).min()) > 1.5 * reach:
+            continue
+        parts.append(_seen_by_draws(setup, leg.belief, times, r - rho, z))
+    if not parts:
+        return np.zeros(DRAWS, dtype=bool)
+    return contact.touched(np.concatenate(parts, axis=1))
+
+
+def _seen_by_draws(setup: Setup, belief: Belief, times: Array, d: Array, z: Array) -> Array:
+    """Positions (m, n, 3) in {C} of the robot, displaced by ``d`` (n, 3) from the predicted grasp
+    point, about m targets whose poses differ by ``z`` (m, 6) standard normal numbers.
+    """
+    root = np.linalg.cholesky(setup.estimator.pose_covariance(belief) + 1e-18 * np.eye(6))
+    errors = z @ root.T
+    R_ac = geometry.matrix(setup.estimator.attitude(belief)(times))
+    y = np.einsum("nji,mnj->mni", R_ac, d[None] - errors[:, None, :3])
+    R_bc = geometry.matrix(belief.x.q_bc)
+    turns = geometry.matrix(geometry.exp(-2.0 * errors[:, 3:] @ R_bc))
+    return np.asarray(np.einsum("mij,mnj->mni", turns, y))
+
+
+def _in_fact(setup: Setup, log: FlightLog, state: GuidanceState, truth: Motion) -> InFact | None:
+    """What happened by the true motion; None where it is not known at the end of the flight."""
+    closed = state.decision.action is Action.CAPTURE
+    if not closed and state.decision.action is not Action.ABORT:
+        return None
+    end_ns = state.segment.end_ns if closed else log.legs[-1].belief.t_ns
+    touched = _touched_in_fact(setup, log, end_ns, truth)
+    hit = {None: "contact not checked", True: "contact", False: "no contact"}[touched]
+    if not closed:
+        return InFact(False, None, touched, f"not captured, {hit}")
+    leg = next((leg for leg in log.legs if leg.action is Action.CAPTURE), log.legs[-1])
+    after = np.array([(end_ns - leg.belief.t_ns) * 1e-9])
+    aimed = setup.estimator.attitude(leg.belief)(after)[0]
+    found = closed_miss(state, setup.since_ns, truth, aimed)
+    if not math.isfinite(found.distance_m):
+        return None
+    errors = CaptureError(found.distance_m, found.speed_mps, found.angle_deg)
+    inside = found.inside(setup.task.tolerance) and found.at_s <= setup.task.deadline_s
+    word = "captured" if inside and not touched else "not captured"
+    return InFact(inside and not touched, errors, touched, f"{word}: {errors_text(errors)}, {hit}")
+
+
+def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -> bool | None:
+    """Whether the flown path touched the true target; None where this is not known."""
+    if setup.contact is None:
+        return None
+    parts: list[Array] = []
+    stamps = [leg.belief.t_ns for leg in log.legs]
+    for leg, begin_ns, next_ns in zip(log.legs, stamps, [*stamps[1:], end_ns], strict=True):
+        stop_ns = min(next_ns, end_ns)
+        if stop_ns > begin_ns:
+            instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
+            rho, _, q = truth(np.asarray((instants - setup.since_ns) * 1e-9, np.float64))
+            known = np.isfinite(rho).all(axis=1)
+            turned = np.einsum("nji,nj->ni", geometry.matrix(q[known]), (r - rho)[known])
+            parts.append(turned)
+    y = np.concatenate([np.zeros((0, 3)), *parts])
+    return bool(setup.contact.touched(y[None])[0])
+
+
+def _probability(good: Any) -> dict[str, Any]:
+    count, number = len(good), int(np.count_nonzero(good))
+    probability = number / count
+    return {
+        "chance": chance_of(probability),
+        "probability": probability,
+        "probability_95": wilson(number, count),
+    }
+
+
+def _planned_s(setup: Setup, belief: Belief) -> float:
+    """Time to a capture that is planned from the start of the robot, without constraints [s]."""
+    from avsreplay.plan.rendezvous import rendezvous
+
+    p = setup.guidance.params
+    start = np.array(p.robot_position_m), np.array(p.robot_velocity_mps)
+    found = rendezvous(setup.estimator.motion(belief), *start, p, belief.t_ns)
+    return found.t_go_s if found.found else p.horizon_s
+
+
+def _predicted(setup: Setup, belief: Belief, after_s: float) -> tuple[int, float, str]:
+    """The error of the grasp point in some time that is largest in units of its tolerance: which
+    one, its 1 sigma, and the quantity of the belief from which it mostly comes.
+    """
+    found = setup.estimator.forecast(belief, np.array([after_s]))
+    sizes = np.array(
+        [found.pos_1s_m[-1], found.vel_1s_mps[-1], math.degrees(float(found.rot_1s_rad[-1]))]
+    )
+    worst = int(np.argmax(sizes / setup.limits))
+    steps, drawn = drawn_beliefs(belief, DRAWS, setup.rng(5))
+    at, errors = np.array([after_s]), np.empty((DRAWS, 7))
+    (rho, rate), q = setup.estimator.motion(belief)(at), setup.estimator.attitude(belief)(at)[0]
+    for k, each in enumerate(drawn):
+        (r, v), own = setup.estimator.motion(each)(at), setup.estimator.attitude(each)(at)[0]
+        turn = geometry.angle(geometry.multiply(geometry.conjugate(own), q))
+        errors[k] = [*(r - rho)[0], *(v - rate)[0], turn]
+    return worst, float(sizes[worst]), _cause(steps, errors, worst)
+
+
+def _cause(steps: Array, errors: Array, worst: int, pushed: Array | None = None) -> str:
+    """The quantity that explains most of an error.
+
+    Args:
+        steps: (n, 20) chart steps of the draws.
+        errors: (n, 7) errors of position, velocity and angle.
+        worst: which of them.
+        pushed: (n, 6) deviations of the robot by errors of the thrust.
+    """
+    part = errors[:, (slice(0, 3), slice(3, 6), slice(6, 7))[worst]]
+    x = np.abs(steps) if worst == 2 else steps
+    columns = [*x.T]
+    names = [name for _, name in sorted(_COORDINATES)]
+    if pushed is not None and np.any(pushed) and worst < 2:
+        columns += list(pushed[:, 3 * worst : 3 * worst + 3].T)
+        names += ["errors of the thrust"] * 3
+    centred = part - part.mean(axis=0)
+    total = float(np.sum(centred**2))
+    shares: dict[str, float] = {}
+    for name, column in zip(names, columns, strict=True):
+        c = column - column.mean()
+        size = float(c @ c)
+        if size > 0.0 and total > 0.0:
+            share = float(np.sum((c @ centred) ** 2)) / (size * total)
+            grouped = name in ("errors of the thrust", "the inertia")
+            shares[name] = share + (shares.get(name, 0.0) if grouped else 0.0)
+    best = max(shares, key=lambda name: shares[name], default="")
+    if not best or shares[best] < _EXPLAINED:
+        return f"the {_QUANTITIES[worst]} error when the gripper closes"
+    return best
+
+
+def _change(cause: str) -> str:
+    """What would change a capture that fails because of a quantity, in words."""
+    if cause.startswith(("the attitude", "the rate", "the inertia", "the mass")):
+        return "a longer observation would help, or a fixture nearer to the mass centre"
+    if "contact" in cause:
+        return "another fixture or approach axis would help, or limits.final_deg with a clearance"
+    if "thrust" in cause:
+        return "a robot with smaller errors of the thrust, or a larger tolerance, would help"
+    return "a longer observation or a larger tolerance would help"
+
+
+def _rule_change(rule: str) -> str:
+    """What would change a flight that a rule of the supervisor ended, in words."""
+    if rule in ("plan_lost", "no_plan_yet", "too_long"):
+        return "more thrust or a longer time limit would help"
+    if rule in ("constraint_broken", "too_close_unsure"):
+        return "another fixture or wider limits would help"
+    return "a longer observation or fewer rejected scans would help"

@@ -1,0 +1,43 @@
+"""Signals that end a command: SIGTERM and SIGHUP act as Ctrl-C, also where Ctrl-C is ignored."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+
+_received: list[int] = []
+_ignored: list[bool] = []
+
+
+def hear() -> list[int]:
+    """Let SIGTERM and SIGHUP, unless they are ignored, act as SIGINT; return the list that
+    receives their numbers.
+
+    A shell starts a command in the background with SIGINT ignored. It stays so, but a SIGINT that
+    stands for one of the other signals counts.
+    """
+    del _received[:], _ignored[:]
+    with contextlib.suppress(ValueError):  # a thread other than the main one sets no handler
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            _ignored.append(True)
+            signal.signal(signal.SIGINT, _end)
+        for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _stand_in)
+    return _received
+
+
+def counts() -> bool:
+    """Return whether a SIGINT that has arrived is to end the command."""
+    return bool(_received) or not _ignored
+
+
+def _stand_in(number: int, _frame: object) -> None:
+    _received.append(number)
+    signal.raise_signal(signal.SIGINT)
+
+
+def _end(_number: int, _frame: object) -> None:
+    if counts():
+        raise KeyboardInterrupt

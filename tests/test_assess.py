@@ -1,0 +1,208 @@
+"""The task, contact with the body, and the assessment of a capture."""
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from avsreplay.assess import drawn_beliefs
+from avsreplay.assessment import Assessment, Chance, InFact, chance_of
+from avsreplay.build import target_geometry
+from avsreplay.estimate.chart import to_chart, to_errors, to_state
+from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.geometry import exp, matrix
+from avsreplay.outcome import CaptureError
+from avsreplay.plan.contact import Contact
+from avsreplay.plan.robot import Limits, RobotParams
+from avsreplay.plan.supervisor import SupervisorParams
+from avsreplay.records import Belief, State, Surface
+from avsreplay.simulate.target import Shape, builtin_surface
+from avsreplay.task import TaskParams, patches, task_of
+
+TOLERANCE = CaptureError(0.013, 0.0066, 2.0)
+
+
+def body(shape=Shape.CUBE, shift=(0.0, 0.0, 0.0)):
+    made = builtin_surface(shape)
+    surface = Surface(made.vertices + np.array(shift), made.faces, "body", "")
+    return surface, target_geometry(surface, (1.0, 0.0, 0.0)).surface
+
+
+def task(surface, closest, limits=None, **given):
+    return task_of(
+        TaskParams(**given),
+        SupervisorParams(),
+        RobotParams(),
+        (1.0, 0.0, 0.0),
+        surface,
+        closest,
+        limits,
+    )
+
+
+@pytest.mark.parametrize("shape", list(Shape))
+def test_the_grasp_point_of_every_built_in_body_can_be_used(shape):
+    assert task(*body(shape)).problem == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"grasp_m": (-0.5, 0.0, 0.0)}, "inside the body"),
+        ({"grasp_m": (0.4, 0.0, 0.0)}, "off the surface"),
+        ({"grasp_m": (0.0, 0.0, 0.0), "axis": (-1.0, 0.0, 0.0)}, "passes through the body"),
+    ],
+)
+def test_a_grasp_point_that_cannot_be_reached_is_found_before_the_run(given, word):
+    assert word in task(*body(), **given).problem
+
+
+@pytest.mark.parametrize("shape", list(Shape))
+def test_every_proposed_patch_is_a_grasp_point_on_the_surface_that_can_be_used(shape):
+    surface, closest = body(shape, (0.3, -0.2, 0.1))
+    found = patches(surface, closest)
+    assert 1 <= len(found) <= 3
+    for patch in found:
+        foot, gap = closest(np.array([patch.point]))
+        assert abs(gap[0]) < 1e-3 * surface.extent
+        assert np.linalg.norm(foot[0] - patch.point) < 1e-3 * surface.extent
+        assert math.hypot(*patch.axis) == pytest.approx(1.0)
+        assert task(surface, closest, patch=patch.name).problem == ""
+    with pytest.raises(ValueError, match="the model has: flat-1"):
+        task(surface, closest, patch="flat-9")
+
+
+def test_a_corridor_does_not_end_inside_the_part_at_the_grasp_point():
+    limits = Limits(final_deg=15.0, clearance_m=0.1)
+    surface, closest = body(Shape.BRACKET)
+    made = task(surface, closest, limits).corridor(limits).resolved(surface.extent)
+    end = np.array([[made.final_range_m, 0.0, 0.0]])
+    assert closest(end)[1][0] >= 0.1
+
+
+def contact(radius_m=0.0, half_m=0.01, mouth_m=0.0):
+    _, closest = body()
+    return Contact(closest, np.array([1.0, 0.0, 0.0]), radius_m, half_m, mouth_m)
+
+
+def test_a_straight_approach_is_no_contact_and_a_path_through_the_body_is():
+    x = np.linspace(2.0, 0.0, 101)
+    straight = np.column_stack([x, 0.0 * x, 0.0 * x])
+    through = np.column_stack([-x - 0.5, 0.0 * x, 0.0 * x])[::-1]
+    assert contact().touched(np.array([straight, straight[::-1] * [-1, 1, 1]])).tolist() == [
+        False,
+        True,
+    ]
+    assert contact(radius_m=0.05).touched(straight[None])[0] == np.False_
+    assert contact().touched(through[::-1][None])[0]
+
+
+def test_a_part_that_the_gripper_encloses_is_entered_through_the_mouth_only():
+    _, closest = body(Shape.BRACKET)
+    grip = Contact(closest, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
+    x = np.linspace(0.6, 0.0, 201)
+    along = np.column_stack([x, 0.0 * x, 0.0 * x])
+    aside = np.column_stack([0.0 * x + 0.03, x, 0.0 * x])
+    assert grip.touched(np.array([along, aside])).tolist() == [False, True]
+
+
+def belief(sigma=(0.1, -0.2), spread=1e-3, seed=0):
+    rng = np.random.default_rng(seed)
+    x = State(
+        exp(rng.normal(size=3)),
+        rng.normal(size=3) * 0.1,
+        np.array([0.0, 0.0, 5.0]),
+        rng.normal(size=3) * 0.01,
+        np.array(sigma),
+        rng.normal(size=3),
+        exp(rng.normal(size=3)),
+    )
+    A = rng.normal(size=(20, 20)) * spread
+    T = to_errors(to_chart(x))
+    return Belief(0, x, T @ A @ A.T @ T.T), A @ A.T
+
+
+@pytest.mark.parametrize("sigma", [(0.1, -0.2), (1e-3, -1e-3), (1e-5, 2e-5)])
+def test_draws_have_the_covariance_of_the_chart_also_where_two_moments_are_equal(sigma):
+    given, P = belief(sigma)
+    steps, drawn = drawn_beliefs(given, 4000, np.random.default_rng(1))
+    scale = np.sqrt(np.diag(P))
+    assert np.abs((steps.T @ steps / 4000 - P) / np.outer(scale, scale)).max() < 0.1
+    chart = to_chart(given.x)
+    for y, each in zip(steps[:20], drawn[:20], strict=True):
+        expected = to_state(chart.moved(y)).T_ac
+        assert np.linalg.norm(each.x.T_ac.t - expected.t) < 1e-12
+    # the pose of the fixture varies as its covariance in the chart says, not as that of the axes
+    moved = np.array([each.x.T_ac.t - given.x.T_ac.t for each in drawn])
+    assert np.abs(moved.std(axis=0) / np.sqrt(np.diag(P)[6:9]) - 1.0).max() < 0.1
+
+
+def test_a_belief_about_another_point_has_its_position_and_covariance():
+    given, _ = belief(spread=1e-4)
+    point = np.array([0.3, -0.4, 0.2])
+    moved = at_grasp(given, point)
+    assert moved.x.T_ac.t == pytest.approx(given.x.T_ac.t + matrix(given.x.T_ac.q) @ point)
+    _, drawn = drawn_beliefs(given, 3000, np.random.default_rng(2))
+    _, others = drawn_beliefs(moved, 3000, np.random.default_rng(3))
+    far = np.array([d.x.T_ac.t + matrix(d.x.T_ac.q) @ point for d in drawn]) - moved.x.T_ac.t
+    near = np.array([d.x.T_ac.t for d in others]) - moved.x.T_ac.t
+    A, B = np.cov(far.T), np.cov(near.T)
+    assert np.abs(A - B).max() < 0.15 * np.abs(A).max()
+    assert at_grasp(given, np.zeros(3)) is given
+
+
+def test_an_assessment_reads_back_from_its_record_and_says_the_same():
+    fact = InFact(True, CaptureError(0.001, 0.0002, math.nan), False, "captured")
+    made = Assessment(
+        chance=Chance.LIKELY,
+        probability=0.96,
+        probability_95=(0.86, 1.0),
+        at_s=30.4,
+        tolerance=TOLERANCE,
+        miss=TOLERANCE,
+        contact=0.0,
+        limit="the rate about z",
+        in_fact=fact,
+    )
+    again = Assessment.of_record(json.loads(json.dumps(made.record(), allow_nan=False)))
+    assert again is not None
+    assert again.sentence == made.sentence
+    assert again.record() == made.record()
+    assert made.sentence.startswith(
+        "CAPTURE likely: 0.96 (0.86 to 1.00) within 13 mm and 2 deg at 30.4 s; no contact;"
+        " limited by the rate about z"
+    )
+    assert Assessment.of_record(None) is None
+
+
+def test_the_word_follows_the_probability():
+    assert [chance_of(p) for p in (1.0, 0.9, 0.6, 0.1)] == [
+        Chance.LIKELY,
+        Chance.LIKELY,
+        Chance.POSSIBLE,
+        Chance.UNLIKELY,
+    ]
+
+
+def _run(fixtures_folder, *more):
+    command = [sys.executable, "-m", "avsreplay", "run", str(fixtures_folder / "tumble.mcap")]
+    done = subprocess.run([*command, *more, "--json"], capture_output=True, text=True, check=False)
+    return done.returncode, json.loads(done.stdout)["verdict"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("more", "chance", "code"),
+    [
+        (("--set", "plan.a_max_mps2=0.0001", "--require", "pass"), "none", 1),
+        (("--set", "task.grasp_m=[-0.5,0,0.3]", "--require", "capture=0.1"), "not assessed", 1),
+        (("--set", "plan.a_max_mps2=0.0001"), "none", 0),
+    ],
+)
+def test_a_run_without_a_capture_is_no_pass(fixtures_folder, more, chance, code):
+    returned, verdict = _run(fixtures_folder, *more)
+    assert (verdict["capture"]["chance"], returned) == (chance, code)
+    assert verdict["grade"] != "PASS"
