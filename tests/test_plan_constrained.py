@@ -289,7 +289,7 @@ def test_the_robot_keeps_clear_of_the_body_and_arrives_from_outside(phase):
 
 
 def ball_margin(limits, y):
-    """Margin of a withdrawal at points in {C}: of the corridor, else of the distance to the ball."""
+    """Margin of a withdrawal at points in {C}: of the corridor, else to the ball."""
     along = y[:, 0]
     side = (
         math.tan(math.radians(limits.final_deg)) * along
@@ -320,7 +320,7 @@ def test_a_withdrawal_from_any_instant_keeps_the_stated_margin(phase):
         space = Space(SampledScene(later, 60.0, 0.2, 45.0), limits, PARAMS.a_max_mps2, 2.0)
         planned = path.escapes[np.abs(path.escapes[:, 0] - t).argmin(), 1:]
         away = withdrawal(space, r, v, 1.0, planned=planned).path
-        times = np.arange(0.0, away.t_go_s, 0.05)
+        times = np.arange(0.0, away.t_go_s + 0.05, 0.05)
         turn = Rotation.from_quat(later.attitude(times))
         y = turn.inv().apply(away.at(times)[0] - later.goal(times)[0])
         assert ball_margin(limits, y) >= plan.abort_margin_m - space.resolution_m

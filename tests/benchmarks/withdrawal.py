@@ -117,6 +117,8 @@ class Truth:
 
     def distance(self, y):
         """Signed distances (n,); the sign only where it matters, near the surface."""
+        if not len(y):
+            return np.zeros(0)
         away = trimesh.proximity.closest_point(self.mesh, y)[1]
         low, high = self.mesh.bounds
         near = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
