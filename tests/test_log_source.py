@@ -26,6 +26,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log import ClockChoice, LogWriter, SourceOptions, open_source
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text
 from avsreplay.log.doctor import examine
+from avsreplay.log.pose_messages import PoseTrack
 from avsreplay.records import Scan, ScanStatus
 
 CLOUDS = scans(12, 150)
@@ -158,6 +159,26 @@ def test_a_split_bag_is_one_log_in_the_order_of_its_numbers(tmp_path: Path) -> N
     with open_source(folder) as source:
         assert len(source) == 12
         assert [loss.file for loss in source.losses] == ["bag_12.mcap"]
+        (topic,) = (each for each in source.info().topics if each.type.endswith("PointCloud2"))
+        whole = mcap(tmp_path / "whole.mcap", parts)
+        with open_source(whole) as single:
+            (other,) = (e for e in single.info().topics if e.type.endswith("PointCloud2"))
+    assert (topic.count, topic.first_ns, topic.last_ns) == (12, other.first_ns, other.last_ns)
+
+
+def test_a_pose_between_two_lies_at_its_share_of_the_time() -> None:
+    track, turn = PoseTrack(1.0), Rotation.from_rotvec([0.0, 0.6, 0.0])
+    for t_ns, share in ((2_000_000_000, 1.0), (1_000_000_000, 0.0)):  # in any order
+        q = (turn**share).as_quat()
+        track.add(t_ns, (4.0 * share, 1.0, 0.0, *q))
+    found = track.pose(1_250_000_000)
+    assert found is not None
+    np.testing.assert_allclose(found.t, [1.0, 1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(found.R, (turn**0.25).as_matrix(), atol=1e-15)
+    assert track.pose(999_999_999) is None
+    assert track.pose(2_000_000_001) is None
+    track.add(3_000_000_001, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))  # a gap of 1 s and 1 ns
+    assert track.pose(2_500_000_000) is None
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.98])

@@ -9,7 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.path import CostatePath, sample_goal
-from avsreplay.plan.reachable_set import _NODES, _WEIGHTS, Gauge, gauge, integrals, support
+from avsreplay.plan.reachable_set import (
+    _NODES,
+    _WEIGHTS,
+    Gauge,
+    gauge,
+    integrals,
+    newton_step,
+    support,
+)
 from avsreplay.plan.rendezvous import PlanParams, _Margin, rendezvous
 
 ORIGIN = np.zeros(3)
@@ -247,3 +255,25 @@ def test_the_gauss_nodes_are_those_of_the_legendre_polynomial():
     nodes, weights = np.polynomial.legendre.leggauss(len(_NODES))
     assert np.allclose(_NODES, nodes, rtol=0.0, atol=1e-15)
     assert np.allclose(_WEIGHTS, weights, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_a_newton_step_solves_the_system_of_the_plane(damping):
+    """Against a general solver, with the blocks 00, 01 and 11 of the Hessian."""
+    for P in np.random.default_rng(8).standard_normal((50, 4)):
+        h, gradient, blocks = support(*P)
+        b = np.asarray(gradient) / h  # P . b = 1, as h is homogeneous
+        b += 0.1 * np.array([P[1], -P[0], P[3], -P[2]])
+        xx, xy, yy = np.reshape(blocks, (3, 3)).T
+        H = np.block(
+            [
+                [np.array([[xx[i + j], xy[i + j]], [xy[i + j], yy[i + j]]]) for j in (0, 1)]
+                for i in (0, 1)
+            ]
+        )
+        residual = np.asarray(gradient) - h * b
+        trace = xx[0] + yy[0] + xx[2] + yy[2]
+        step = np.linalg.solve(H + trace * np.outer(b, b) + damping * np.eye(4), -residual)
+        step -= (b @ step) * P
+        found = newton_step([*residual], blocks, [*P], [*b], damping)
+        np.testing.assert_allclose(found, step, rtol=1e-7, atol=1e-9 * np.abs(step).max())

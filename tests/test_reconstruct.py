@@ -19,7 +19,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct.fusion import continues, contradicting, fused, refuted
 from avsreplay.reconstruct.model import at_grasp, deviations, surface_of
-from avsreplay.reconstruct.reconstruction import reconstruct, true_frame
+from avsreplay.reconstruct.reconstruction import evenly, reconstruct, true_frame
 from avsreplay.reconstruct.registration import Pairing, between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import (
@@ -765,3 +765,13 @@ def test_a_point_at_the_sensor_is_left_out_of_a_view():
     assert np.isfinite(view.normals).all()
     assert np.isfinite(view.weight).all()
     assert np.linalg.norm(view.points - camera, axis=1).min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("count", "left"), [(0, 0), (1, 1), (149, 149), (150, 150), (151, 76), (301, 101)]
+)
+def test_scans_beyond_the_most_that_are_fused_are_thinned_evenly(count, left):
+    chosen = evenly(range(count), 150)
+    assert len(chosen) == left
+    assert len(set(np.diff(chosen))) <= 1
+    assert list(chosen[:1]) == list(range(count)[:1])

@@ -155,10 +155,10 @@ def support(
     return _closed_support(p0x, p0y, p1x, p1y)
 
 
-def _newton_step(
+def newton_step(
     residual: list[float], hess: list[float], P: list[float], b: list[float], damping: float
 ) -> list[float]:
-    """Return the Newton step that decreases h on the plane P.b = 1.
+    """Return the Newton step (4) that decreases h on the plane P.b = 1.
 
     h is homogeneous, so H P = 0 and P.(grad - h b) = 0. The solution of (H + k b b^T) step = -(grad
     - h b) therefore satisfies b.step = 0, and the KKT system reduces to four symmetric positive
@@ -226,7 +226,7 @@ def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
             break
         trace = now.hess[0] + now.hess[2] + now.hess[6] + now.hess[8]
         damping = 1e-3 * min(now.size, 1.0) * trace + 1e-14 * trace
-        better = _search(now, _newton_step(now.residual, now.hess, now.P, b, damping), b)
+        better = _search(now, newton_step(now.residual, now.hess, now.P, b, damping), b)
         if better is None or (better.size >= now.size and now.size < 1e-13):
             break
         now = better

@@ -151,7 +151,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
             found.views, fine, motion, found.gate, p.thin * survey.extent, survey.extent
         )
         poses = _on_motion(found, motion)
-    chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
+    chosen = evenly(sorted(poses), MOST_FUSED)
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
     points, normals, one_sigma_m, seen, sights = fused(
         surveyed_scans(scans, survey),
@@ -366,3 +366,8 @@ def _notes(used: int, offered: int, contradicting: int, coverage: float) -> tupl
     if coverage < 0.5:
         notes.append(f"the target was seen from {100.0 * coverage:.0f} % of all directions only")
     return tuple(notes)
+
+
+def evenly(numbers: Sequence[int], most: int) -> Sequence[int]:
+    """Return every n-th of some numbers, with the least n that leaves at most ``most``."""
+    return numbers[:: max(1, -(-len(numbers) // most))]

@@ -1,11 +1,14 @@
 """Measure the structure of the source code: size, share of imports, path of one scan, duplicate
 names, documentation.
 
-    python tests/benchmarks/structure.py                  # this checkout python
-    tests/benchmarks/structure.py --json           # the same for machines python
-    tests/benchmarks/structure.py --root CHECKOUT  # another checkout, for example an earlier
-    version python tests/benchmarks/structure.py --list           # the functions whose docstring
-    lacks a section, small modules
+    python tests/benchmarks/structure.py                  # this checkout
+    python tests/benchmarks/structure.py --json           # the same for machines
+    python tests/benchmarks/structure.py --root CHECKOUT  # another checkout
+    python tests/benchmarks/structure.py --list           # what lacks a docstring section
+
+Tokens are those of Python without comments, docstrings and line ends. A constant is a name in
+capitals that a module assigns a number. Private members are names that begin with one underscore,
+taken from another module. A long line has over 100 characters. Complexity is radon's.
 
 Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments
 and docstrings. The import share counts the lines of import statements and of ``__all__`` over all
@@ -55,6 +58,7 @@ def main() -> None:
         | docstrings(options.root)
         | settings(options.root)
     )
+    found |= concepts(options.root) | form(options.root) | complexity(options.root)
     found |= traced(options.root)
     if options.json:
         print(json.dumps(found, indent=1))
@@ -103,6 +107,145 @@ def sizes(root: Path) -> dict:
         "modules with one importer": single,
         "longest module": f"{longest[0]} ({longest[1]} lines)",
         **{f"  {name} (modules, lines)": f"{n}, {k}" for name, (n, k) in sorted(packages.items())},
+    }
+
+
+def concepts(root: Path) -> dict:
+    """Code tokens, numeric constants, parameters and private members, in all and by package."""
+    tokens: collections.Counter[str] = collections.Counter()
+    constants: collections.Counter[str] = collections.Counter()
+    values: dict[str, set[str]] = collections.defaultdict(set)
+    wide = 0
+    for path in modules(root):
+        text = path.read_text(encoding="utf-8")
+        parts = path.relative_to(root / "avsreplay").parts
+        package = parts[0] if len(parts) > 1 else "root"
+        tokens[package] += code_tokens(text)
+        tree = ast.parse(text)
+        for node in tree.body:
+            for name, value in numbers_assigned(node):
+                constants[package] += 1
+                values[name].add(value)
+        functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
+        wide += sum(parameters(node) >= MANY_PARAMETERS for node in functions)
+    return {
+        "code tokens": tokens.total(),
+        **{f"  {name} (code tokens)": n for name, n in sorted(tokens.items())},
+        "numeric constants": constants.total(),
+        **{f"  {name} (numeric constants)": n for name, n in sorted(constants.items())},
+        "constant names with several values": sum(len(v) > 1 for v in values.values()),
+        f"functions with {MANY_PARAMETERS} or more parameters": wide,
+        "private members used by other modules": sum(map(private_uses, modules(root))),
+        "private members used by tests": sum(
+            map(private_uses, sorted((root / "tests").glob("test_*.py")))
+        ),
+    }
+
+
+MANY_PARAMETERS = 8
+NOT_CODE = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENCODING,
+    tokenize.ENDMARKER,
+}
+
+
+def code_tokens(text: str) -> int:
+    """Tokens without comments, line ends and strings that are statements."""
+    found, begins = 0, True
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type in NOT_CODE:
+            begins = begins or token.type in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+            continue
+        found += not (begins and token.type == tokenize.STRING)
+        begins = False
+    return found
+
+
+def numbers_assigned(node: ast.stmt):
+    """Names in capitals and the text of their values, of an assignment with a number in it."""
+    targets = node.targets if isinstance(node, ast.Assign) else []
+    targets = [node.target] if isinstance(node, ast.AnnAssign) and node.value else targets
+    for target in targets:
+        each = zip(target.elts, node.value.elts, strict=False) if _is_tuple(target, node) else ()
+        for name, value in each or ((target, node.value),):
+            is_number = isinstance(value, (ast.Constant, ast.UnaryOp, ast.BinOp)) and any(
+                isinstance(n, ast.Constant) and type(n.value) in (int, float)
+                for n in ast.walk(value)
+            )
+            if isinstance(name, ast.Name) and name.id.lstrip("_").isupper() and is_number:
+                yield name.id.lstrip("_"), ast.unparse(value)
+
+
+def _is_tuple(target: ast.expr, node: ast.stmt) -> bool:
+    return isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+
+
+def parameters(node: ast.FunctionDef) -> int:
+    """Parameters of a function without self and cls."""
+    every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    return sum(a.arg not in ("self", "cls") for a in every)
+
+
+def private_uses(path: Path) -> int:
+    """Imports of private names of the package, and private attributes of what is not self."""
+    found = 0
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("avsreplay"):
+            found += sum(_is_private(alias.name) for alias in node.names)
+        elif isinstance(node, ast.Attribute) and _is_private(node.attr):
+            base = node.value.id if isinstance(node.value, ast.Name) else ""
+            found += base not in ("self", "cls", "other", "os", "sys") and path.name.startswith(
+                "test_"
+            )
+    return found
+
+
+def _is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__") and name != "_kernel"
+
+
+def form(root: Path) -> dict:
+    """Share of long lines, and words of the documentation."""
+    lines = [
+        line for path in modules(root) for line in path.read_text(encoding="utf-8").splitlines()
+    ]
+    pages = [root / "README.md", root / "CONTRIBUTING.md", *(root / "docs").rglob("*.md")]
+    return {
+        "lines over 100 characters [%]": round(
+            100.0 * sum(len(line) > 100 for line in lines) / len(lines), 2
+        ),
+        "words of documentation": sum(len(p.read_text(encoding="utf-8").split()) for p in pages),
+    }
+
+
+def complexity(root: Path) -> dict:
+    """Functions above a cyclomatic complexity of 10 and of 20, in all and by package."""
+    try:
+        from radon.complexity import cc_visit
+    except ImportError:
+        return {"functions above complexity 10, 20": "radon is not installed"}
+    found: dict[str, list[int]] = collections.defaultdict(list)
+    for path in modules(root):
+        parts = path.relative_to(root / "avsreplay").parts
+        blocks = cc_visit(path.read_text(encoding="utf-8"))
+        found[parts[0] if len(parts) > 1 else "root"] += [
+            block.complexity for block in blocks if block.letter != "C"
+        ]
+    count = {
+        name: [sum(c > most for c in all_) for most in (10, 20)] for name, all_ in found.items()
+    }
+    every = [sum(each[k] for each in count.values()) for k in (0, 1)]
+    return {
+        "functions above complexity 10, 20": f"{every[0]}, {every[1]}",
+        **{
+            f"  {name} (above complexity 10, 20)": f"{a}, {b}"
+            for name, (a, b) in sorted(count.items())
+        },
     }
 
 

@@ -1,0 +1,216 @@
+"""Whether tests fail where the code is wrong: ``python tests/benchmarks/mutants.py --seed 1 --count
+60``.
+
+Each mutant changes one operator, comparison, sign, number or condition of one module, chosen by the
+seed among all that the syntax trees of the package contain. The test files of its area run in a
+copy of the checkout: those whose name begins with the package or the package and the module. Prints
+one line per mutant, then the share that was killed; survivors may be equivalent to the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMIT_S = 600  # of the tests of a mutant; one that does not end is killed
+SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Div,
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.USub: ast.UAdd,
+}
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: the module, the number of its node in the tree, line, and text of the line."""
+
+    path: Path
+    number: int
+    line: int
+    what: str
+
+
+class _Change(ast.NodeTransformer):
+    """Counts what can be changed; changes number ``wanted``."""
+
+    def __init__(self, wanted: int = -1) -> None:
+        self.wanted, self.found = wanted, list[tuple[int, str]]()
+
+    def _is_wanted(self, node: ast.AST, what: str) -> bool:
+        self.found.append((getattr(node, "lineno", 0), what))
+        return len(self.found) - 1 == self.wanted
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        return self._operator(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> ast.AST:
+        return self._operator(node)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.AST:
+        return self._operator(node)
+
+    def _operator(self, node: ast.BinOp | ast.BoolOp | ast.UnaryOp) -> ast.AST:
+        other = SWAPPED.get(type(node.op))
+        if other and self._is_wanted(node, f"{type(node.op).__name__} to {other.__name__}"):
+            node.op = other()  # type: ignore[assignment]
+        return self.generic_visit(node)
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        other = SWAPPED.get(type(node.ops[0]))
+        if other and self._is_wanted(node, f"{type(node.ops[0]).__name__} to {other.__name__}"):
+            node.ops[0] = other()  # type: ignore[call-overload]
+        return self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> ast.AST:
+        if type(node.value) in (int, float) and self._is_wanted(node, f"{node.value} plus one"):
+            return ast.copy_location(ast.Constant(node.value + 1), node)
+        if type(node.value) is bool and self._is_wanted(node, f"not {node.value}"):
+            return ast.copy_location(ast.Constant(not node.value), node)
+        return node
+
+    def visit_If(self, node: ast.If) -> ast.AST:
+        if self._is_wanted(node, "condition negated"):
+            node.test = ast.copy_location(ast.UnaryOp(ast.Not(), node.test), node.test)
+        return self.generic_visit(node)
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
+        if node.value is not None:
+            node.value = self.visit(node.value)
+        return node
+
+
+def mutants(path: Path) -> Iterator[Mutant]:
+    """Every change of a module."""
+    change = _Change()
+    change.visit(ast.parse(path.read_text(encoding="utf-8")))
+    for number, (line, what) in enumerate(change.found):
+        yield Mutant(path.relative_to(ROOT), number, line, what)
+
+
+def tests_of(path: Path, folder: Path) -> list[str]:
+    """The test files of the area of a module: its own ones, else those of its package."""
+    package = path.parent.name if path.parent.name != "avsreplay" else ""
+    own = "_".join(filter(None, (package, path.stem)))
+    for name in (own, package):
+        found = sorted((folder / "tests").glob(f"test_{name}*.py")) if name else []
+        if found and name == own and package:
+            return [str(f) for f in found] + ["tests/test_golden.py"]
+        if found:
+            return [*map(str, found)]
+    return ["tests/test_golden.py", "tests/test_run.py", "tests/test_cli_results.py"]
+
+
+def passes(tests: list[str], folder: Path, slow: bool) -> bool:
+    """Whether tests pass in a copy of the checkout; tests that do not end fail."""
+    chosen = () if slow else ("-m", "not slow")
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *chosen]
+    try:
+        done = subprocess.run(
+            [*command, *tests],
+            cwd=folder,
+            env=_environment(folder),
+            capture_output=True,
+            timeout=LIMIT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def killed(mutant: Mutant, tests: list[str], folder: Path, slow: bool) -> bool:
+    """Whether a test fails with the mutant."""
+    place = folder / mutant.path
+    text = place.read_text(encoding="utf-8")
+    tree = _Change(mutant.number).visit(ast.parse(text))
+    place.write_text(ast.unparse(ast.fix_missing_locations(tree)) + "\n", encoding="utf-8")
+    try:
+        return not passes(tests, folder, slow)
+    finally:
+        place.write_text(text, encoding="utf-8")
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def _is_imported(folder: Path) -> bool:
+    """Whether Python imports the package from there; an editable install has another place."""
+    code = "import avsreplay; print(avsreplay.__file__)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder.parent,
+        env=_environment(folder),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.stdout.startswith(str(folder))
+
+
+def main() -> int:
+    """Run the campaign."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--only", default="", help="modules whose path contains this")
+    parser.add_argument("--slow", action="store_true", help="run the slow tests of the area too")
+    parser.add_argument("--list", action="store_true", help="print the mutants and stop")
+    options = parser.parse_args()
+    paths = sorted(p for p in ROOT.glob("avsreplay/**/*.py") if options.only in str(p))
+    everything = [mutant for path in paths for mutant in mutants(path)]
+    sample = random.Random(options.seed).sample(everything, min(options.count, len(everything)))
+    print(f"{len(sample)} of {len(everything)} mutants of {len(paths)} modules", flush=True)
+    ended: list[bool] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "avsreplay"
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "build", ".mypy_cache"))
+        if not options.list and not _is_imported(folder):
+            print("install the package without --editable", file=sys.stderr)
+            return 2
+        sound: dict[tuple[str, ...], bool] = {}  # tests of an area pass without a mutant
+        for mutant in sample:
+            where = f"{mutant.path}:{mutant.line} {mutant.what}"
+            if options.list:
+                print(where)
+                continue
+            tests = tests_of(mutant.path, folder)
+            if tuple(tests) not in sound:
+                sound[tuple(tests)] = passes(tests, folder, options.slow)
+            if not sound[tuple(tests)]:
+                print(f"no verdict, as its tests fail without it: {where}", flush=True)
+                continue
+            ended.append(killed(mutant, tests, folder, options.slow))
+            print(f"{'killed  ' if ended[-1] else 'survived'} {where}", flush=True)
+    if ended:
+        print(f"killed {sum(ended)} of {len(ended)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
