@@ -254,7 +254,7 @@ def test_a_lens_is_undone_for_every_pixel_of_a_raw_image(tmp_path, lens):
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], 1), atol=1e-4)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(st.data())
 def test_rays_of_any_lens_are_those_that_it_images_at_the_pixels(data):
     lens = data.draw(st.sampled_from(sorted(LENSES)))
@@ -568,7 +568,7 @@ WHOLE = {encoding: foxglove(encoding) for encoding in ("protobuf", "json", "cdr"
 
 
 @pytest.mark.parametrize("encoding", WHOLE)
-@settings(max_examples=60)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_a_damaged_foxglove_cloud_is_refused_or_read_but_raises_nothing_else(encoding, data):
     whole = bytearray(WHOLE[encoding])
