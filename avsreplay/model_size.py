@@ -47,14 +47,16 @@ _MARGIN = 0.25  # space around the target in a suggested crop, over the model's 
 _UNITS = {
     0.001: "millimetres",
     1.0: "metres",
-    1000.0: "kilometres, or the scans are in millimetres",
     0.01: "centimetres",
-    100.0: "units of 100 m, or the scans are in centimetres",
     0.0254: "inches",
-    39.3701: "units of 39.37 m, or the scans are in inches",
     0.3048: "feet",
     3.28084: "units of 3.28 m, or the scans are in feet",
+    1000.0: "kilometres, or the scans are in millimetres",
+    100.0: "units of 100 m, or the scans are in centimetres",
+    39.3701: "units of 39.37 m, or the scans are in inches",
 }
+_SAME_UNIT = 1e-4  # relative difference of two units that are the same
+_SMALLEST_TARGET_M = 0.05  # a smaller model is too small, and not the unit of the scans wrong
 
 
 @value_class(eq=True)
@@ -97,15 +99,7 @@ def compare_sizes(
         The findings.
     """
     if not clouds:
-        cropped = options.crop_range is not None or options.crop_box is not None
-        empty = "no points are left in the examined scans; widen the crop"
-        return [
-            Advice(
-                "check",
-                "scans",
-                empty if cropped else "the examined scans hold fewer than ten points",
-            )
-        ]
+        return [_no_points(options)]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
         text = f"there is no model; the scans measure {_metres(scan_m)}"
@@ -114,10 +108,13 @@ def compare_sizes(
     ratio = scan_m / model_m if model_m else np.inf
     said = f"the scans measure {_metres(scan_m)}, the model {_metres(model_m)}"
     unit = options.model_unit.metres
+    if min(scan_m, model_m) > _LARGEST_TARGET_M:
+        text = f"{said}: if both are in millimetres, all lengths are 1000 times too large"
+        return [Advice("check", "unit", text, "--model-unit mm --scan-unit mm")]
     if _LEAST <= ratio <= _WHOLE:
         groups = _grouped_units(clouds, model_m, ratio, unit, most=_SCENE)
-        other = groups and _unit_advice({unit: [], **groups}, clouds, surface, unit, said)
-        return other or [_agreeing(said, scan_m, ratio)]
+        other = groups and _unit_advice({unit: [], **groups}, clouds, surface, options, said)
+        return other or [_agreeing(said, ratio)]
     whole = _units(ratio, unit)
     left = ratio < _LEFT_OVER or not whole  # background, not a wrong unit, explains the size
     if ratio > MOST_OF_MODEL and left and (found := _located(clouds, surface, registrar)):
@@ -148,12 +145,23 @@ def compare_sizes(
         )
         return [Advice("check", "background", text)]
     units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
-    if not units:
-        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
-            ratio > MOST_OF_MODEL
-        )
-        return [Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")]
-    return _unit_advice(units, clouds, surface, unit, said)
+    return _unit_advice(units, clouds, surface, options, said) or [_unexplained(said, ratio)]
+
+
+def _unexplained(said: str, ratio: float) -> Advice:
+    """Sizes that no unit explains."""
+    hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
+        ratio > MOST_OF_MODEL
+    )
+    return Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")
+
+
+def _no_points(options: SourceOptions) -> Advice:
+    """What is said where the examined scans have no points."""
+    cropped = options.crop_range is not None or options.crop_box is not None
+    empty = "no points are left in the examined scans; widen the crop"
+    few = "the examined scans hold fewer than ten points"
+    return Advice("check", "scans", empty if cropped else few)
 
 
 def find_model(
@@ -174,11 +182,10 @@ def find_model(
         The number of scans in which the model is found, and whether the sensor is elsewhere. If the
         mirror image of the model explains the scans better, a second finding says so.
     """
-    named = [
-        advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")
-    ]
-    scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
+    scale = _named_unit(found, "--model-unit") or options.model_unit.metres
     model = scaled(surface, scale / options.model_unit.metres)
+    if (metres := _named_unit(found, "--scan-unit")) is not None:
+        clouds = [metres * cloud for cloud in clouds]
     few, registrar = _few(clouds), Registrar(model)
     poses = [registrar.acquire(cloud) for cloud in few]
     one, any_pose = _counts(poses)
@@ -198,6 +205,12 @@ def find_model(
         Advice("ok", "pose", text + ("" if one else ", each time in more than one pose")),
         *mirrored,
     ]
+
+
+def _named_unit(found: Sequence[Advice], option: str) -> float | None:
+    """The unit [m] that a finding names as the value of an option, None if none does."""
+    words = next((a.option.split() for a in found if option in a.option.split()), [])
+    return Unit(words[words.index(option) + 1]).metres if words else None
 
 
 def _mirror_advice(
@@ -246,16 +259,20 @@ def _thinned(cloud: NDArray[Any]) -> NDArray[Any]:
     return cloud[:: max(len(cloud) // _SEARCHED, 1)]
 
 
-def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
-    """Sizes that agree, though both may be in millimetres, or the model in feet."""
-    if scan_m > _LARGEST_TARGET_M:
-        text = (
-            f"{said}: if both are in millimetres, all lengths are 1000 times too large; convert"
-            " them to metres"
-        )
-        return Advice("check", "unit", text)
+def _agreeing(said: str, ratio: float) -> Advice:
+    """Sizes that agree, though the model may be in feet."""
     feet = "; if more than a narrow side is seen, the model is in feet (--model-scale 0.3048)"
     return Advice("ok", "size", said + feet * (ratio < _FEET))
+
+
+def _scan_unit(factor: float, model_m: float) -> Unit | None:
+    """The unit of the scans that explains a factor on a model of this size, None if the model
+    explains it.
+    """
+    of_scans = (
+        unit for unit in Unit if unit is not Unit.M and abs(factor * unit.metres - 1.0) < _SAME_UNIT
+    )
+    return next(of_scans, None) if model_m >= _SMALLEST_TARGET_M else None
 
 
 def _unit_option(scale: float, given: float) -> str:
@@ -312,7 +329,7 @@ def _unit_advice(
     units: Mapping[float, Sequence[Array]],
     clouds: Sequence[NDArray[Any]],
     surface: Surface,
-    given: float,
+    options: SourceOptions,
     said: str,
 ) -> list[Advice]:
     """The unit, and the crop around its groups of points; empty if it is the given one.
@@ -321,17 +338,29 @@ def _unit_advice(
     ones. If no scan fits it, the text says so, because an object of another size fits some unit,
     too.
     """
-    few = _few(clouds)
+    if not units:
+        return []
+    few, given = _few(clouds), options.model_unit.metres
     once = RegisterParams(index_cache=False)  # most of the units are wrong
     fits = {each: _fitting(few, Registrar(scaled(surface, each / given), once)) for each in units}
     scale, groups = max(units.items(), key=lambda item: fits[item[0]][0])
     if scale == given:
         return []
     doubt = "" if fits[scale][1] else ", or it is another object: it is not found in the scans"
-    text = f"{said}: the model seems to be in {_UNITS[scale]}{doubt}"
-    unit = Advice("fail", "unit", text, _unit_option(scale, given))
-    size = scale / given * diameter(surface.vertices, trimmed=False)
-    crop = _crop_advice(clouds, groups, _of_size(size)) if groups else None
+    model_m = diameter(surface.vertices, trimmed=False)
+    scans = None if options.scan_unit else _scan_unit(scale / given, model_m)
+    if scans is None:
+        what, option = f"the model seems to be in {_UNITS[scale]}", _unit_option(scale, given)
+    else:
+        what = f"the scans seem to be in {_UNITS[scans.metres]}"
+        option = f"--scan-unit {scans.value}"
+    unit = Advice("fail", "unit", f"{said}: {what}{doubt}", option)
+    metres = 1.0 if scans is None else scans.metres  # a crop is in the new unit
+    size = metres * scale / given * model_m
+    crop = None
+    if groups:
+        inside = [metres * np.asarray(group, dtype=np.float64) for group in groups]
+        crop = _crop_advice([metres * cloud for cloud in clouds], inside, _of_size(size))
     return [unit, crop] if crop else [unit]
 
 

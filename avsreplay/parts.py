@@ -76,3 +76,4 @@ def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
 
 
 BACKENDS = Parts("avsreplay.backends", "registration back end", "--backend")
+FAULTS = Parts("avsreplay.faults", "kind of fault", "kind")

@@ -46,6 +46,7 @@ def preflight(
     """
     info, scans = source.info(), _sampled(source)
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
+    general += _meaning(source)
     if source.options.poses:
         return [*_poses(source, surface), *_grasp_point(surface), *general]
     found = [
@@ -62,6 +63,14 @@ def preflight(
         )
         found.insert(1, Advice("ok" if share >= 0.5 else "check", "points on the model", text))
     return found
+
+
+def _meaning(source: Source) -> list[Advice]:
+    """What the numbers of the clouds mean; an option is named where it should be confirmed."""
+    return [
+        Advice(each.grade, each.about, each.sentence, each.option if each.grade != "ok" else "")
+        for each in source.meaning.inferences
+    ]
 
 
 def _faces(surface: Surface | None) -> list[Advice]:

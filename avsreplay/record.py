@@ -14,8 +14,9 @@ from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surf
 from avsreplay.log.options import lost_text
 from avsreplay.log.writer import ROOT_FRAME
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
+from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.rays import Engine
-from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
+from avsreplay.simulate.recorded_faults import disturbed
 from avsreplay.simulate.scenario import Scenario, load_scenario
 from avsreplay.simulate.simulation import EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
@@ -40,7 +41,7 @@ class RecordOptions:
     cloud_model: bool = False
     overwrite: bool = False
     compression: str = "zstd"
-    faults: tuple[RecordedFault, ...] = ()
+    faults: tuple[InjectedFault, ...] = ()
     fault_seed: int = 0
 
 

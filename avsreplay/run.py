@@ -33,6 +33,7 @@ from avsreplay.plan.flights import Motion
 from avsreplay.plan.robot import Limits
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register.backend import POSES
+from avsreplay.register.interrupt import shielded
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.registrar import Registrar
 from avsreplay.report.summary import Summary, SummaryFold
@@ -236,7 +237,8 @@ class Run:
             truth = self._truth_of(outcome.scan)
             if self.job.growing:
                 self.job.growing.take(outcome.scan, self._true(outcome.scan))
-            self.model_check.add(outcome.scan, outcome.alignment)
+            with shielded():
+                self.model_check.add(outcome.scan, outcome.alignment)
             row = Row.of(outcome, self._scored.score(state, outcome, truth))
             self._fold.add(row)
             if truth.state is not None:
@@ -396,6 +398,7 @@ class Run:
                 "extent_m": surface.extent,
             },
             "clock": settings.dump(self.source.clock),
+            "clouds": self.source.meaning.record(),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),

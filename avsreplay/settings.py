@@ -41,6 +41,7 @@ class Setting:
         of_extent: Where the setting is not given: its value as a fraction of the target's extent.
         unset: Where the setting is not given and does not scale with the extent: what applies
             instead.
+        one_of: The value is the name of one of these parts.
         parts: The field is a ``Tables`` with one table of parameters for each of these parts.
     """
 
@@ -53,6 +54,7 @@ class Setting:
     infinite: bool = False
     of_extent: float | None = None
     unset: str = ""
+    one_of: Parts | None = None
     parts: Parts | None = None
 
     @property
@@ -95,6 +97,9 @@ class Setting:
         Raises:
             SettingError: A number is outside the range.
         """
+        if self.one_of is not None and value not in self.one_of.names():
+            known = ", ".join(self.one_of.names())
+            raise SettingError(name, f"{name} is '{value}', must be one of: {known}")
         several = isinstance(value, tuple)
         for number in value if several else (value,):
             if (
@@ -281,7 +286,9 @@ class Entry:
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The values of an enumeration, () of anything else."""
+        """The values of an enumeration, the names of parts, () of anything else."""
+        if self.declared.one_of is not None:
+            return self.declared.one_of.names()
         kind = _inner(self.hint)
         return (
             tuple(m.value for m in kind)

@@ -10,6 +10,7 @@ import math
 import pickle
 import signal
 from collections import Counter
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions
 from avsreplay.records import ScanStatus
+from avsreplay.register.interrupt import request_stop, shielded
 from avsreplay.report.result import write_manifest
 from avsreplay.result_dir import CHECKPOINT, ResultDirectory, ResultWriter
 from avsreplay.run import Job, Run
@@ -63,6 +65,48 @@ def test_a_continued_run_has_the_bytes_of_a_run_without_interruption(
         assert (tmp_path / "parts" / CHECKPOINT).is_file()
     assert replay(work, tmp_path / "parts", resume=True) == 26
     assert files(tmp_path / "parts") == files(tmp_path / "whole")
+
+
+@pytest.fixture
+def stoppable():
+    yield
+    request_stop(False)
+
+
+@pytest.mark.usefixtures("stoppable")
+@pytest.mark.parametrize("prefetch", [0, 2])
+def test_a_run_that_is_ended_within_a_scan_is_continued_with_the_same_bytes(
+    fixtures_folder, tmp_path, prefetch
+):
+    work = replace(job(fixtures_folder / "tumble.mcap", n_scans=12), prefetch=prefetch)
+    assert replay(work, tmp_path / "whole") == 12
+    rows = []
+    with Run(work) as run, ResultWriter(ResultDirectory(tmp_path / "r"), run) as writer:
+        found = run.rows(writer.listeners)
+        rows += islice(found, 5)
+        request_stop()
+        with pytest.raises(KeyboardInterrupt):
+            rows.extend(found)
+        request_stop(False)
+        assert 5 <= len(rows) < 12
+        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, resumable=True)
+    assert replay(work, tmp_path / "r", resume=True) == 12
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+@pytest.mark.usefixtures("stoppable")
+def test_registrations_end_on_request_unless_they_are_shielded(fixtures_folder):
+    with Run(job(fixtures_folder / "tumble.mcap", n_scans=2)) as run:
+        index = run.registrar.index
+        points = np.random.default_rng(1).normal(size=(5000, 3))
+        before = index.closest(points)
+        request_stop()
+        with pytest.raises(KeyboardInterrupt):
+            index.closest(points)
+        with shielded():
+            assert np.array_equal(index.closest(points).id, before.id)
+        request_stop(False)
+        assert np.array_equal(index.closest(points).id, before.id)
 
 
 def test_other_settings_are_refused(fixtures_folder, tmp_path):

@@ -119,12 +119,16 @@ def test_an_invalid_option(flags, word, cli, log):
 
 
 @pytest.mark.parametrize(
-    ("scale", "word"),
-    [("1e-320", "the model spans"), ("1e300", "a vertex is at"), ("1.7e308", "not finite")],
+    ("scale", "code", "word"),
+    [
+        ("1e-320", 3, "the model spans"),
+        ("1e90", 3, "a vertex is at"),
+        ("1.7e308", 2, "--model-scale is 1.7e+308, must be at most 1e+100"),
+    ],
 )
 @pytest.mark.parametrize("command", ["run", "info"])
-def test_a_model_of_an_extreme_scale_is_one_line(command, scale, word, cli, log):
-    check_one_line(cli(command, log, "--model-scale", scale), 3, word)
+def test_a_model_of_an_extreme_scale_is_one_line(command, scale, code, word, cli, log):
+    check_one_line(cli(command, log, "--model-scale", scale), code, word)
 
 
 @pytest.mark.parametrize("extent", ["nan", "inf", "0", "1e308", "1e-320"])

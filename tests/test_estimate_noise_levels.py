@@ -17,6 +17,7 @@ from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, line_of_sight_1s
 from avsreplay.estimate.disturbance_density import density_in_use
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
+from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import (
     MOST_POINTS,
     NO_LEVELS,
@@ -172,3 +173,8 @@ def test_the_common_error_lies_along_the_line_of_sight() -> None:
     assert b / np.linalg.norm(b) == pytest.approx(at / 5.0)
     assert b @ b == pytest.approx(0.25 * (0.36 * 4.0 + 0.64 * 9.0))
     assert not line_of_sight_1s(np.zeros(3), 0.5 * R, NO_MODEL_ERRORS).any()
+
+
+def test_rows_of_zeros_have_no_autocorrelation() -> None:
+    """Exact poses, or those of a target at rest, leave residuals that are zero."""
+    assert integrated_autocorrelation(np.zeros((80, 3))) == 1.0

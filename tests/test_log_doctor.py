@@ -187,7 +187,7 @@ def test_gaps_duplicates_points_clocks_and_layouts_are_reported(tmp_path: Path) 
     assert "the widest 20.5" in found["gaps"][0][1]
     assert found["duplicates"] == [(Severity.WARNING, "1 are identical to the previous scan")]
     assert "1 of 20 have no finite point" in found["scans"][0][1]
-    assert "0.58 % not finite" in found["points"][0][1]
+    assert "0.58 % no returns" in found["points"][0][1]
     assert found["clock"][0] == (Severity.WARNING, "1 stamps jump")
     assert len(found["layout"]) == 2
     assert found["model"][0][0] is Severity.NOTE

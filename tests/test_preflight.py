@@ -20,6 +20,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 import avsreplay.model_size
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
+from avsreplay.log.canonical import Meaning
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.preflight import preflight
@@ -41,6 +42,8 @@ class Log:
 
     def __len__(self):
         return len(self.clouds)
+
+    meaning = Meaning()
 
     def info(self):
         return LogInfo("x", "mcap", 1, self.topics, 0, 1, truth=self.truth)
@@ -565,3 +568,13 @@ def test_a_sensor_that_is_not_at_the_origin_is_named(surface):
         a for a in preflight(Log(moved), surface, search=True) if a.about in ("pose", "sensor")
     ]
     assert [a.option for a in found] == ["--set register.camera=none"]
+
+
+def test_scans_in_millimetres_are_named_with_the_option_and_the_crop_in_metres(surface):
+    clouds = [1000.0 * cloud for cloud in _seen(surface, wall=True)]
+    found = preflight(Log(clouds), surface)
+    assert _found(found, "unit").option == "--scan-unit mm"
+    crop = _found(found, "background").option.split()[1]
+    assert max(abs(float(v)) for v in crop.split(",")) < 100.0
+    both = preflight(Log(clouds), scaled(surface, 1000.0))
+    assert _found(both, "unit").option == "--model-unit mm --scan-unit mm"

@@ -213,6 +213,8 @@ def test_every_reading_option_that_is_given_is_stated():
         "crop_box": (0.0, 0.0, 0.0, 1.0, 2.0, 3.0),
         "clock": ClockChoice.LOG,
         "grasp": (1.0, 2.0, 3.0),
+        "point_time": "t:ns:stamp",
+        "no_return": "0,0,0",
     }
     for field in dataclasses.fields(SourceOptions):
         value = special.get(field.name, examples.get(type(field.default)))

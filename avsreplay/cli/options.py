@@ -330,9 +330,14 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
             )
 
 
+_GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
+
+
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
+
+    A scan that takes longer than ``_GRACE_S`` after the first one is given up; its row is missing.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
@@ -349,16 +354,26 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
         asked.append(number)
         stop()
         if not rows or len(asked) > 1:
+            request_stop()
             raise KeyboardInterrupt
+        late.start()
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    from avsreplay.register.interrupt import request_stop
+
+    late = threading.Timer(_GRACE_S, request_stop)
+    late.daemon = True
     before = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: bool(asked)
     finally:
         signal.signal(signal.SIGINT, before)
+        late.cancel()
+        if late.is_alive():
+            late.join()
+        request_stop(False)
 
 
 _LIVE_HEAD = "  scan     t [s]  state             rms [mm]     nis pos err [mm] rot err [deg]"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
     from avsreplay.record import Recorded
     from avsreplay.records import Scan
-    from avsreplay.simulate.recorded_faults import RecordedFault
+    from avsreplay.simulate.faults import InjectedFault
 
 EPILOG = """\b
 Examples:
@@ -40,31 +40,41 @@ Examples:
   avsreplay record scenario.toml -o x.mcap --seed 7     a scenario file
   avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
   avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP
-  avsreplay record y.mcap -o f.mcap --fault occlusion:10:4 --fault range_bias:20:2:0.05
-
-\b
-Kinds of fault with their default strengths (docs/scenario.md describes them):
-  occlusion:1  partial_occlusion:0.5  dropped  empty  clutter:0.5  range_bias:0.3 [m]  noise_burst:5
-  frozen  stamp_jump:30 [s]  outliers:0.2  subsampled:0.9  frame_rate:2"""
+  avsreplay record y.mcap -o f.mcap --fault occlusion:10:4 --fault range_bias:20:2:0.05"""
+KINDS = "Kinds of fault with their default strengths (docs/scenario.md describes them):"
 
 
-class _Fault(click.ParamType["RecordedFault"]):
+class RecordCommand(SectionedCommand):
+    """``record``, whose help lists the kinds of fault."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples, then the kinds of fault with their default strengths."""
+        from avsreplay.simulate.faults import kinds_with_strengths
+
+        super().format_epilog(ctx, formatter)
+        formatter.write_paragraph()
+        formatter.write_text(KINDS)
+        with formatter.indentation():
+            formatter.write_text(kinds_with_strengths())
+
+
+class _Fault(click.ParamType["InjectedFault"]):
     """``kind:start:duration[:strength]``."""
 
     name = "kind:start:duration[:strength]"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> RecordedFault:
-        from avsreplay.simulate.recorded_faults import RecordedFault
+    ) -> InjectedFault:
+        from avsreplay.simulate.faults import InjectedFault
 
         try:
-            return RecordedFault.parse(str(value))
+            return InjectedFault.parse(str(value))
         except ValueError as error:
             self.fail(str(error), param, ctx)
 
 
-@click.command("record", cls=SectionedCommand, epilog=EPILOG)
+@click.command("record", cls=RecordCommand, epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
 @click.option(
     "-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output."
@@ -89,7 +99,7 @@ def record_command(
     source: Path | None,
     output: Path,
     seed: int | None,
-    faults: tuple[RecordedFault, ...],
+    faults: tuple[InjectedFault, ...],
     model: Path | None,
     cloud_model: bool | None,
     compression: str,

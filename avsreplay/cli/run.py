@@ -290,6 +290,9 @@ def _checked(run: Run) -> list[Advice]:
 
     checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
     found = [advice for advice in checked if advice.grade != "ok"]
+    for each in run.source.meaning.inferences:
+        if each.grade == "ok":
+            click.echo(f"avsreplay: {each.about}: {each.sentence}", err=True)
     for advice in found:
         click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
     return found
@@ -405,8 +408,8 @@ def _collect(
 
     try:
         with (
-            closing(found),
             interruptible(rows, growing.stop if growing else lambda: None) as stopped,
+            closing(found),
         ):
             for row in found:
                 if live:

@@ -50,11 +50,11 @@ _MOST_ALIKE = (
 
 def integrated_autocorrelation(e: Array) -> float:
     """1 + 2 sum of the autocorrelations of rows e (n, 3), over the lags with the largest
-    significant (3 sigma) sum.
+    significant (3 sigma) sum; 1 for rows of zeros, as those of exact poses.
     """
     n, e = len(e), np.ascontiguousarray(e).reshape(-1)
     total = float(e @ e)
-    lags = [k for k in _LAGS if k <= n // 8]
+    lags = [k for k in _LAGS if k <= n // 8] if total > 0.0 else []
     rho = [
         float(e[3 * k :] @ e[: -3 * k]) / total * n / (n - k)
         for k in range(1, max(lags, default=0) + 1)

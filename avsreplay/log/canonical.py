@@ -110,6 +110,19 @@ class Meaning:
         time = None if self.time is None else replace(self.time, limit_s=0.0)
         return self.swapped, self.unit_m, time, self.codes
 
+    def record(self) -> dict[str, Any]:
+        """Return the content of ``run.json`` about it."""
+        return {
+            "byte_order": "reversed" if self.swapped else "declared",
+            "unit_m": self.unit_m,
+            "point_time": None if self.time is None else self.time.text,
+            "no_return": self.codes.text,
+            "inferred": [
+                {"about": each.about, "found": each.finding, "evidence": each.evidence}
+                for each in self.inferences
+            ],
+        }
+
     @property
     def refused(self) -> Inference | None:
         """The first thing that the values do not decide."""

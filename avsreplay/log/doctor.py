@@ -87,7 +87,8 @@ def examine(path: Path, options: SourceOptions | None = None) -> tuple[LogInfo, 
         findings = [*_losses(info.losses), *_structure(path, options), *_content(info)]
         if info.scans:
             tally, times = _pass(source)
-            findings += [*_clocks(source.clock), *_gaps(times), *_scans(tally), *_layout(source)]
+            findings += [*_clocks(source.clock), *_gaps(times), *_scans(tally)]
+            findings += [*_meaning(source), *_layout(source)]
     return info, findings
 
 
@@ -244,11 +245,21 @@ def _scans(tally: _Tally) -> Iterator[Finding]:
         yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_NAMED]))
     total = tally.points + tally.dropped
     share = tally.dropped / total if total else 0.0
-    text = f"{total} in {tally.scans} scans, {100 * share:.2f} % not finite"
+    text = f"{total} in {tally.scans} scans, {100 * share:.2f} % no returns"
     yield Finding(Severity.NOTE if tally.dropped else Severity.OK, "points", text)
     if 0 < tally.with_truth < tally.scans:
         text = f"{tally.scans - tally.with_truth} of {tally.scans} scans have none"
         yield Finding(Severity.NOTE, "truth", text)
+
+
+_SEVERITIES = {"ok": Severity.OK, "check": Severity.NOTE, "fail": Severity.WARNING}
+
+
+def _meaning(source: Source) -> Iterator[Finding]:
+    """Report what the numbers of the clouds mean, and what is to be stated."""
+    for each in source.meaning.inferences:
+        advice = f"; {each.option}" if each.grade != "ok" else ""
+        yield Finding(_SEVERITIES[each.grade], each.about, f"{each.sentence}{advice}")
 
 
 def _layout(source: Source) -> Iterator[Finding]:

@@ -30,7 +30,7 @@ from avsreplay.geometry import Array
 from avsreplay.log.raw_cloud import RawCloud
 
 _MOST_PERIODS = 1.6  # reach of the times of a scan over the time between two scans
-_PERIODS_APART = 2.0  # an origin farther than this from the stamps is that of another clock
+_PERIODS_APART = 1.2  # an origin farther than this from the stamps is that of another clock
 _USUAL_PERIOD = 0.3  # from here on the reach is an ordinary part of the period
 _USUAL_S = 1e-3, 3.0  # ordinary durations of a scan
 _MOST_S = 30.0  # longest duration where the period is unknown
@@ -39,6 +39,7 @@ _DENSE_PER_S = 1e8  # more distinct instants per second than any scanner has
 _COARSE = 0.02  # of the period: a field that resolves less cannot place a point
 _ADVANCE_PERIODS = 2.5  # stamps must differ by so much before an advance is tested
 _ADVANCE_ERROR = 0.2  # of that difference
+_MOST_SCANS = 0.85  # share of the scans that agree; the others may have a wrong stamp
 _CYCLES_S = 1.0, 60.0, 3600.0, 86400.0
 _NAMED, _HINTED = 3.0, 1.4  # decades that a unit in the name, or the usual unit of a type, counts
 
@@ -366,7 +367,9 @@ class _Candidate:
             return Reading(self.name, evidence="none of its values is finite")
         self._low = [column.min() for column in self._columns]
         self._high = [column.max() for column in self._columns]
-        self._span = max(float(h - low) for low, h in zip(self._low, self._high, strict=True))
+        self._middle = [_median(column) for column in self._columns]
+        spans = [float(h - low) for low, h in zip(self._low, self._high, strict=True)]
+        self._span = max(spans) and float(_median(np.array(spans)))
         self._step = self._resolution()
         if found := self._coarse():
             return found
@@ -404,48 +407,53 @@ class _Candidate:
         return None
 
     def _absolute(self) -> Reading | None:
-        """The reading of values that advance with the stamps."""
+        """The reading of values that advance with the stamps, or are next to the only one."""
         for unit in self._units:
-            if self._advances(self._residual(unit), unit) and self._plausible(unit):
-                return self._of_clock(unit, 0)
+            residual = self._residual(unit)
+            if self._advances(residual, unit) and self._plausible(unit):
+                plain = self._steady(residual, unit)
+                cycles = [(self._steady(residual, unit, c), c) for c in self._cycles(unit)]
+                best = max(cycles, default=(0.0, 0))
+                return self._of_clock(unit, best[1] if best[0] > plain else 0)
         if len(self._columns) > 1 and not self._fits_relative():
             for unit in self._units:
                 for cycle_ns in self._cycles(unit):
-                    residual = self._residual(unit)
-                    cycle_s = cycle_ns * 1e-9
-                    residual -= cycle_s * np.round(residual / cycle_s)
-                    if self._steady(residual, unit):
+                    if self._steady(self._residual(unit), unit, cycle_ns) > _MOST_SCANS:
                         return self._of_clock(unit, cycle_ns)
-        if self._by_value() is not None:
-            return self._of_clock(self._by_value() or TimeUnit.S, 0)
-        return None
+        unit_by_value = self._by_value()
+        return None if unit_by_value is None else self._of_clock(unit_by_value, 0)
 
     def _plausible(self, unit: TimeUnit) -> bool:
-        return self._span * unit.seconds <= max(_MOST_S, 10.0 * (self._period or 0.0))
+        most_s = _MOST_S if self._period is None else 2.0 * _MOST_PERIODS * self._period
+        return self._span * unit.seconds <= most_s
 
     def _fits_relative(self) -> bool:
         return any(self._score(unit) > -_NAMED for unit in self._units)
 
     def _cycles(self, unit: TimeUnit) -> Iterator[int]:
-        most_ns = max(float(h) for h in self._high) * unit.ns
+        most_ns = self._reach * unit.ns
+        if self._integer and self._bits == 32 and self._reach > 1 << 30:
+            yield (1 << 32) * unit.ns
         if min(float(low) for low in self._low) < 0.0:
             return
-        if self._integer and self._bits == 32 and most_ns > (1 << 30) * unit.ns:
-            yield (1 << 32) * unit.ns
         for cycle_s in _CYCLES_S:
             if most_ns <= cycle_s * 1e9 and self._span * unit.seconds <= cycle_s:
                 yield round(cycle_s * 1e9)
 
     def _residual(self, unit: TimeUnit) -> Array:
-        """Advance of the first point minus that of the stamp, of each scan [s]."""
-        advance = [float(low - self._low[0]) * unit.seconds for low in self._low]
+        """Advance of the middle of the points minus that of the stamp, of each scan [s]."""
+        advance = [float(value - self._middle[0]) * unit.seconds for value in self._middle]
         return np.array(advance) - self._stamps
 
-    def _steady(self, residual: Array, unit: TimeUnit) -> bool:
-        """Whether most of the residuals are equal within a scan."""
-        middle = float(sorted(residual.tolist())[len(residual) // 2])
+    def _steady(self, residual: Array, unit: TimeUnit, cycle_ns: int = 0) -> float:
+        """Share of the scans whose residuals are equal within a scan, apart from whole cycles."""
         within = 0.6 * (self._period or 0.0) + 1.5 * self._span * unit.seconds
-        return float(np.mean(np.abs(residual - middle) <= within)) > 0.7
+        if cycle_ns:
+            cycle_s = cycle_ns * 1e-9
+            residual = residual - cycle_s * np.round(residual / cycle_s)
+            if within > 0.25 * cycle_s or not self._plausible(unit):
+                return 0.0  # nearly any residual would be within
+        return float(np.mean(np.abs(residual - _median(residual)) <= within))
 
     def _advances(self, residual: Array, unit: TimeUnit) -> bool:
         stamps = self._stamps
@@ -455,11 +463,11 @@ class _Candidate:
         span_s = max(self._span * unit.seconds, self._period or 0.0)
         if apart <= 0.0 or len(stamps) < 3 or apart < _ADVANCE_PERIODS * span_s:
             # two scans: an advance by the difference of the stamps, and no relative time that fits
-            advance = float(self._low[-1] - self._low[0]) * unit.seconds
+            advance = float(self._middle[-1] - self._middle[0]) * unit.seconds
             near = abs(advance - float(stamps[-1])) < _ADVANCE_ERROR * apart
             return near and not self._fits_relative()
-        middle = float(sorted(residual.tolist())[len(residual) // 2])
-        return float(np.mean(np.abs(residual - middle) < _ADVANCE_ERROR * apart)) > 0.7
+        near_middle = np.abs(residual - _median(residual)) < _ADVANCE_ERROR * apart
+        return float(np.mean(near_middle)) > _MOST_SCANS
 
     def _by_value(self) -> TimeUnit | None:
         """The unit in which the values of a single scan are next to its stamp."""
@@ -543,6 +551,11 @@ def _decades(low: float, high: float) -> float:
     return float(np.log10(low / high)) if 0.0 < high < low else 0.0
 
 
+def _median(values: NDArray[Any]) -> Any:
+    """The upper median, without numpy's, which loads more modules."""
+    return values[np.argpartition(values, len(values) // 2)[len(values) // 2]]
+
+
 def _core(ticks: NDArray[Any]) -> NDArray[Any]:
     """Values without those that are not finite, and without those that are far from the others,
     such as the zeros of missing returns beside times of day.
@@ -552,6 +565,6 @@ def _core(ticks: NDArray[Any]) -> NDArray[Any]:
     nonzero = ticks[ticks != 0]
     if not len(nonzero):
         return ticks
-    middle = nonzero[np.argpartition(nonzero, len(nonzero) // 2)[len(nonzero) // 2]]
+    middle = _median(nonzero)
     far = np.abs(nonzero - middle) > 0.5 * abs(middle)
     return nonzero[~far] if np.count_nonzero(far) <= 0.1 * len(far) and len(far) > 3 else ticks

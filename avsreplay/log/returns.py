@@ -187,14 +187,17 @@ def count(clouds: Sequence[NDArray[Any]], codes: NoReturn, largest: float) -> Mi
 
 
 def _usable(points: NDArray[Any]) -> NDArray[Any]:
-    masks = [m for m in (_finite(points, np.inf), _away_from_origin(points)) if m is not None]
+    masks = [
+        m
+        for m in (_finite(points, MAX_COORDINATE_M**2), _away_from_origin(points))
+        if m is not None
+    ]
     return points[np.logical_and.reduce(masks)] if masks else points
 
 
 def _finite(points: NDArray[Any], largest: float) -> NDArray[np.bool_] | None:
     with np.errstate(invalid="ignore", over="ignore"):
-        total = np.einsum("ij,ij->", points, points)
-        if np.isfinite(total) and total < largest**2:  # fast: no point can be outside
+        if np.einsum("ij,ij->", points, points) < largest**2:  # fast: no point can be outside
             return None
         kept: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
         kept &= (np.abs(points) <= largest).all(axis=1)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
+from avsreplay.parts import FAULTS
 from avsreplay.records import State
 from avsreplay.report.episodes import Episode
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
@@ -60,11 +61,7 @@ KINDS = {  # colour and pattern of each place
         "halves_differ",
         *("doubtful", "sensor_bias", "clock"),
     ),
-    "injected": (
-        *("occlusion", "partial_occlusion", "dropped", "clutter", "range_bias", "frozen"),
-        *("empty", "noise_burst", "stamp_jump"),
-        *("outliers", "subsampled", "frame_rate"),
-    ),
+    "injected": FAULTS.names(),
     "action": (
         "approach",
         "hold",

@@ -15,6 +15,7 @@ from operator import not_
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
@@ -296,9 +297,12 @@ def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
     scans.
     """
     healthy, out = np.equal(taken["gamma"], 1), {}
+    claimed = _since_convergence(taken["converged"])
     for name in (*_BY_STATE, *_OF_ALL):
         column = np.array(taken[name], dtype=np.float64)
         known = np.isfinite(column)
+        if name == "nis" or name in _OF_ALL:
+            known = known & claimed
         if name in _BY_STATE:
             out[f"{name}/healthy"], out[f"{name}/coasting"] = (
                 column[known & healthy],
@@ -307,6 +311,15 @@ def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
         else:
             out[name] = column[known]
     return out
+
+
+def _since_convergence(converged: Sequence[bool]) -> NDArray[np.bool_]:
+    """The scans from convergence on, all of them without it.
+
+    The noise of the poses is adapted by then, and no plan relies on the covariance before.
+    """
+    flags = np.array(converged, dtype=bool)
+    return np.logical_or.accumulate(flags) if flags.any() else np.ones(len(flags), dtype=bool)
 
 
 def _observability(last: Row | None, full_rank_s: float | None) -> ObservabilitySummary:

@@ -1,81 +1,383 @@
-"""Faults injected into a simulated log, each over a window of the log clock and labelled in the
-log.
+"""Kinds of fault, one class each, and the faults of a scenario or of ``record --fault``.
 
-=================  ===========================================  =======
-======================================== kind               strength (default)
-harmful  what happens =================  ===========================================  =======
-======================================== occlusion          part of the view covered (1.0)
-yes      a plate in front hides it; few plate points partial_occlusion  part of the target's returns
-hidden (0.5)    no       the same, from one side dropped            none
-yes      no message is written empty              none                                         yes
-a message without a point clutter            added points over returns (0.5)              no
-points anywhere about the target range_bias         added to every range [m] (0.3)               yes
-the target seems farther away noise_burst        factor on the range noise (5.0)              no
-more range noise frozen             none                                         yes      the last
-scan before the window again stamp_jump         added to the stamps [s] (30.0)               yes
-log time stays true =================  ===========================================  =======
-========================================
+A kind of fault is a part (``avsreplay.parts``): a class that derives from ``Fault`` and is
+registered in the entry-point group ``avsreplay.faults``. Its ``apply`` serves simulated and
+recorded scans. The keys of a scenario, the help of ``record``, the table in docs/scenario.md, which
+``python -m avsreplay.simulate.faults`` prints, and the colours of a page follow from the classes.
 
 ``harmful`` is part of the label: the scan cannot give a correct pose at its stamp. The estimate
-should survive a fault that is not harmful. A scenario may set it for each fault.
+should survive a fault that is not harmful.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from typing import ClassVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from avsreplay.errors import value_class
+from avsreplay.geometry import Array
+from avsreplay.parts import FAULTS
 from avsreplay.records import Label
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import NoParameters, SettingError, Settings, declared_of, setting
 from avsreplay.simulate.scanner import Returns
 
 NS = 1_000_000_000
 LONGEST_S = 1e8  # longest log or window: its stamps fit the 31 bits of seconds of a ROS 2 time
+MOST_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
+MOST_CLUTTER = 100.0  # points added for each point of the scan
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))
-CLUTTER_RADIUS_RATIO = (
-    1.2  # radius of the ball of clutter over that of the target's bounding sphere
-)
+# radius of the ball of clutter over that of the target's bounding sphere
+CLUTTER_RADIUS_RATIO = 1.2
+OUTLIER_RANGES = 0.5, 1.5  # limits of the range of an outlier, over the median range of the scan
+# cosine to the mean direction of the points, below which a point is not in front of the scanner
+LEAST_AHEAD = 0.05
+RADIUS_QUANTILE = 0.9  # of the distances from the median point: the radius of an unknown target
 
 
-class Kind(Enum):
-    """The kinds of fault."""
+class Stage(IntEnum):
+    """What a fault acts on. Faults act in this order, those of one stage by name."""
 
-    OCCLUSION = "occlusion"
-    PARTIAL_OCCLUSION = "partial_occlusion"
-    DROPPED = "dropped"
-    EMPTY = "empty"
-    CLUTTER = "clutter"
-    RANGE_BIAS = "range_bias"
-    NOISE_BURST = "noise_burst"
-    FROZEN = "frozen"
-    STAMP_JUMP = "stamp_jump"
+    LIGHT = 0  # what the rays meet, before the noise of the scanner
+    NOISE = 1  # the noise of the ranges
+    RETURNS = 2  # measured returns
+    OBJECTS = 3  # returns that are added or all missing
+    MESSAGE = 4  # the message with the scan
 
 
-DEFAULTS: dict[Kind, tuple[float | None, bool]] = {  # strength and whether it is harmful
-    Kind.OCCLUSION: (1.0, True),
-    Kind.PARTIAL_OCCLUSION: (0.5, False),
-    Kind.DROPPED: (None, True),
-    Kind.EMPTY: (None, True),
-    Kind.CLUTTER: (0.5, False),
-    Kind.RANGE_BIAS: (0.3, True),
-    Kind.NOISE_BURST: (5.0, False),
-    Kind.FROZEN: (None, True),
-    Kind.STAMP_JUMP: (30.0, True),
-}
+@value_class
+class Shot:
+    """A scan on its way into a log.
+
+    Attributes:
+        returns: its returns.
+        noise: factor on the noise of the ranges.
+        stamp_ns: added to its stamp [ns].
+        written: whether there is a message.
+        repeated: whether the message has the points of the last one without this fault.
+    """
+
+    returns: Returns
+    noise: float = 1.0
+    stamp_ns: int = 0
+    written: bool = True
+    repeated: bool = False
+
+
+@value_class
+class Circumstances:
+    """What is known where a fault acts on a scan.
+
+    Attributes:
+        t_s: time of the scan after the first one [s].
+        place: number of scans before it in the window of the fault.
+        window: makes a random generator that is the same for all scans of the window.
+        along_z: the scanner looks along +z of the frame of the directions; otherwise along the mean
+            direction of the returns.
+        centre_a: (3,) centre of the target in that frame [m]; None: the median point.
+        radius_m: radius of its bounding sphere [m]; None: from the points.
+    """
+
+    t_s: float
+    place: int
+    window: Callable[[], np.random.Generator]
+    along_z: bool = True
+    centre_a: Array | None = None
+    radius_m: float | None = None
+
+
+class Fault(ABC):
+    """A fault that acts on scans.
+
+    Attributes:
+        name: the kind, as in ``kind = "..."``.
+        about: what happens, one line.
+        harmful: whether a scan with it cannot give a correct pose at its stamp.
+        stage: what it acts on.
+        parameters: parameter class with the field ``strength``, or without it.
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str]
+    harmful: ClassVar[bool]
+    stage: ClassVar[Stage]
+    parameters: ClassVar[type[Settings]] = NoParameters
+
+    def __init__(self, strength: float = 0.0) -> None:
+        """Create the fault.
+
+        Args:
+            strength: its strength, in the range of the kind; not used by a kind without one.
+        """
+        self.strength = strength
+
+    @abstractmethod
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:
+        """Return the scan with the fault.
+
+        Args:
+            shot: the scan, with the faults that act before this one.
+            at: what is known.
+            rng: for the random numbers of this scan.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class _Covered(Settings):
+    strength: float = setting(1.0, "share of the view that is covered", above=0.0, high=1.0)
+
+
+class Occlusion(Fault):
+    """A plate hides returns; it enters from the same side in all scans of the window."""
+
+    name = "occlusion"
+    about = "a plate in front of the target; 5 % of the rays it blocks give a return from it"
+    harmful = True
+    stage = Stage.LIGHT
+    parameters: ClassVar[type[Settings]] = _Covered
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:
+        """Return the scan behind the plate."""
+        side_rad = float(at.window().uniform(0.0, 2.0 * math.pi))
+        if at.along_z:
+            hidden = occlude(shot.returns, self.strength, side_rad, rng)
+            return replace(shot, returns=hidden)
+        if not len(shot.returns.ranges):
+            return shot
+        turn = view_of(shot.returns.directions)
+        seen = _turned(shot.returns, turn)
+        ahead = seen.directions[:, 2] > LEAST_AHEAD
+        hidden = occlude(seen.keep(ahead), self.strength, side_rad, rng).joined(seen.keep(~ahead))
+        return replace(shot, returns=replace(hidden, directions=hidden.directions @ turn))
+
+
+@dataclass(frozen=True, slots=True)
+class _Hidden(Settings):
+    strength: float = setting(0.5, "share of the returns that is hidden", above=0.0, high=1.0)
+
+
+class PartialOcclusion(Occlusion):
+    """The same plate, which covers a part of the view."""
+
+    name = "partial_occlusion"
+    about = "the same plate from one side"
+    harmful = False
+    parameters = _Hidden
+
+
+class Dropped(Fault):
+    """No message."""
+
+    name = "dropped"
+    about = "no message is written"
+    harmful = True
+    stage = Stage.MESSAGE
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan that is not written."""
+        return replace(shot, written=False)
+
+
+class Empty(Fault):
+    """A message without points."""
+
+    name = "empty"
+    about = "a message without points"
+    harmful = True
+    stage = Stage.OBJECTS
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan without returns."""
+        none = np.zeros(len(shot.returns.ranges), dtype=bool)
+        return replace(shot, returns=shot.returns.keep(none))
+
+
+@dataclass(frozen=True, slots=True)
+class _Added(Settings):
+    strength: float = setting(0.5, "added points over returns", above=0.0, high=MOST_CLUTTER)
+
+
+class Clutter(Fault):
+    """Points about the target."""
+
+    name = "clutter"
+    about = "points uniform in a ball about the target"
+    harmful = False
+    stage = Stage.OBJECTS
+    parameters = _Added
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:
+        """Return the scan with the points."""
+        returns, radius_m = shot.returns, at.radius_m
+        if not len(returns.ranges):
+            return shot
+        points = returns.directions * returns.ranges[:, None]
+        centre = np.median(points, axis=0) if at.centre_a is None else at.centre_a
+        if radius_m is None:
+            distances = np.sqrt(np.sum((points - centre) ** 2, axis=1))
+            radius_m = float(np.quantile(distances, RADIUS_QUANTILE))
+        if at.along_z:
+            return replace(shot, returns=clutter(returns, self.strength, centre, radius_m, rng))
+        turn = view_of(returns.directions)
+        added = clutter(_turned(returns, turn), self.strength, turn @ centre, radius_m, rng)
+        return replace(shot, returns=replace(added, directions=added.directions @ turn))
+
+
+@dataclass(frozen=True, slots=True)
+class _Bias(Settings):
+    strength: float = setting(
+        0.3, "metres added to every range", unit="m", low=-MOST_STRENGTH, high=MOST_STRENGTH
+    )
+
+
+class RangeBias(Fault):
+    """Longer or shorter ranges."""
+
+    name = "range_bias"
+    about = "the target appears farther away"
+    harmful = True
+    stage = Stage.RETURNS
+    parameters = _Bias
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan with the other ranges, none below zero."""
+        ranges = np.maximum(shot.returns.ranges + self.strength, 0.0)
+        return replace(shot, returns=replace(shot.returns, ranges=ranges))
+
+
+@dataclass(frozen=True, slots=True)
+class _Factor(Settings):
+    strength: float = setting(5.0, "factor on the noise", above=0.0, high=MOST_STRENGTH)
+
+
+class NoiseBurst(Fault):
+    """More range noise."""
+
+    name = "noise_burst"
+    about = "more range noise"
+    harmful = False
+    stage = Stage.NOISE
+    parameters = _Factor
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan with the larger factor."""
+        return replace(shot, noise=shot.noise * self.strength)
+
+
+class Frozen(Fault):
+    """The last scan again."""
+
+    name = "frozen"
+    about = "the last scan before the window is repeated"
+    harmful = True
+    stage = Stage.MESSAGE
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan that repeats the last one."""
+        return replace(shot, repeated=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Jump(Settings):
+    strength: float = setting(
+        30.0, "seconds added to the stamp", unit="s", low=-MOST_STRENGTH, high=MOST_STRENGTH
+    )
+
+
+class StampJump(Fault):
+    """A wrong stamp."""
+
+    name = "stamp_jump"
+    about = "the log clock stays correct"
+    harmful = True
+    stage = Stage.MESSAGE
+    parameters = _Jump
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan with the other stamp."""
+        return replace(shot, stamp_ns=shot.stamp_ns + round(self.strength * NS))
+
+
+@dataclass(frozen=True, slots=True)
+class _Wrong(Settings):
+    strength: float = setting(0.2, "share of the returns", above=0.0, below=1.0)
+
+
+class Outliers(Fault):
+    """Wrong ranges."""
+
+    name = "outliers"
+    about = "their ranges are 0.5 to 1.5 times the median range of the scan"
+    harmful = False
+    stage = Stage.RETURNS
+    parameters = _Wrong
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan with wrong ranges."""
+        ranges = shot.returns.ranges
+        n = len(ranges)
+        wrong = rng.random(n) < self.strength
+        median = float(np.median(ranges)) if n else 0.0
+        ranges = np.where(wrong, median * rng.uniform(*OUTLIER_RANGES, n), ranges)
+        return replace(shot, returns=replace(shot.returns, ranges=ranges))
+
+
+@dataclass(frozen=True, slots=True)
+class _Removed(Settings):
+    strength: float = setting(0.9, "share of the points that is removed", above=0.0, below=1.0)
+
+
+class Subsampled(Fault):
+    """Fewer points."""
+
+    name = "subsampled"
+    about = "fewer points, chosen at random"
+    harmful = False
+    stage = Stage.RETURNS
+    parameters = _Removed
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan with the points that are kept."""
+        kept = rng.random(len(shot.returns.ranges)) >= self.strength
+        return replace(shot, returns=shot.returns.keep(kept))
+
+
+@dataclass(frozen=True, slots=True)
+class _Every(Settings):
+    strength: float = setting(2.0, "n, a whole number", low=2.0)
+
+    def check(self) -> None:
+        """Raise ValueError where n is not a whole number."""
+        if not float(self.strength).is_integer():
+            raise SettingError("strength", f"strength is {self.strength}, must be a whole number")
+
+
+class FrameRate(Fault):
+    """Fewer scans."""
+
+    name = "frame_rate"
+    about = "only every n-th scan is written"
+    harmful = False
+    stage = Stage.MESSAGE
+    parameters = _Every
+
+    def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
+        """Return the scan, written or not."""
+        return replace(shot, written=shot.written and at.place % round(self.strength) == 0)
 
 
 @dataclass(frozen=True, slots=True)
 class InjectedFault(Settings):
     """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
 
-    kind: Kind = setting(doc="Kind of the fault.")
+    kind: str = setting(doc="Kind of the fault.", one_of=FAULTS)
     start_s: float = setting(
         doc="Begin of the fault, after the time of the first scan.",
         unit="s",
@@ -93,67 +395,129 @@ class InjectedFault(Settings):
     )
 
     def check(self) -> None:
-        """Raise ValueError where the strength does not fit the kind."""
-        default, _ = DEFAULTS[self.kind]
-        if self.strength is not None and default is None:
-            raise ValueError(f"a fault of kind '{self.kind.value}' has no strength")
-        if self.strength is not None and not fits(self.kind, self.strength):
-            raise ValueError(f"strength = {self.strength} is out of range for '{self.kind.value}'")
+        """Raise SettingError where the strength does not fit the kind."""
+        has_strength = any(f.name == "strength" for f in fields(cast(type, self.type.parameters)))
+        if self.strength is not None and not has_strength:
+            raise SettingError("strength", f"a fault of kind '{self.kind}' has no strength")
+        if self.strength is not None:
+            try:
+                self.type.parameters(strength=self.strength)  # type: ignore[call-arg]
+            except SettingError as error:
+                raise SettingError("strength", f"{error} for '{self.kind}'") from None
+
+    @classmethod
+    def parse(cls, text: str) -> InjectedFault:
+        """Return the fault that ``kind:start:duration[:strength]`` describes.
+
+        Args:
+            text: kind, start and duration [s], and for some kinds the strength.
+
+        Raises:
+            ValueError: The text has another form, or a value is out of range.
+        """
+        kind, *rest = text.strip().split(":")
+        if kind not in FAULTS.names():
+            raise ValueError(f"no fault '{kind}'; there are {', '.join(FAULTS.names())}")
+        try:
+            numbers = [float(word) for word in rest]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
+            raise ValueError(
+                f"'{text}' is not kind:start:duration[:strength] with times in seconds"
+            )
+        return cls(kind, numbers[0], numbers[1], numbers[2] if numbers[2:] else None)
+
+    @property
+    def type(self) -> type[Fault]:
+        """The class of the kind."""
+        return cast("type[Fault]", FAULTS.load(self.kind))
+
+    @property
+    def known_strength(self) -> float | None:
+        """The strength, the default of the kind where none is given; None for a kind without."""
+        default = getattr(self.type.parameters(), "strength", None)
+        return default if self.strength is None else self.strength
+
+    def fault(self) -> Fault:
+        """Return the fault itself."""
+        return self.type(self.known_strength or 0.0)
+
+    def label(self, epoch_ns: int) -> Label:
+        """Return the label: a half-open window on the log clock.
+
+        Args:
+            epoch_ns: time of the first scan on the log clock [ns].
+        """
+        return Label(
+            kind=self.kind,
+            start_ns=epoch_ns + round(self.start_s * NS),
+            end_ns=epoch_ns + round((self.start_s + self.duration_s) * NS),
+            harmful=self.type.harmful if self.harmful is None else self.harmful,
+            strength=self.known_strength,
+        )
+
+    def active(self, epoch_ns: int, log_ns: int) -> bool:
+        """Return whether a scan is in the window.
+
+        Args:
+            epoch_ns: time of the first scan on the log clock [ns].
+            log_ns: time of the scan on the log clock [ns].
+        """
+        window = self.label(epoch_ns)
+        return window.start_ns <= log_ns < window.end_ns
 
 
-MOST_CLUTTER = 100.0  # points added for each point of the scan
-MOST_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
+Active = list[tuple[int, InjectedFault]]
+"""Faults with their numbers in the list from which they come."""
 
 
-def fits(kind: Kind, value: float) -> bool:
-    """Return whether a strength is in the range of its kind."""
-    if kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
-        return 0.0 < value <= 1.0
-    if kind is Kind.CLUTTER:
-        return 0.0 < value <= MOST_CLUTTER
-    return abs(value) <= MOST_STRENGTH and (
-        value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP)
-    )
+def active(faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int) -> Active:
+    """Return the faults whose window contains an instant, in their order.
 
-
-def strength(fault: InjectedFault) -> float:
-    """The strength of a fault, the default of its kind where none is given (0 for a kind without
-    strength).
+    Args:
+        faults: All faults.
+        epoch_ns: Time of the first scan on the log clock [ns].
+        log_ns: The instant on the log clock [ns].
     """
-    return fault.strength if fault.strength is not None else DEFAULTS[fault.kind][0] or 0.0
+    return [(k, each) for k, each in enumerate(faults) if each.active(epoch_ns, log_ns)]
 
 
-def label(fault: InjectedFault, epoch_ns: int) -> Label:
-    """The label of a fault: a half-open window on the log clock that begins at ``epoch_ns``."""
-    default, harmful = DEFAULTS[fault.kind]
-    return Label(
-        kind=fault.kind.value,
-        start_ns=epoch_ns + round(fault.start_s * NS),
-        end_ns=epoch_ns + round((fault.start_s + fault.duration_s) * NS),
-        harmful=harmful if fault.harmful is None else fault.harmful,
-        strength=default if fault.strength is None else fault.strength,
-    )
+def first_of_each_kind(now: Active) -> Active:
+    """Return the first fault of each kind, in their order."""
+    first: dict[str, tuple[int, InjectedFault]] = {}
+    for number, each in now:
+        first.setdefault(each.kind, (number, each))
+    return list(first.values())
 
 
-def active(
-    faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int
-) -> dict[Kind, InjectedFault]:
-    """The faults whose window contains ``log_ns``, the first of each kind, in the order of the
-    scenario.
+def in_order_of_action(now: Active) -> list[tuple[int, Fault]]:
+    """Return faults in the order in which they act; those of one kind keep their order."""
+    found = [(number, each.fault()) for number, each in now]
+    return sorted(found, key=lambda item: (item[1].stage, item[1].name))
+
+
+def view_of(directions: Array) -> Array:
+    """Rotation (3, 3) from the frame of the scan to one whose +z axis is the mean direction of the
+    points.
     """
-    found: dict[Kind, InjectedFault] = {}
-    for fault in faults:
-        window = label(fault, epoch_ns)
-        if window.start_ns <= log_ns < window.end_ns:
-            found.setdefault(fault.kind, fault)
-    return found
+    mean = directions.mean(axis=0)
+    z = mean / np.sqrt(mean @ mean) if mean @ mean > 0.0 else np.array([0.0, 0.0, 1.0])
+    aside = np.eye(3)[int(np.argmin(np.abs(z)))]
+    y = np.cross(z, aside)
+    y /= np.sqrt(y @ y)
+    return np.stack([np.cross(y, z), y, z])
+
+
+def _turned(returns: Returns, turn: Array) -> Returns:
+    return replace(returns, directions=returns.directions @ turn.T)
 
 
 def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Generator) -> Returns:
     """Hide a share of the returns behind a plate; a few returns come from the plate.
 
     Args:
-        returns: The returns of the scan.
+        returns: The returns of the scan, of a scanner that looks along +z.
         covered: Share that is hidden.
         side_rad: Direction in the image from which the plate enters: 0 from the left, pi / 2 from
             the top.
@@ -176,12 +540,12 @@ def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Ge
 
 
 def clutter(
-    returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator
+    returns: Returns, ratio: float, centre_a: Array, radius_m: float, rng: np.random.Generator
 ) -> Returns:
     """Add ``ratio`` times as many points, uniform over a ball about the target.
 
     Args:
-        returns: The returns of the scan.
+        returns: The returns of the scan, of a scanner that looks along +z.
         ratio: Number of points to add over the number of returns.
         centre_a: (3,) centre of the target in {A} [m].
         radius_m: Radius of its bounding sphere [m].
@@ -204,3 +568,30 @@ def clutter(
         points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead], one, zero, zero
     )
     return returns.joined(added)
+
+
+def kinds_with_strengths() -> str:
+    """Return the kinds with their default strengths, as the help of ``record`` lists them."""
+    words = []
+    for name in FAULTS.names():
+        strength = getattr(FAULTS.load(name).parameters(), "strength", None)
+        words.append(name if strength is None else f"{name}:{strength:g}")
+    return "  ".join(words)
+
+
+def table() -> Iterator[str]:
+    """Yield the lines of the table of the kinds in docs/scenario.md."""
+    yield "| kind | strength (default; range) | harmful | what happens |"
+    yield "|---|---|---|---|"
+    for name in FAULTS.names():
+        kind = cast("type[Fault]", FAULTS.load(name))
+        strength = "–"  # noqa: RUF001 (a dash in a table)
+        for each in fields(cast(type, kind.parameters)):
+            declared = declared_of(each)
+            strength = f"{declared.doc} ({each.default:g}; {declared.range})"
+        harmful = "yes" if kind.harmful else "no"
+        yield f"| `{name}` | {strength} | {harmful} | {kind.about} |"
+
+
+if __name__ == "__main__":
+    print("\n".join(table()))  # noqa: T201 (the table is the output)

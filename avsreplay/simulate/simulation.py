@@ -19,11 +19,11 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Pose
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
-from avsreplay.simulate.faults import InjectedFault, Kind
+from avsreplay.simulate.faults import Circumstances, InjectedFault, Shot, Stage
 from avsreplay.simulate.motion import Motion
 from avsreplay.simulate.rays import Engine, Pattern
-from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
-from avsreplay.simulate.scanner import Returns, Scanner
+from avsreplay.simulate.recorded_faults import disturbed
+from avsreplay.simulate.scanner import Scanner
 from avsreplay.simulate.scenario import Scenario, belief, load_scenario, scenario_of
 from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
 from avsreplay.simulate.target import Shape, body, builtin_surface
@@ -31,7 +31,7 @@ from avsreplay.simulate.target import Shape, body, builtin_surface
 __all__ = [
     "EPOCH_NS",
     "Engine",
-    "RecordedFault",
+    "InjectedFault",
     "Scenario",
     "Shape",
     "Simulation",
@@ -89,7 +89,7 @@ class Simulation:
             scan: A scan of ``scans``.
         """
         state = self.truth(scan.log_ns)
-        kinds = [kind.value for kind in self._faults(scan.log_ns)]
+        kinds = [each.kind for _, each in self._faults(scan.log_ns)]
         t_s, params = (scan.log_ns - EPOCH_NS) / NS, self._scenario.params
         others = [
             each for each in (*params.object, *params.plume, *params.limb) if each.present(t_s)
@@ -117,95 +117,80 @@ class Simulation:
             (ns, self._camera.reported((scan.log_ns + ns - EPOCH_NS) / NS, rng)) for ns in after
         ]
 
-    def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
-        return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+    def _faults(self, log_ns: int) -> faults.Active:
+        every = self._scenario.params.fault
+        return faults.first_of_each_kind(faults.active(every, EPOCH_NS, log_ns))
 
     def scans(self) -> Iterator[Scan]:
         """The scans in the order of recording; a dropped one leaves a gap in ``seq``."""
         last: Scan | None = None
+        places: dict[int, int] = {}  # scans so far in the window of each fault
         for k in range(self.count):
-            scan = self._scan(k, last)
-            if scan is not None:
-                if next(iter(self._faults(scan.log_ns)), None) is not Kind.FROZEN:
-                    last = scan
-                yield scan
+            log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
+            now = self._faults(log_ns)
+            shot = self._shot(k, log_ns, now, places)
+            places.update({number: places.get(number, 0) + 1 for number, _ in now})
+            if not shot.written:
+                continue
+            scan = self._scan(k, log_ns, shot)
+            if not shot.repeated:
+                last = scan
+            elif last is not None:
+                scan = replace(
+                    scan,
+                    points=last.points,
+                    times_s=last.times_s,
+                    intensities=last.intensities,
+                    status=last.status,
+                )
+            yield scan
 
-    def _scan(self, k: int, last: Scan | None) -> Scan | None:
-        log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
-        now = self._faults(log_ns)
-        if Kind.DROPPED in now:
-            return None
-        returns = self._returns(k, log_ns, now)
-        timed = self._scenario.params.scanner.pattern is not Pattern.FLASH
-        jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
-        scan = Scan(
+    def _scan(self, k: int, log_ns: int, shot: Shot) -> Scan:
+        returns, scanner = shot.returns, self._scenario.params.scanner
+        timed = scanner.pattern is not Pattern.FLASH
+        return Scan(
             seq=k,
-            t_ns=log_ns + round(jump * NS),
+            t_ns=log_ns + shot.stamp_ns,
             log_ns=log_ns,
             points=returns.points,
             times_s=returns.times_s.astype(np.float32) if timed else None,
             status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
-            intensities=(
-                returns.intensities.astype(np.float32)
-                if self._scenario.params.scanner.intensity
-                else None
-            ),
+            intensities=returns.intensities.astype(np.float32) if scanner.intensity else None,
         )
-        if Kind.FROZEN in now and last is not None:
-            scan = replace(
-                scan,
-                points=last.points,
-                times_s=last.times_s,
-                intensities=last.intensities,
-                status=last.status,
-            )
-        return scan
 
-    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault]) -> Returns:
-        """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the
-        light.
-        """
+    def _shot(self, k: int, log_ns: int, now: faults.Active, places: Mapping[int, int]) -> Shot:
+        """Ray casting, noise and faults, in the order in which they act on the light."""
         noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
         bodies = [body for body in self._bodies if body.params.present(t_s)]
         plumes = [each for each in params.plume if each.present(t_s)]
         limbs = [each for each in params.limb if each.present(t_s)]
         lights = self._with_rng("plume", k, plumes), self._with_rng("limb", k, limbs)
-        returns = self._scanner.cast(t_s, bodies, *lights)
-        wrong = (
-            self._rng("fault", k) if now else noise
-        )  # not used without a fault; to create it takes 25 us
-        for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
-            if kind in now:
-                returns = faults.occlude(
-                    returns, faults.strength(now[kind]), self._side(now[kind]), wrong
-                )
-        factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
-        factor *= self._scanner.glare(t_s, limbs)
-        returns = self._scanner.disturb(returns, noise, factor)
-        if Kind.RANGE_BIAS in now:
-            returns = replace(
-                returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS])
-            )
-        if Kind.CLUTTER in now:
-            ratio, centre = (
-                faults.strength(now[Kind.CLUTTER]),
-                self.truth(log_ns).T_ac.apply(self._scanner.centre_c),
-            )
-            if self._camera is not None:
-                centre = self._camera.pose(t_s).inverse().apply(centre)
-            returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
-        return (
-            returns.keep(np.zeros(len(returns.ranges), dtype=bool))
-            if Kind.EMPTY in now
-            else returns.in_order()
-        )
+        acting = faults.in_order_of_action(now)
+        # not used without a fault; to create it takes 25 us
+        wrong = self._rng("fault", k) if now else noise
+        at = {n: self._circumstances(t_s, log_ns, n, places.get(n, 0)) for n, _ in acting}
+        shot = Shot(self._scanner.cast(t_s, bodies, *lights))
+        for number, fault in acting:
+            if fault.stage <= Stage.NOISE:
+                shot = fault.apply(shot, at[number], wrong)
+        factor = shot.noise * self._scanner.glare(t_s, limbs)
+        shot = replace(shot, returns=self._scanner.disturb(shot.returns, noise, factor))
+        for number, fault in acting:
+            if fault.stage > Stage.NOISE:
+                shot = fault.apply(shot, at[number], wrong)
+        return replace(shot, returns=shot.returns.in_order())
 
-    def _side(self, fault: InjectedFault) -> float:
-        """Direction in the image from which the plate of a fault enters, the same for all its scans
-        [rad].
-        """
-        return float(
-            self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi)
+    def _circumstances(self, t_s: float, log_ns: int, number: int, place: int) -> Circumstances:
+        """What a fault with this number in the scenario needs to know."""
+        centre = self.truth(log_ns).T_ac.apply(self._scanner.centre_c)
+        if self._camera is not None:
+            centre = self._camera.pose(t_s).inverse().apply(centre)
+        return Circumstances(
+            t_s=t_s,
+            place=place,
+            window=lambda: self._rng("plate", number),
+            centre_a=centre,
+            radius_m=self._scanner.radius_m,
         )
 
     def _with_rng(
@@ -252,7 +237,7 @@ def simulate(
         scenario=scenario.text,
         seed=params.seed,
         labels=(
-            *(faults.label(f, EPOCH_NS) for f in params.fault),
+            *(each.label(EPOCH_NS) for each in params.fault),
             *(label for label in others if label),
         ),
         start=start,

@@ -9,6 +9,7 @@
 #include <cstring>
 #include <limits>
 #include <stdexcept>
+#include <utility>
 
 #include "build.hpp"
 #include "coarse.hpp"
@@ -16,6 +17,7 @@
 #include "cubes.hpp"
 #include "evidence.hpp"
 #include "grade.hpp"
+#include "interrupt.hpp"
 #include "loop.hpp"
 #include "pairs.hpp"
 #include "point_tree.hpp"
@@ -32,6 +34,16 @@ using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Ints = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Numpy = nb::ndarray<nb::numpy, double>;
+
+unsigned long main_thread;  // the one that handles signals
+
+bool handles_signals() {
+  if (PyThread_get_thread_ident() != main_thread) return false;
+  nb::gil_scoped_acquire lock;
+  if (PyErr_CheckSignals() == 0) return false;
+  PyErr_Clear();  // raised again when the work has ended
+  return true;
+}
 
 void require(bool good, const char* what) {
   if (!good) throw std::invalid_argument(what);
@@ -618,6 +630,17 @@ nb::ndarray<nb::numpy, int64_t> seen_at(nb::handle points, const Doubles& T_ca, 
 
 NB_MODULE(_kernel, m) {
   keep_freed_memory();
+  main_thread = nb::cast<unsigned long>(nb::module_::import_("threading").attr("main_thread")().attr("ident"));
+  handle_signals = &handles_signals;
+  nb::register_exception_translator([](const std::exception_ptr& p, void*) {
+    try {
+      std::rethrow_exception(p);
+    } catch (const Interrupted&) {
+      PyErr_SetNone(PyExc_KeyboardInterrupt);
+    }
+  });
+  m.def("request_stop", [](bool wanted) { stop_requested = wanted; }, nb::arg("wanted"));
+  m.def("shield", [](bool wanted) { return std::exchange(shielded, wanted); }, nb::arg("wanted"));
   m.attr("LAYOUT") = LAYOUT;
   m.def("checksum", [](const Bytes& b) { return checksum(reinterpret_cast<const char*>(b.data()), b.size()); }, nb::arg("payload"));
   nb::class_<Matches>(m, "Matches");

@@ -2,6 +2,8 @@
 
 #include <system_error>
 
+#include "interrupt.hpp"
+
 namespace avs {
 
 Team::Team(int threads) {
@@ -23,17 +25,21 @@ Team::~Team() {
 
 void Team::each(int64_t n, const std::function<void(int64_t)>& work) {
   if (threads_.empty() || n < 2) {
-    for (int64_t k = 0; k < n; ++k) work(k);
+    for (int64_t k = 0; k < n; ++k) {
+      if (Poll::ends()) throw Interrupted{};
+      work(k);
+    }
     return;
   }
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    work_ = &work, n_ = n, next_ = 0, busy_ = (int)threads_.size(), ++round_;
+    work_ = &work, n_ = n, next_ = 0, ended_ = false, busy_ = (int)threads_.size(), ++round_;
   }
   wake_.notify_all();
-  take();
+  take(true);
   std::unique_lock<std::mutex> lock(mutex_);
   done_.wait(lock, [this] { return busy_ == 0; });
+  if (ended_) throw Interrupted{};
 }
 
 void Team::serve() {
@@ -44,14 +50,18 @@ void Team::serve() {
     if (stop_) return;
     seen = round_;
     lock.unlock();
-    take();
+    take(false);
     lock.lock();
     if (--busy_ == 0) done_.notify_one();
   }
 }
 
-void Team::take() {
-  for (int64_t k; (k = next_.fetch_add(1)) < n_;) (*work_)(k);
+// Only the thread that called `each` asks whether the work is to end.
+void Team::take(bool asks) {
+  for (int64_t k; !ended_ && (k = next_.fetch_add(1)) < n_;) {
+    (*work_)(k);
+    if (asks && Poll::ends()) ended_ = true;
+  }
 }
 
 }  // namespace avs
