@@ -289,6 +289,7 @@ class Alignment:
         systematic: its part from errors of model and ranges.
         message: why it failed or is not accepted.
         free_directions: not determined, in words; free: columns d (6, k).
+        members: of an ambiguous one, the poses T_ac that explain the scan, the registered first.
         split_nis, size: see ``quality``; with the 1 sigma of the size.
         size_1s: error of the size, until it is fitted.
     """
@@ -311,6 +312,7 @@ class Alignment:
     size_1s: float | None = None
     systematic: Array | None = None
     size: tuple[float, float] | None = None
+    members: tuple[Pose, ...] = ()
 
     @property
     def measured(self) -> bool:
