@@ -8,7 +8,7 @@ radians; instants are ``t_ns`` [ns].
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from enum import Enum
 from itertools import accumulate
 from typing import Any
@@ -220,6 +220,14 @@ class Scan:
     intensities: NDArray[Any] | None = None
     places: NDArray[Any] | None = None
     sensor: Pose | None = None
+
+    def keep(self, kept: NDArray[np.bool_]) -> Scan:
+        """Return the scan with some of its points (n,)."""
+        each = (self.times_s, self.intensities, self.places)
+        times, seen, places = (None if column is None else column[kept] for column in each)
+        return replace(
+            self, points=self.points[kept], times_s=times, intensities=seen, places=places
+        )
 
 
 @value_class
