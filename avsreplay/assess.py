@@ -38,7 +38,7 @@ from avsreplay.estimate.chart import (
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.params import NoiseSource
 from avsreplay.geometry import Array, Pose
-from avsreplay.outcome import CaptureError
+from avsreplay.outcome import CaptureError, Plan, PlanStatus
 from avsreplay.pipeline import planner_input
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.flights import (
@@ -50,6 +50,7 @@ from avsreplay.plan.flights import (
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import TargetGeometry
+from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.plan.supervisor import RULES, Action
 from avsreplay.plan.uncertainty import Disturbance, draws, wilson
 from avsreplay.records import Alignment, AlignStatus, Belief, State
@@ -337,9 +338,11 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
     if touched is not None:
         contact = float(touched.mean())
     found: dict[str, Any] = {"chance": Chance.NONE, "probability": 0.0, "contact": contact}
-    plan, params = state.plan, setup.guidance.params
-    if log.converged and plan is not None:
-        words = "proven" if plan.status.value.startswith("infeasible") else "found"
+    params, free = setup.guidance.params, _planned(setup, belief)
+    plan = state.plan if log.converged else None
+    plan = free if plan is None and free.status is PlanStatus.INFEASIBLE else plan
+    if plan is not None:
+        words = "proven" if plan.status is PlanStatus.INFEASIBLE else "found"
         return {
             **found,
             "limit": (
@@ -600,14 +603,17 @@ def _probability(good: Any) -> dict[str, Any]:
     }
 
 
-def _planned_s(setup: Setup, belief: Belief) -> float:
-    """Time to a capture that is planned from the start of the robot, without constraints [s]."""
-    from avsreplay.plan.rendezvous import rendezvous
-
+def _planned(setup: Setup, belief: Belief) -> Plan:
+    """A capture that is planned from the start of the robot, without constraints."""
     p = setup.guidance.params
     start = np.array(p.robot_position_m), np.array(p.robot_velocity_mps)
-    found = rendezvous(setup.estimator.motion(belief), *start, p, belief.t_ns)
-    return found.t_go_s if found.found else p.horizon_s
+    return rendezvous(setup.estimator.motion(belief), *start, p, belief.t_ns)
+
+
+def _planned_s(setup: Setup, belief: Belief) -> float:
+    """Time to that capture; the horizon where there is none [s]."""
+    found = _planned(setup, belief)
+    return found.t_go_s if found.found else setup.guidance.params.horizon_s
 
 
 def _predicted(setup: Setup, belief: Belief, after_s: float) -> tuple[int, float, str]:

@@ -71,7 +71,8 @@ def stages(
         estimator=estimator_of(estimator, start, surface.extent, clock[0], 0.5 * (low + high)),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
-            Consistency(config.consistency), Convergence(config.convergence, surface.extent)
+            Consistency(config.consistency),
+            Convergence(config.convergence, surface.extent, _tolerance(task)),
         ),
         guidance=Guidance(
             robot.applied(config.plan),
@@ -89,6 +90,11 @@ def stages(
         initialise=_initialise(config, header, truth_of),
         region=Region(np.array(config.region_start()), low, high) if config.region else None,
     )
+
+
+def _tolerance(task: Task) -> tuple[float, float, float]:
+    allowed = task.tolerance
+    return allowed.position_m, allowed.speed_mps, float(np.radians(allowed.angle_deg))
 
 
 def task_and_target(config: RunConfig, surface: Surface) -> tuple[Task, TargetGeometry]:

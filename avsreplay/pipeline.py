@@ -40,6 +40,7 @@ from avsreplay.monitor.gramian import gramian as empty_gramian
 from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry
+from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
 from avsreplay.region import Followed, Region
 from avsreplay.register.backend import measured_alignment
@@ -81,6 +82,20 @@ class MonitorState:
 
 
 @value_class
+class PlannedTime:
+    """Time to the planned capture.
+
+    Attributes:
+        flown: a capture plan is flown.
+        after_s: returns the time [s after the scan]; before a plan is flown, a plan without
+            constraints is made, and the horizon taken where there is none.
+    """
+
+    flown: bool
+    after_s: Callable[[], float]
+
+
+@value_class
 class Monitors:
     """Observability, consistency and convergence; they do not change the estimate."""
 
@@ -106,6 +121,8 @@ class Monitors:
         gamma: int,
         track: Track,
         belief: Belief,
+        planned: PlannedTime,
+        grasp_c: Array,
     ) -> tuple[MonitorState, MonitorReport]:
         """Process one scan.
 
@@ -117,6 +134,8 @@ class Monitors:
             gamma: 1 if the fault detector accepts the measurement, else 0.
             track: estimate after the scan.
             belief: what is published of it.
+            planned: time to the planned capture.
+            grasp_c: (3,) grasp point in {C} [m].
         """
         healthy, seen = (
             innovation if gamma else None,
@@ -129,12 +148,19 @@ class Monitors:
         consistent = window.consistent and not (
             track.window.many_outliers or in_doubt(track) or failed
         )
-        forecast = estimator.track_forecast(track, self.convergence.times_s)
+        forecast = estimator.track_forecast(track, np.zeros(1), grasp_c)
+        if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
+            forecast = estimator.track_forecast(track, np.array([planned.after_s()]), grasp_c)
         possible = with_change(forecast, belief, track.change_P)
         instants = state.instants.after(belief.t_ns) if healthy else state.instants
         w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
         judged = self.convergence.judge(
-            state.convergence, belief, forecast, consistent is True and alias is None, possible
+            state.convergence,
+            belief,
+            forecast,
+            consistent is True and alias is None,
+            possible,
+            planned.flown,
         )
         report = MonitorReport(
             ogm_rank=rank.rank,
@@ -255,7 +281,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     track = track.changed(
         errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor)
     )
-    seen = innovation, gamma, track, (belief := stages.estimator.published(track))
+    belief = stages.estimator.published(track)
+    planned = _planned_time(stages, state.guidance, belief)
+    seen = innovation, gamma, track, belief, planned, stages.grasp_c
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
@@ -295,6 +323,24 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         ),
         outcome,
     )
+
+
+def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
+    """The time to the capture that is flown, or that a plan from the robot's start would take."""
+    params, t_ns = stages.guidance.params, belief.t_ns
+    if guidance is not None and guidance.captured_ns is not None:
+        return PlannedTime(True, lambda: 0.0)
+    if guidance is not None and guidance.segment.capture:
+        left_s = max((guidance.segment.end_ns - t_ns) * 1e-9, 0.0)
+        return PlannedTime(True, lambda: left_s)
+
+    def planned() -> float:
+        motion = stages.estimator.motion(at_grasp(belief, stages.grasp_c))
+        start = np.array(params.robot_position_m), np.array(params.robot_velocity_mps)
+        made = rendezvous(motion, *start, params, t_ns)
+        return made.t_go_s if made.found else params.horizon_s
+
+    return PlannedTime(False, planned)
 
 
 def fold(

@@ -878,24 +878,24 @@ class Row:
     grasp_pos_1s_m: float | None = _number(
         lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
         (
-            "Largest standard deviation of the position of the grasp point, predicted over the "
-            "horizon."
+            "Standard deviation of the position of the grasp point, predicted for the "
+            "planned capture; for now where that already exceeds the tolerance."
         ),
         "m",
     )
     grasp_vel_1s_mps: float | None = _number(
         lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()),
         (
-            "Largest standard deviation of the velocity of the grasp point, predicted over the "
-            "horizon."
+            "Standard deviation of the velocity of the grasp point, predicted for the "
+            "planned capture likewise."
         ),
         "m/s",
     )
     grasp_rot_1s_deg: float | None = _number(
         lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()),
         (
-            "Largest standard deviation of the attitude of the grasp point, predicted over the "
-            "horizon."
+            "Standard deviation of the attitude of the grasp point, predicted for the "
+            "planned capture likewise."
         ),
         "deg",
     )

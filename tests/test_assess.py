@@ -1,5 +1,6 @@
 """The task, contact with the body, and the assessment of a capture."""
 
+import io
 import json
 import math
 import subprocess
@@ -19,6 +20,10 @@ from avsreplay.plan.contact import Contact
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import SupervisorParams
 from avsreplay.records import Belief, State, Surface
+from avsreplay.report.summary import Summary
+from avsreplay.report.summary_tables import print_screen
+from avsreplay.report.table import make_console
+from avsreplay.report.verdict import verdict_of
 from avsreplay.simulate.target import Shape, builtin_surface
 from avsreplay.task import TaskParams, patches, task_of
 
@@ -206,3 +211,17 @@ def test_a_run_without_a_capture_is_no_pass(fixtures_folder, more, chance, code)
     returned, verdict = _run(fixtures_folder, *more)
     assert (verdict["capture"]["chance"], returned) == (chance, code)
     assert verdict["grade"] != "PASS"
+
+
+def test_the_first_screen_has_the_answer_and_the_four_quantities_in_80_columns(make_rows):
+    rows = make_rows(600)
+    verdict = verdict_of(rows, Summary.fold(rows))
+    stream = io.StringIO()
+    print_screen(make_console(stream), rows, verdict)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) <= 26
+    assert max(map(len, lines)) <= 80
+    assert lines[0].startswith(verdict.line[:40])
+    shown = " ".join(lines)
+    for head in ("position", "attitude", "gamma", "log10 cond.", "capture [s]"):
+        assert head in shown

@@ -4,6 +4,8 @@ converge.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from avsreplay.records import BLOCKS, Belief, Forecast, State
 
 X = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
 PAPER = ConvergenceParams(criterion=Criterion.COVARIANCE)
+TOLERANCE = (0.08, 0.016, math.radians(3.0))
 TIMES = np.array([5.0, 30.0])
 
 
@@ -35,7 +38,7 @@ def fold(convergence: Convergence, steps):
 
 
 def test_t1_is_the_first_epoch_of_the_dwell() -> None:
-    convergence = Convergence(PAPER, 8.0)
+    convergence = Convergence(PAPER, 8.0, TOLERANCE)
     steps = [(belief(t, **({"sigma": 1.0} if t < 10 else {})),) for t in range(30)]
     assert not fold(convergence, steps[:12]).converged
     track = fold(convergence, steps)
@@ -44,7 +47,7 @@ def test_t1_is_the_first_epoch_of_the_dwell() -> None:
 
 
 def test_a_break_starts_the_dwell_again_but_t1_stays() -> None:
-    convergence = Convergence(PAPER, 8.0)
+    convergence = Convergence(PAPER, 8.0, TOLERANCE)
     bad = {3, 10}
     steps = [(belief(t, **({"rate": 1.0} if t in bad else {})),) for t in range(20)]
     assert fold(convergence, steps[:4]).t1_ns == 0
@@ -57,7 +60,9 @@ def test_a_break_starts_the_dwell_again_but_t1_stays() -> None:
 
 @pytest.mark.parametrize("block", list(BLOCKS))
 def test_every_block_counts(block: str) -> None:
-    track = fold(Convergence(PAPER, 8.0), [(belief(t, **{block: 0.5}),) for t in range(9)])
+    track = fold(
+        Convergence(PAPER, 8.0, TOLERANCE), [(belief(t, **{block: 0.5}),) for t in range(9)]
+    )
     assert not track.converged
     assert track.unknown == (block,)
 
@@ -65,8 +70,8 @@ def test_every_block_counts(block: str) -> None:
 def test_predictive_test_ignores_an_unobservable_parameter() -> None:
     """A nearly axisymmetric body: sigma and mu wide, the grasp point's motion known."""
     steps = [(belief(t, sigma=0.5, mu=0.5), ahead()) for t in range(9)]
-    assert fold(Convergence(ConvergenceParams(), 8.0), steps).converged
-    track = fold(Convergence(PAPER, 8.0), steps)
+    assert fold(Convergence(ConvergenceParams(), 8.0, TOLERANCE), steps).converged
+    track = fold(Convergence(PAPER, 8.0, TOLERANCE), steps)
     assert not track.converged
     assert track.predictive_converged
     assert track.unknown == ("sigma", "mu")
@@ -75,12 +80,13 @@ def test_predictive_test_ignores_an_unobservable_parameter() -> None:
 @pytest.mark.parametrize("wide", [{"pos": 0.2}, {"vel": 0.1}, {"rot": 0.1}])
 def test_predictive_test_counts_each_of_three(wide: dict[str, float]) -> None:
     assert not fold(
-        Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(**wide)) for t in range(9)]
+        Convergence(ConvergenceParams(), 8.0, TOLERANCE),
+        [(belief(t), ahead(**wide)) for t in range(9)],
     ).converged
 
 
 def test_an_inconsistent_filter_is_not_converged() -> None:
-    convergence = Convergence(ConvergenceParams(), 8.0)
+    convergence = Convergence(ConvergenceParams(), 8.0, TOLERANCE)
     steps = [(belief(t), ahead(), t < 10) for t in range(20)]
     assert fold(convergence, steps[:10]).converged
     assert not fold(convergence, steps).converged
@@ -90,7 +96,7 @@ def test_the_test_of_the_paper_looks_at_the_covariance_only() -> None:
     """Consistency of the innovations and a possible change of the motion are additions to the
     printed method.
     """
-    convergence = Convergence(PAPER, 8.0)
+    convergence = Convergence(PAPER, 8.0, TOLERANCE)
     track = fold(convergence, [(belief(t), ahead(), False, ahead(1e9)) for t in range(9)])
     assert track.converged
     assert track.t1_ns == 0
@@ -99,9 +105,10 @@ def test_the_test_of_the_paper_looks_at_the_covariance_only() -> None:
 def test_not_a_number_is_not_converged() -> None:
     P = np.full((20, 20), np.nan)
     nothing = Belief(0, X, P)
-    assert not fold(Convergence(PAPER, 8.0), [(nothing,)] * 3).covariance_converged
+    assert not fold(Convergence(PAPER, 8.0, TOLERANCE), [(nothing,)] * 3).covariance_converged
     assert not fold(
-        Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(np.nan)) for t in range(9)]
+        Convergence(ConvergenceParams(), 8.0, TOLERANCE),
+        [(belief(t), ahead(np.nan)) for t in range(9)],
     ).converged
 
 
@@ -111,21 +118,30 @@ def test_blocks_are_roots_of_traces() -> None:
 
 
 def test_params() -> None:
-    assert ConvergenceParams(horizon_s=20.0, horizon_steps=4).times_s == pytest.approx(
-        [5.0, 10.0, 15.0, 20.0]
-    )
-    assert ConvergenceParams().resolved(8.0).grasp_pos_m == pytest.approx(0.08)
+    assert ConvergenceParams().resolved(8.0).position_m == pytest.approx(0.08)
     with pytest.raises(ValueError, match="dwell_s"):
         ConvergenceParams(dwell_s=-1.0)
-    with pytest.raises(ValueError, match="horizon_steps"):
-        ConvergenceParams(horizon_steps=0)
+    with pytest.raises(ValueError, match="sigmas"):
+        ConvergenceParams(sigmas=0.0)
 
 
 def test_a_possible_change_withholds_convergence_and_does_not_interrupt_the_dwell() -> None:
-    convergence, far = Convergence(ConvergenceParams(), 8.0), ahead(pos=1.0)
+    convergence, far = Convergence(ConvergenceParams(), 8.0, TOLERANCE), ahead(pos=1.0)
     steps = [(belief(float(t)), ahead(), True, far if t in (1, 6) else ahead()) for t in range(9)]
     assert [fold(convergence, steps[: n + 1]).converged for n in range(9)] == [
         t >= 2 and t != 6 for t in range(9)
     ]
     assert fold(convergence, steps[:7]).predictive_converged
     assert fold(convergence, steps).t1_ns == 0
+
+
+def test_the_tolerance_of_the_task_decides_and_a_flight_goes_on_up_to_twice_the_error() -> None:
+    convergence = Convergence(ConvergenceParams(), 8.0, TOLERANCE)
+    for share, rests, flies in ((0.9, True, True), (1.5, False, True), (2.1, False, False)):
+        seen = ahead(pos=share * TOLERANCE[0])
+        assert convergence.ratio(seen) == pytest.approx(share)
+        for flown, expected in ((False, rests), (True, flies)):
+            track = convergence.initial()
+            for t in range(5):
+                track = convergence.judge(track, belief(float(t)), seen, flown=flown)
+            assert track.converged is expected

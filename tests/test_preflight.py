@@ -499,7 +499,19 @@ def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures
     assert volume == pytest.approx(
         trimesh.Trimesh(own.vertices, own.faces, process=False).volume, rel=1e-5
     )
-    done = cli("run", log, "--model", mirrored, "--model-mirror", "--init", "auto", "--n-scans", 6)
+    done = cli(
+        "run",
+        log,
+        "--model",
+        mirrored,
+        "--model-mirror",
+        "--init",
+        "auto",
+        "--n-scans",
+        6,
+        "--tables",
+        "run",
+    )
     assert "6 healthy" in done.out
 
 

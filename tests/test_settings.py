@@ -339,7 +339,6 @@ def test_the_papers_settings_are_settings() -> None:
         "estimator.start_vel_1s_mps=1e15",
         "estimator.start_log_inertia_1s=1e3",
         "estimator.start_sigma_1s=2",
-        "convergence.horizon_steps=1000000",
         "register.threads=1000000",
     ],
 )

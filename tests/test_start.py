@@ -85,7 +85,7 @@ def test_a_reference_is_called_a_fit_and_never_truth(cli, fixtures_folder):
         row["nees"] is None for row in fitted
     )  # a fit to the same scans judges no covariance
     assert rms(fitted, "pos_err_m") < 0.003
-    printed = cli("run", log, "--reference", "fit").out
+    printed = cli("run", log, "--reference", "fit", "--tables", "errors").out
     assert "from fit" in printed
     assert "Errors against the fitted motion" in printed
 

@@ -55,6 +55,28 @@ Exit codes: 0 ok, 1 the tracking is FAIL, the golden file differs or a requireme
             2 usage, 3 unreadable input, 4 finished but data was lost, 130 interrupted."""
 
 
+class Tables(click.ParamType[tuple[str, ...]]):
+    """Names of tables, separated by commas, or ``all``."""
+
+    name = "NAME,...|all"
+
+    def convert(
+        self,
+        value: Any,
+        param: click.Parameter | None,
+        ctx: click.Context | None,  # noqa: ARG002 -- the signature of click
+    ) -> tuple[str, ...]:
+        """Return the names."""
+        from avsreplay.report.summary_tables import TABLES
+
+        names = tuple(name for name in str(value).lower().split(",") if name)
+        if "all" in names:
+            return TABLES
+        if unknown := [name for name in names if name not in TABLES]:
+            self.fail(f"'{unknown[0]}' is none of {', '.join(TABLES)}, all", param)
+        return names
+
+
 class Requirement(click.ParamType[str | float]):
     """``pass``, ``check`` or ``any``, or ``capture=P`` with the least probability of a capture."""
 
@@ -130,6 +152,14 @@ class Requirement(click.ParamType[str | float]):
     multiple=True,
     help="Exit with code 1 if the verdict is worse, or the capture is less probable (capture=0.9)."
     " Without it FAIL gives code 1; any accepts every verdict. May be repeated.",
+)
+@click.option(
+    "--tables",
+    type=Tables(),
+    default="",
+    metavar="NAME,...|all",
+    help="Print more tables: verdict, moments, capture, scans, curves, errors, faults, manoeuvres,"
+    " parameters, consistency, run.",
 )
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
@@ -208,6 +238,7 @@ class Wanted:
     resume: bool
     follow: bool
     as_json: bool
+    tables: tuple[str, ...]
     table_every: int | None
     table_all: bool
     plain: bool
@@ -477,14 +508,19 @@ def _print(wanted: Wanted, done: _Finished) -> None:
 
         click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
         return
-    from avsreplay.report.summary_tables import print_tables
+    from avsreplay.report.summary_tables import print_screen, print_tables
     from avsreplay.report.table import make_console
 
+    console, names = make_console(), set(wanted.tables)
+    if wanted.table_all or wanted.table_every:
+        names.add("scans")
+    print_screen(console, done.rows, done.verdict)
     print_tables(
-        make_console(),
+        console,
         done.rows,
         done.summary,
         done.verdict,
+        names=names,
         every=wanted.table_every,
         show_all=wanted.table_all,
         plain=wanted.plain,

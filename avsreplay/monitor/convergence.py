@@ -3,8 +3,8 @@ may be used.
 
 Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every
 correct estimate. They need no ground truth. Convergence: ``covariance`` is the paper's test, every
-parameter and motion block below its limit. ``predictive`` tests position, velocity and attitude of
-the grasp point over the planner's horizon, which the capture needs; a body with unobservable
+parameter and motion block below its limit. ``predictive`` compares position, velocity and attitude
+of the grasp point at the planned capture with the tolerances of the task; a body with unobservable
 parameters may pass it. Either must hold for the dwell time, with a consistent estimate.
 """
 
@@ -23,6 +23,7 @@ from avsreplay.monitor.chi_square import mean_band
 from avsreplay.records import BLOCKS, UNLIKELY, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
+KEPT = 2.0  # a flight goes on up to this multiple of the error with which it may begin
 _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
@@ -76,8 +77,8 @@ class ConvergenceParams(Settings):
     criterion: Criterion = setting(
         Criterion.PREDICTIVE,
         "Test that decides: the covariance of every block alone, as in the paper (covariance), or"
-        " the predicted 1 sigma of the grasp point over the horizon and the consistency of the"
-        " innovations (predictive).",
+        " the 1 sigma of the grasp point predicted for the planned capture and the consistency of"
+        " the innovations (predictive).",
     )
     dwell_s: float = setting(
         2.0,
@@ -85,32 +86,12 @@ class ConvergenceParams(Settings):
         unit="s",
         low=0.0,
     )
-    horizon_s: float = setting(
-        30.0,
-        "With predictive: time over which the grasp point is predicted. A larger value requires a"
-        " more precise estimate.",
-        unit="s",
-        low=0.0,
-    )
-    horizon_steps: int = setting(
-        6, "With predictive: number of instants of the horizon that are tested.", low=1, high=1000
-    )
-    grasp_pos_m: float | None = setting(
-        None,
-        "With predictive: largest 1 sigma of the grasp point's position.",
-        unit="m",
-        low=0.0,
-        of_extent=0.01,
-    )
-    grasp_vel_mps: float | None = setting(
-        None,
-        "With predictive: largest 1 sigma of the grasp point's velocity.",
-        unit="m/s",
-        low=0.0,
-        of_extent=0.002,
-    )
-    grasp_rot_deg: float = setting(
-        3.0, "With predictive: largest 1 sigma of the grasp point's attitude.", unit="deg", low=0.0
+    sigmas: float = setting(
+        1.0,
+        "With predictive: the 1 sigma of the grasp point, predicted for the planned capture, times"
+        " this must be within the tolerances of the task. A larger value requires a more precise"
+        " estimate.",
+        above=0.0,
     )
     attitude_deg: float = setting(
         3.0, "With covariance: largest 1 sigma of the attitude of {B}.", unit="deg", low=0.0
@@ -139,13 +120,6 @@ class ConvergenceParams(Settings):
         None, "With covariance: largest 1 sigma of varrho.", unit="m", low=0.0, of_extent=0.01
     )
     mu_deg: float = setting(3.0, "With covariance: largest 1 sigma of mu.", unit="deg", low=0.0)
-
-    @property
-    def times_s(self) -> Array:
-        """Instants (n,) after now at which the grasp point is predicted, ascending to the horizon
-        [s].
-        """
-        return np.linspace(0.0, self.horizon_s, self.horizon_steps + 1)[1:]
 
     @property
     def block_limits(self) -> dict[str, float]:
@@ -329,20 +303,14 @@ class Convergence:
     Args:
         params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal
             [m].
-
-    Attributes:
-        times_s: instants (n,) after now at which the grasp point is predicted [s].
+        tolerance: largest errors of a capture: position [m], speed [m/s] and angle [rad].
     """
 
-    def __init__(self, params: ConvergenceParams, extent_m: float) -> None:
+    def __init__(
+        self, params: ConvergenceParams, extent_m: float, tolerance: tuple[float, float, float]
+    ) -> None:
         self.params = params.resolved(extent_m)
-        self._limits, p = self.params.block_limits, self.params
-        self.times_s = p.times_s
-        self._grasp_limits = (
-            given(p.grasp_pos_m),
-            given(p.grasp_vel_mps),
-            math.radians(p.grasp_rot_deg),
-        )
+        self._limits, self._tolerance = self.params.block_limits, tolerance
 
     def initial(self) -> ConvergenceTrack:
         """Return the state before the first scan."""
@@ -355,6 +323,7 @@ class Convergence:
         forecast: Forecast | None = None,
         consistent: bool = True,
         possible: Forecast | None = None,
+        flown: bool = False,
     ) -> ConvergenceTrack:
         """Return the state after one more scan. By the predictive criterion an inconsistent
         estimate is not converged.
@@ -362,17 +331,20 @@ class Convergence:
         Args:
             track: the state so far.
             belief: the estimate after the scan.
-            forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
+            forecast: predicted 1 sigma of the grasp point at the planned capture; needed by the
+                predictive criterion.
             consistent: of the consistency tests.
             possible: the forecast with a change that the last scans make possible. While it exceeds
                 a limit, convergence is not claimed. The dwell goes on: once later scans exclude the
                 change, the test has held.
+            flown: a plan is flown: further scans will arrive before the capture, so that the
+                flight is given up only where the error is ``KEPT`` times as large.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(
             name for name, limit in self._limits.items() if not one_sigma[name] <= limit
         )
-        predictive = forecast is not None and self._predicted(forecast)
+        predictive = forecast is not None and self.ratio(forecast) <= (KEPT if flown else 1.0)
         printed = (
             self.params.criterion is Criterion.COVARIANCE
         )  # the paper's test looks at the covariance only
@@ -380,14 +352,19 @@ class Convergence:
         if not holds:
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
         since = belief.t_ns if track.since_ns is None else track.since_ns
-        excluded = possible is None or printed or self._predicted(possible)
+        excluded = possible is None or printed or self.ratio(possible) <= (KEPT if flown else 1.0)
         converged = excluded and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)
 
-    def _predicted(self, forecast: Forecast) -> bool:
+    def ratio(self, forecast: Forecast) -> float:
+        """Return the largest predicted error in units of its tolerance.
+
+        Args:
+            forecast: predicted 1 sigma of the grasp point.
+        """
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return all(
-            float(values.max()) <= limit
-            for values, limit in zip(predicted, self._grasp_limits, strict=True)
+        return self.params.sigmas * max(
+            float(values.max()) / limit
+            for values, limit in zip(predicted, self._tolerance, strict=True)
         )

@@ -86,6 +86,7 @@ def build_html(
     parts: Iterable[Part],
     data: Mapping[str, Any] | None = None,
     lead: Iterable[Part] = (),
+    grade: str = "",
 ) -> str:
     """Build a page.
 
@@ -96,6 +97,7 @@ def build_html(
             out.
         data: charts and 3D view for the scripts; without it the page has no script.
         lead: parts above the charts.
+        grade: pass, check or fail, the colour of the first line.
 
     Returns:
         The page as text; the same arguments give the same bytes.
@@ -109,6 +111,7 @@ def build_html(
             "page.html",
             title=title,
             lines=lines,
+            grade=grade,
             lead=first,
             parts=listed,
             style=style,
@@ -183,7 +186,9 @@ def build_page(
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
-    lead = [verdict_table(verdict), moments_table(verdict, place), faults, manoeuvres]
+    capture = [] if verdict.capture is None else verdict.capture.described()
+    lead = [moments_table(verdict, place), facts_table("Capture", capture), faults, manoeuvres]
+    parts = [verdict_table(verdict), *parts]
     lines = [verdict.line, in_one_line(summary)]
     if len(rows) < len(all_rows):
         count = f"{len(rows)} of {len(all_rows)} scans"
@@ -191,7 +196,7 @@ def build_page(
             f"The charts show {count}: of every interval the first scan and those with the largest"
             " errors."
         )
-    return build_html(title, lines, parts, data, lead)
+    return build_html(title, lines, parts, data, lead, verdict.grade.value.lower())
 
 
 def _packed(columns: charts.Columns) -> dict[str, Any]:

@@ -5,6 +5,7 @@ about it.
 from __future__ import annotations
 
 import math
+import textwrap
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -26,11 +27,72 @@ from avsreplay.report.table import (
     print_sparks,
     print_table,
     scan_table,
+    state_cell,
 )
 from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
 
+SCREEN_ROWS, SCREEN_MOMENTS = 9, 3  # scans and worst moments on the first screen
+TABLES = (  # names of the tables of a run
+    *("verdict", "moments", "capture", "scans", "curves"),
+    *("errors", "faults", "manoeuvres", "parameters", "consistency", "run"),
+)
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+
+
+def print_screen(console: Console, rows: Sequence[Row], verdict: RunVerdict) -> None:
+    """Print the answer in about 24 lines: verdict, worst moments, and the four quantities of the
+    run over time.
+
+    Args:
+        console: where to print.
+        rows: one per scan.
+        verdict: on the run.
+    """
+    print_line(console, verdict.line)
+    console.print()
+    for m in verdict.moments[:SCREEN_MOMENTS]:
+        span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
+        line = f"{span} s: {m.what}; {m.cause}"
+        print_line(console, textwrap.shorten(line, console.width, placeholder=" ..."))
+    if rows:
+        print_table(console, over_time_table(rows), tight=True)
+
+
+def over_time_table(rows: Sequence[Row]) -> Table:
+    """Pose error, gamma with its reason, condition number of the Gramian and planned time of
+    capture over time.
+
+    Args:
+        rows: one per scan; about ten of them are shown.
+    """
+    step = -(-len(rows) // SCREEN_ROWS)
+    chosen = [rows[k] for k in sorted({*range(0, len(rows), step), len(rows) - 1})]
+    lines = tuple(
+        (
+            f"{row.t_s:.1f}",
+            state_cell(row.gamma, row.reason),
+            number(None if row.pos_err_m is None else 1e3 * row.pos_err_m, ".3g"),
+            number(row.rot_err_deg, ".2g"),
+            number(row.ogm_log10_cond, ".1f") if row.ogm_log10_cond else f"rank {row.ogm_rank}",
+            number(row.capture_time_s, ".2f"),
+            row.action or "-",
+        )
+        for row in chosen
+    )
+    fitted = bool(rows) and rows[0].reference == "fit"
+    error = "from fit" if fitted else "error"
+    heads = (
+        "time\n[s]",
+        "gamma",
+        f"position\n{error} [mm]",
+        f"attitude\n{error} [deg]",
+        "Gramian\nlog10 cond.",
+        "planned\ncapture [s]",
+        "action",
+    )
+    note = "more: --tables NAME,... (" + ", ".join(TABLES) + ") or all; page: -o DIR --report"
+    return Table(f"{len(chosen)} of {len(rows)} scans", heads, lines, align="rlrrrrl", note=note)
 
 
 def print_tables(
@@ -39,35 +101,45 @@ def print_tables(
     summary: Summary,
     verdict: RunVerdict | None = None,
     *,
+    names: Iterable[str] | None = None,
     every: int | None = None,
     show_all: bool = False,
     scans_per_s: float | None = None,
     plain: bool = False,
 ) -> None:
-    """Print the verdict, the per-scan table, curves on a wide terminal, and the summary.
+    """Print the tables of a run.
 
     Args:
         console: where to print.
         rows: one per scan.
         summary: of the same rows.
-        verdict: on the run; None leaves it out.
+        verdict: on the run; None leaves out what depends on it.
+        names: of ``TABLES``; None prints all of them.
         every: print every N-th scan.
         show_all: print all scans.
         scans_per_s: measured speed; it is printed and never written to a file.
         plain: leave the curves out.
     """
+    wanted = set(TABLES if names is None else names)
+    listed: list[tuple[str, Table]] = []
     if verdict is not None:
-        print_line(console, verdict.line)
-        console.print()
-        print_table(console, verdict_table(verdict))
-        print_table(console, moments_table(verdict))
-    if rows:
+        capture = [] if verdict.capture is None else verdict.capture.described()
+        listed += [("verdict", verdict_table(verdict)), ("moments", moments_table(verdict))]
+        listed.append(("capture", facts_table("Capture", capture)))
+    for name, table in listed:
+        if name in wanted:
+            print_table(console, table)
+    if rows and "scans" in wanted:
         print_table(console, scan_table(console, rows, every=every, show_all=show_all), tight=True)
-        if not plain:
-            print_sparks(console, rows)
-    for table in summary_tables(summary, rows):
-        print_table(console, table)
-    print_table(console, facts_table("Run", fact_lines(summary, scans_per_s=scans_per_s)))
+    if rows and "curves" in wanted and not plain:
+        print_sparks(console, rows)
+    named = ("errors", "faults", "manoeuvres", "parameters", "consistency")
+    for name, table in zip(named, summary_tables(summary, rows), strict=True):
+        if name in wanted:
+            print_table(console, table)
+    if "run" in wanted:
+        facts = fact_lines(summary, scans_per_s=scans_per_s)
+        print_table(console, facts_table("Run", facts))
 
 
 def verdict_table(verdict: RunVerdict) -> Table:

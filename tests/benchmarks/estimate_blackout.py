@@ -36,7 +36,7 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
     lit = tumbling.World(world.times[:seen], world.states[:seen], world.moments)
     rng = np.random.Generator(np.random.PCG64([seed, 11]))
     estimator = Estimator(EstimatorParams(start=Start.COLD, correlated_share=0.0), None, 2.0)
-    tests = [Convergence(ConvergenceParams(), 2.0)]
+    tests = [Convergence(ConvergenceParams(), 2.0, (0.005, 0.0025, 0.035))]
     for _, _, track, words in fold(lit, estimator, tests, rng, (0.005, np.radians(0.3))):  # noqa: B007
         pass
     found = []
@@ -70,7 +70,7 @@ def early(seed: int, seen_s: float, gap_s: float) -> tuple[float, float]:
         np.random.Generator(np.random.PCG64([seed, 12])),
         Estimator(EstimatorParams(), None, 4.0),
     )
-    tests = [Convergence(ConvergenceParams(), 4.0)]
+    tests = [Convergence(ConvergenceParams(), 4.0, (0.01, 0.005, 0.035))]
     for _, _, track, _ in fold(lit, estimator, tests, rng, (0.002, np.radians(0.1))):  # noqa: B007
         pass
     then_ns = round(world.times[-1] * 1e9)

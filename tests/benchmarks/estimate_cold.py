@@ -51,7 +51,11 @@ def one(seed: int, start: Start) -> Outcome:
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
     estimator = Estimator(EstimatorParams(start=start, correlated_share=0.0), None, EXTENT)
     tests = [
-        Convergence(ConvergenceParams(criterion=c), EXTENT)
+        Convergence(
+            ConvergenceParams(criterion=c),
+            EXTENT,
+            (0.0025 * EXTENT, 0.00125 * EXTENT, 0.035),
+        )
         for c in (Criterion.PREDICTIVE, Criterion.COVARIANCE)
     ]
     marks, begun = [], time.perf_counter()

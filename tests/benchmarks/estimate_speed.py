@@ -162,7 +162,10 @@ def run_ms(world: tumbling.World) -> np.ndarray:
         Estimator(EstimatorParams(correlated_share=0.1), None, 4.0),
         FaultDetector(FaultParams(), 4.0),
     )
-    monitors = Monitors(Consistency(ConsistencyParams()), Convergence(ConvergenceParams(), 4.0))
+    monitors = Monitors(
+        Consistency(ConsistencyParams()),
+        Convergence(ConvergenceParams(), 4.0, (0.01, 0.005, 0.035)),
+    )
     state, track, spent = monitors.initial(np.ones(20)), estimator.initial(0, seen[0].T_ac), []
     # no search for reference cycles among the simulated poses, which are none of the estimator's
     # objects

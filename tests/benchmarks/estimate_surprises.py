@@ -246,7 +246,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
     estimator = Estimator(params, None, EXTENT)
     estimator.anomalies.enabled = tested
     detector, watch = FaultDetector(FaultParams(), EXTENT), Consistency(ConsistencyParams())
-    test = Convergence(ConvergenceParams(), EXTENT)
+    test = Convergence(ConvergenceParams(), EXTENT, (0.0025 * EXTENT, 0.00125 * EXTENT, 0.035))
     word, seen_so_far = test.initial(), watch.initial()
     result = Result(step_s=case.at_s + LATER_S, true_velocity=dv, true_rate=dw)
     alignments = measured(case, times, states, seed)
@@ -274,7 +274,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         result.violations += list(failed)
         result.failed_at += [t] * len(failed)
         honest = honest and not in_doubt(track) and not failed
-        forecast = estimator.track_forecast(track, test.params.times_s)
+        forecast = estimator.track_forecast(track, np.array([30.0]))
         possible = with_change(forecast, track.belief, track.change_P)
         word = test.judge(word, track.belief, forecast, honest, possible)
         published = estimator.published(track)

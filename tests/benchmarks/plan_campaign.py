@@ -149,7 +149,10 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
         noise=EstimatorParams().noise.__class__("r0"), r0_pos_m=NOISE_M, r0_rot_deg=NOISE_DEG
     )
     estimator = Estimator(params, near_start(state(0.0), rng), EXTENT_M)
-    convergence, watch = Convergence(ConvergenceParams(), EXTENT_M), ConvergenceTrack()
+    convergence, watch = (
+        Convergence(ConvergenceParams(), EXTENT_M, (0.0025 * EXTENT_M, 0.00125 * EXTENT_M, 0.035)),
+        ConvergenceTrack(),
+    )
     target, touched = geometry_of(state(0.0)), False
     flown, errors, gripper, radius = (
         PlanParams(latency_s=0.2),
@@ -172,7 +175,7 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
         seen = estimator.innovate(prior, measured(x, rng)) if gamma else None
         track = estimator.update(track, prior, seen, gamma)
         belief = track.belief
-        forecast = estimator.forecast(belief, convergence.params.times_s)
+        forecast = estimator.forecast(belief, np.array([30.0]))
         watch = convergence.judge(watch, belief, forecast, True)
         known = planner_input(
             estimator, belief, target, gamma, watch.converged, partial(estimator.forecast, belief)

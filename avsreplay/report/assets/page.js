@@ -14,7 +14,6 @@
   paintTheme(wish.matches);
 
   let zoom = null, ready = false, view = { choose() {}, resize() {} };
-  if (page.scene) document.querySelector("main").classList.add("two");
   const charts = Charts.build(by("charts"), page, { hover: tell, choose, zoomed(range) { zoom = range; remember(); } });
   const t = charts.t, last = t.length - 1;
   if (page.scene) view = Scene.build(by("scene"), page.scene, t);
