@@ -45,11 +45,21 @@ Examples:
 @pose_options
 @source_setting("--poses", is_flag=True)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-def info_command(source: Path, as_json: bool, **reading: Any) -> None:
+@click.option(
+    "--write",
+    "job_file",
+    type=click.Path(path_type=Path),
+    help="Write a job file with the options and their reasons, for 'avsreplay run'.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace an existing job file.")
+def info_command(
+    source: Path, as_json: bool, job_file: Path | None, overwrite: bool, **reading: Any
+) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 
     With a model (in the log or --model) it also checks what a run needs: unit of the model,
-    background points, truth, transforms and time stamps; each finding names the option to add.
+    background points, truth, transforms and time stamps; each finding names the option to add, and
+    the first scans are replayed with these options. --write stores them as a job file.
 
     The exit code is 4 if a part of SOURCE could not be read, or a scan cannot be decoded. All scans
     are decoded, unless SOURCE is larger than 256 MiB.
@@ -62,6 +72,7 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     """  # noqa: D301
     from avsreplay.log import open_source
 
+    check_outputs("job_file", overwrite=overwrite)
     options = read_options(reading)
     built = options.model == Path("auto")
     if built:
@@ -71,6 +82,15 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
         for _ in opened.scans() if info.bytes <= DECODED_BYTES else ():
             pass  # only whether they can be decoded
         advice = _advice(opened, built)
+        known = opened.header.surface is not None or built
+    from avsreplay.cli.trial import advised_words, try_advice
+
+    words = list(advised_words(advice))
+    if known and info.scans + bool(words):
+        more, words = try_advice(source, reading, advice)
+        advice += more
+    if job_file is not None:
+        _write_job(job_file, source, reading, advice, words)
     damaged = dict(sorted(opened.damaged.items()))
     if as_json:
         checks = [dataclasses.asdict(a) for a in advice]
@@ -79,8 +99,31 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
             json.dumps({**_document(info), "damaged_scans": broken, "checks": checks}, indent=2)
         )
     else:
-        _print(info, advice, damaged)
+        _print(info, advice, damaged, words)
     report_losses(opened)
+
+
+def _write_job(
+    path: Path, source: Path, reading: dict[str, Any], advice: list[Advice], words: list[str]
+) -> None:
+    """Write the options of the command, and those that were advised with their reasons."""
+    from avsreplay.cli.job import job_text
+    from avsreplay.cli.trial import advised_words, job_with
+
+    job, before = job_with(source, reading, words), job_with(source, reading, [])
+    reasons = dict[str, str]()
+    for option, why in advised_words(advice).items():
+        alone = job_with(source, reading, [option])
+        changed = [
+            field.name
+            for field in dataclasses.fields(alone.options)
+            if getattr(alone.options, field.name) != getattr(before.options, field.name)
+        ]
+        reasons |= dict.fromkeys([*changed, *map(str, alone.assignments)], why)
+    text = job_text(source, job.options, list(map(str, job.assignments)), reasons, path.parent)
+    result = next((a.text for a in advice if a.about == "replay"), "")
+    head = f"# {result}\n" if result else ""
+    path.write_text(head + text, encoding="utf-8")
 
 
 def _advice(opened: Source, built: bool) -> list[Advice]:
@@ -172,7 +215,7 @@ def loss_line(loss: Loss) -> str:
     return shown("".join([*parts, ")"]))
 
 
-def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str]) -> None:
+def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str], words: list[str]) -> None:
     from avsreplay.log.bytes_io import shown
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
@@ -181,20 +224,12 @@ def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str]) -> None
     print_table(console, _topics(info))
     print_table(console, _faults(info))
     print_table(console, _checks(advice))
-    options = [
-        a.option for a in advice if a.option and not any(map(_is_placeholder, a.option.split()))
-    ]
-    if len(options) > 1:
-        click.echo(f"options to add: {' '.join(dict.fromkeys(options))}")
+    if len(words) > 1:
+        click.echo(f"options to add: {' '.join(words)}")
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
     for seq, why in list(damaged.items())[:LISTED]:
         print_line(console, f"lost: scan {seq}: {why}")
-
-
-def _is_placeholder(word: str) -> bool:
-    """Whether a word of an option is to be replaced by a value, as FILE and X,Y,Z are."""
-    return word.isupper() and word.replace(",", "").isalpha()
 
 
 def _checks(found: list[Advice]) -> Table:

@@ -145,7 +145,7 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
 
     given = {name: value for name, value in flags.items() if value is not None}
     for name, choice in _CHOICES.items():
-        if name in given:
+        if isinstance(given.get(name), str):
             given[name] = getattr(log_options, choice)(given[name])
     if "grasp" in given and given.get("model") == Path("auto"):
         hint = "build the model first with 'avsreplay model', which has the same option"

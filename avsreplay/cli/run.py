@@ -143,8 +143,9 @@ class Requirement(click.ParamType[str | float]):
 def run_command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs
-    no option; for any other log 'avsreplay info LOG --model FILE' names the options that it needs.
+    LOG is an MCAP file, a ROS bag, a folder of scans, or a job file with a log and its options. A
+    log written by 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model
+    FILE' names the options that it needs, and --write stores them as a job file.
     If LOG is -, an MCAP file is read from standard input, and each scan is replayed as soon as it
     is complete; --follow does the same with a file that is still being written. The results are
     those of a replay of the complete log. \f Raises:
@@ -152,6 +153,7 @@ def run_command(log: Path, **flags: Any) -> None:
     """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
 
+    log = _with_job_file(log, flags)
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
     again = wanted.overwrite or wanted.resume
@@ -160,7 +162,7 @@ def run_command(log: Path, **flags: Any) -> None:
         ResultDirectory(wanted.output, overwrite=again, inputs=inputs) if wanted.output else None
     )
     with log_file(log, follow=wanted.follow) as (path, growing):
-        job = _job(path, flags)
+        job = job_of(path, flags)
         streamed = growing is not None and job.options.model != Path("auto") and not wanted.resume
         if wanted.follow and not streamed:
             raise UsageError(
@@ -235,10 +237,45 @@ class Wanted:
             read_golden(self.update_golden)
 
 
-def _job(log: Path, flags: dict[str, Any]) -> Job:
+def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
+    """Return the log of a job file and put its options into ``flags`` where none is given; any
+    other log is returned as it is.
+    """
+    if log.suffix != ".toml" or not log.is_file():
+        return log
+    from avsreplay.cli.job import read_job
+
+    job = read_job(log)
+    if job is None:
+        return log
+    given = {**job.given, "golden": job.golden, "config_file": job.config}
+    start_s = given.pop("start_s", None)
+    if start_s is not None and not any(isinstance(each, float) for each in flags["starts"]):
+        flags["starts"] = (*flags["starts"], start_s)
+    for name, value in given.items():
+        if flags.get(name) is None:
+            flags[name] = value
+    flags["assigned"] = job.assignments
+    return job.log
+
+
+def job_of(log: Path, flags: dict[str, Any]) -> Job:
+    """Return the run that the options of the command describe.
+
+    Args:
+        log: the log.
+        flags: the options by the names of their parameters; those that are used are taken out.
+
+    Raises:
+        UsageError: a value is not allowed.
+    """
     from avsreplay.run import Job
 
+    for field in fields(Wanted):
+        flags.pop(field.name, None)
+    of_file = tuple(flags.pop("assigned", ()))
     config_file, assignments = take_run_settings(flags)
+    assignments = (*of_file, *assignments)
     starts = flags.pop("starts")
     if flags.pop("paper"):
         from avsreplay.config import PAPER

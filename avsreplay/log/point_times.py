@@ -122,9 +122,8 @@ class PointTime:
     @property
     def text(self) -> str:
         """Return the reading as the argument of ``--point-time``."""
-        origin = (
-            f"{self.offset_ns * 1e-9:.9g}" if self.origin is TimeOrigin.OTHER else self.origin.value
-        )
+        offset = f"{self.offset_ns * 1e-9:.7f}".rstrip("0").rstrip(".")
+        origin = offset if self.origin is TimeOrigin.OTHER else self.origin.value
         return f"{'+'.join(self.fields)}:{self.unit.value}:{origin}"
 
     @property
