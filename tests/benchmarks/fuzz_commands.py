@@ -40,7 +40,7 @@ from avsreplay.simulate import scenario
 
 LIMIT_S, LIMIT_MIB = 20, 512
 ROOT = Path(__file__).resolve().parents[2]
-OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "poses", "animate"}
+OUTPUTS = {"output", "job_file", "update_golden", "junit", "export", "mesh", "poses", "animate"}
 NUMBERS = (
     b"0",
     b"-1",
