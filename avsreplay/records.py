@@ -28,6 +28,10 @@ BLOCKS: Mapping[str, slice] = {
     "varrho": slice(14, 17),  # [m], {B}
     "mu": slice(17, 20),  # dmu_v, half angle, {B}
 }  # the 20 error states by name, in the order of every covariance
+STATES: int = max(block.stop for block in BLOCKS.values())  # number of error states
+# 99.99 % points of chi-square by degrees of freedom: a squared normalised error above it is not by
+# chance. Of the three of a vector, and of the six of a pose.
+UNLIKELY = {3: 21.1, 6: 27.86}
 _SIZES = {
     "q_ab": 4,
     "w_b": 3,

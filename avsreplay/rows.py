@@ -1,8 +1,8 @@
-"""The row of a scan. Each column is declared once: value, unit, format and golden tolerance;
-columns.toml describes it.
+"""The row of a scan. Each column is declared once, in its place: value, meaning, unit, format and
+golden tolerance. Columns of one vector, covariance or change share a declaration.
 
 JSONL, CSV and Parquet files, tables, golden comparisons, docs/columns.md and the JSON schema are
-made from these two files. A row holds results only, no wall clock, host, version or path: the same
+made from this declaration. A row holds results only, no wall clock, host, version or path: the same
 input gives the same bytes.
 """
 
@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array
 from avsreplay.outcome import CaptureError, Outcome, Plan, PoseError, Score
 from avsreplay.records import Innovation, Manoeuvre, ScanStatus
 
@@ -26,71 +26,139 @@ Value = Callable[[Outcome, Score], T]
 
 
 @value_class(eq=True)
+class Section:
+    """A section of docs/columns.md.
+
+    Attributes:
+        title: its heading.
+        text: what holds for its columns, "" if nothing.
+    """
+
+    title: str
+    text: str = ""
+
+
+@value_class(eq=True)
 class Column:
     """Metadata of a row field.
 
     Attributes:
         name: field name, with its unit as suffix where it has one.
+        text: its meaning, one or more sentences.
         unit: as printed in table headings, "" if none.
         fmt: format specification for tables.
         rtol, atol: relative and absolute golden tolerance; both 0 means exact.
         table: shown in the per-scan table.
+        section: the section that begins with it, None if it continues one.
+        words: meaning of every value of a column that holds one of a few words.
     """
 
     name: str
+    text: str
     unit: str
     fmt: str
     rtol: float
     atol: float
     table: bool
+    section: Section | None
+    words: Mapping[str, str]
 
 
 def column(
     value: Value[T],
+    text: str,
     unit: str = "",
     fmt: str = "",
     rtol: float = 0.0,
     atol: float = 0.0,
     table: bool = False,
+    section: Section | None = None,
+    words: Mapping[str, str] | None = None,
 ) -> T:
     """Declare a row field: its value and its metadata. Every field's default is None.
 
     Args:
         value: takes the value from an outcome and its score.
+        text: its meaning.
         unit: as printed in table headings, "" if none.
         fmt: format specification for tables.
         rtol: relative golden tolerance; 0 with ``atol`` 0 means exact.
         atol: absolute golden tolerance.
         table: shown in the per-scan table.
+        section: the section that begins with it.
+        words: meaning of every value of a column that holds one of a few words.
     """
-    meta = {"unit": unit, "fmt": fmt, "rtol": rtol, "atol": atol, "table": table, "value": value}
-    return cast(T, dataclasses.field(default=None, metadata=meta))
+    made = Column("", text, unit, fmt, rtol, atol, table, section, words or {})
+    return cast(T, dataclasses.field(default=None, metadata={"column": made, "value": value}))
 
 
-def _metres(value: Value[T]) -> T:
-    return column(value, "m", ".4f", 1e-5, 1e-6)
+def _metres(value: Value[T], text: str) -> T:
+    return column(value, text, "m", ".4f", 1e-5, 1e-6)
 
 
-def _error_m(value: Value[T], unit: str = "m", table: bool = False) -> T:
-    return column(value, unit, ".4f", 1e-3, 1e-5, table)
+def _error_m(value: Value[T], text: str, unit: str = "m", **more: Any) -> T:
+    return column(value, text, unit, ".4f", 1e-3, 1e-5, **more)
 
 
-def _error_deg(value: Value[T], table: bool = False) -> T:
-    return column(value, "deg", ".3f", 1e-3, 1e-3, table)
+def _error_deg(value: Value[T], text: str, **more: Any) -> T:
+    return column(value, text, "deg", ".3f", 1e-3, 1e-3, **more)
 
 
-def _seconds(value: Value[T], table: bool = False) -> T:
-    return column(value, "s", ".2f", 1e-4, 1e-3, table)
+def _seconds(value: Value[T], text: str, **more: Any) -> T:
+    return column(value, text, "s", ".2f", 1e-4, 1e-3, **more)
 
 
 def _number(
-    value: Value[T], unit: str = "", fmt: str = ".4g", table: bool = False, atol: float = 1e-6
+    value: Value[T], text: str, unit: str = "", fmt: str = ".4g", atol: float = 1e-6, **more: Any
 ) -> T:
-    return column(value, unit, fmt, 1e-4, atol, table)
+    return column(value, text, unit, fmt, 1e-4, atol, **more)
 
 
-def _exact(value: Value[T], table: bool = False) -> T:
-    return column(value, table=table)
+def _radps(value: Value[T], text: str) -> T:
+    return _number(value, text, "rad/s")
+
+
+def _mps(value: Value[T], text: str) -> T:
+    return _number(value, text, "m/s")
+
+
+def _exact(value: Value[T], text: str, **more: Any) -> T:
+    return column(value, text, **more)
+
+
+_XYZ = ("x", "y", "z")
+_XYZW = ("x", "y", "z", "w")
+_ENTRIES = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))  # the six entries of a symmetric matrix
+
+
+def _block(
+    values: Value[Array | None],
+    make: Callable[[Value[float | None], str], float | None],
+    text: str,
+    first: str = "",
+    names: Sequence[str] = _XYZ,
+) -> list[float | None]:
+    """Declare the columns of one vector.
+
+    Args:
+        values: takes the vector from an outcome and its score; None where it does not apply.
+        make: declares one column.
+        text: meaning, after the name of the component.
+        first: the same for the first component, where it says more.
+        names: names of the components.
+    """
+
+    def one(place: int) -> Value[float | None]:
+        def value(outcome: Outcome, score: Score) -> float | None:
+            found = values(outcome, score)
+            return None if found is None else float(found[place])
+
+        return value
+
+    return [
+        make(one(k), f"{name} {first if first and k == 0 else text}.")
+        for k, name in enumerate(names)
+    ]
 
 
 def finite(value: float | None) -> float | None:
@@ -106,30 +174,40 @@ def _if_planned(get: Callable[[Outcome, Plan], T]) -> Value[T | None]:
     return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
 
 
-def _if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
-    return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
-
-
 def _if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
     return lambda o, s: get(o) if len(o.scan.points) else None
 
 
-def _change(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | None], ...]:
-    """Instant [s] and sizes of the linear and the angular part of a change, each followed by its
-    standard deviation.
+def _change(
+    get: Callable[[Outcome], Manoeuvre | None],
+    per: str,
+    texts: Sequence[str],
+    atol: float = 1e-6,
+) -> list[float | None]:
+    """Declare the six columns of a change of the motion: its instant, its linear and its angular
+    part, each followed by its standard deviation.
+
+    Args:
+        get: takes the change; None where there is none.
+        per: unit of time below m and rad, "s" of a change of the velocity.
+        texts: meaning of each column.
+        atol: absolute golden tolerance of the sizes.
     """
 
     def of(value: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
         return lambda o, s: None if (change := get(o)) is None else float(value(o, change))
 
-    return (
-        of(lambda o, m: _since_start_s(o, m.t_ns)),
-        of(lambda o, m: m.t_1s_s),
-        of(lambda o, m: float(np.linalg.norm(m.velocity))),
-        of(lambda o, m: math.sqrt(np.trace(m.P[3:, 3:]))),
-        of(lambda o, m: float(np.linalg.norm(m.rate))),
-        of(lambda o, m: math.sqrt(np.trace(m.P[:3, :3]))),
-    )
+    def size(part: Callable[[Manoeuvre], float], text: str, unit: str) -> float | None:
+        return _number(of(lambda o, m: part(m)), text, f"{unit}/{per}", atol=atol)
+
+    return [
+        _seconds(of(lambda o, m: _since_start_s(o, m.t_ns)), texts[0]),
+        _seconds(of(lambda o, m: m.t_1s_s), texts[1]),
+        size(lambda m: float(np.linalg.norm(m.velocity)), texts[2], "m"),
+        size(lambda m: math.sqrt(np.trace(m.P[3:, 3:])), texts[3], "m"),
+        size(lambda m: float(np.linalg.norm(m.rate)), texts[4], "rad"),
+        size(lambda m: math.sqrt(np.trace(m.P[:3, :3])), texts[5], "rad"),
+    ]
 
 
 def _of_error(
@@ -161,15 +239,184 @@ def _status(outcome: Outcome) -> str:
     return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value
 
 
-_PUSH, _DRIFT = (
-    _change(lambda o: o.manoeuvres[-1] if o.manoeuvres else None),
-    _change(lambda o: o.drift),
+def _nees(block: str, text: str) -> float | None:
+    value: Value[float | None] = lambda o, s: finite(s.nees_blocks.get(block))  # noqa: E731
+    return column(value, text, "", ".2f", 1e-2, 1e-3)
+
+
+_MEASURED = _block(
+    lambda o, s: o.alignment.T_ac.t if o.alignment.measured else None,
+    _metres,
+    "coordinate of the measured position of {C} in {A}",
+)
+_MEASURED_ATTITUDE = _block(
+    lambda o, s: o.alignment.T_ac.q if o.alignment.measured else None,
+    _number,
+    "component of the measured attitude",
+    first="component of the measured attitude, the quaternion q_ac with w >= 0",
+    names=_XYZW,
+)
+_ESTIMATED = _block(
+    lambda o, s: o.pose.t,
+    _metres,
+    "coordinate of the estimated position of {C} in {A}",
+    first="coordinate of the estimated position of {C} in {A}, after the update",
+)
+_ESTIMATED_ATTITUDE = _block(
+    lambda o, s: o.pose.q,
+    _number,
+    "component of the estimated attitude",
+    first="component of the estimated attitude, the quaternion q_ac with w >= 0",
+    names=_XYZW,
+)
+_RATE = _block(lambda o, s: o.belief.x.w_b, _radps, "component of the angular rate in {B}")
+_CENTRE = _block(lambda o, s: o.belief.x.r_a, _metres, "coordinate of the mass centre in {A}")
+_VELOCITY = _block(
+    lambda o, s: o.belief.x.v_a, _mps, "component of the velocity of the mass centre in {A}"
+)
+_VARRHO = _block(
+    lambda o, s: o.belief.x.c_b,
+    _metres,
+    "coordinate of varrho",
+    first="coordinate of varrho, the position of the fixture in {B}",
+)
+_MU = _block(
+    lambda o, s: o.belief.x.q_bc,
+    _number,
+    "component of mu",
+    first="component of mu, the attitude of the fixture in {B}, as the quaternion q_bc",
+    names=_XYZW,
+)
+_CENTRE_C = _block(lambda o, s: o.body.centre_c, _metres, "coordinate of the mass centre in {C}")
+_RATE_C = _block(lambda o, s: o.body.rate_c, _radps, "component of the angular rate in {C}")
+_INERTIA = _block(
+    lambda o, s: o.body.inertia[_ENTRIES],
+    _number,
+    "entry of this tensor",
+    first=(
+        "entry of the inertia tensor about the mass centre, in {C}, divided by its trace. The "
+        "tensor does not depend on the order of the principal axes"
+    ),
+    names=("xx", "yy", "zz", "xy", "xz", "yz"),
+)
+_MOMENTS = _block(
+    lambda o, s: o.body.moments,
+    _number,
+    "principal moment of inertia, divided by the sum of the three moments",
+    names=("Smallest", "Middle", "Largest"),
+)
+_PUSH = _change(
+    lambda o: o.manoeuvres[-1] if o.manoeuvres else None,
+    "s",
+    (
+        "Time of the last manoeuvre since the first scan.",
+        "Standard deviation of the time of the last manoeuvre.",
+        "Change of the velocity of the mass centre by the last manoeuvre.",
+        "Standard deviation of this change of velocity.",
+        "Change of the angular rate by the last manoeuvre.",
+        "Standard deviation of this change of the angular rate.",
+    ),
+)
+_DRIFT = _change(
+    lambda o: o.drift,
+    "s2",
+    (
+        "Time since the first scan at which a constant torque or force on the target began.",
+        "Standard deviation of this time.",
+        "Acceleration of the mass centre by the constant force.",
+        "Standard deviation of this acceleration.",
+        "Angular acceleration by the constant torque.",
+        "Standard deviation of this angular acceleration.",
+    ),
+    atol=1e-9,
 )
 
-
-def _nees(block: str) -> float | None:
-    value: Value[float | None] = lambda o, s: finite(s.nees_blocks.get(block))  # noqa: E731
-    return column(value, "", ".2f", 1e-2, 1e-3)
+_STATUS_WORDS = {
+    "aligned": "The scan was registered.",
+    "measured": "The pose comes from the log itself; nothing was registered.",
+    "not_converged": (
+        "The iteration limit was reached. The quality of the pose is still measured."
+    ),
+    "degenerate": (
+        "The view does not determine all six directions of the pose. The scan is "
+        "used for the others."
+    ),
+    "no_overlap": "Too few points are close to the model.",
+    "no_points": "The registration had no points to use.",
+    "ambiguous": "A search found a second, different pose that fits as well.",
+    "failed": (
+        "The back end raised an error, returned its guess unchanged, or gave a pose "
+        "that is not finite."
+    ),
+    "implausible": "The scan contradicts the pose.",
+    "budget_exhausted": (
+        "The pose is implausible or none was found, and the work allowed for the scan was spent."
+    ),
+    "empty": "The message has no finite point.",
+    "damaged": "The message cannot be decoded.",
+    "clock": "The time stamp is implausible; the clock of the log was used instead.",
+}
+_REASON_WORDS = {
+    "ok": "The scan is used.",
+    "no_scan": "The scan is empty or damaged.",
+    "not_aligned": "The registration found no overlap, failed, or is ambiguous.",
+    "not_converged": "The registration did not converge.",
+    "few_inliers": "Too few points, or too small a share of them, are close to the model.",
+    "fit_error": "The distance of the inliers from the model is too large.",
+    "halves_differ": (
+        "The poses from two halves of the scan differ by more than their errors explain."
+    ),
+    "pose_jump": "The pose is too far from the prediction.",
+    "doubtful": (
+        "The innovation is large, and it is not decided yet whether the scan, the "
+        "sensor or the target is the cause."
+    ),
+    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
+    "clock": "The time stamp steps back or jumps.",
+}
+_GUESS_WORDS = {
+    "start": "The initial state that the log states.",
+    "truth": "The true pose of the log (--init truth).",
+    "given": "A pose given by an option.",
+    "acquired": "A search without a guess.",
+    "predicted": "The prediction of the filter.",
+    "last": "The pose of the last healthy scan.",
+    "measured": "None was needed, because the log holds poses.",
+}
+_ESTIMATOR_WORDS = {
+    "near": "The given initial state, before the first healthy scan.",
+    "start": "The first poses of a cold start.",
+    "fit": "A maximum-likelihood fit to all poses.",
+    "filter": "The Kalman filter.",
+}
+_REFERENCE_WORDS = {
+    "truth": "True poses of the log or of a file.",
+    "fit": "One motion that was fitted to all healthy poses (--reference fit).",
+}
+_PLAN_DELAY_WORDS = {
+    "attitude": "The turn of the gripper.",
+    "arm": "The joints of the arm.",
+}
+_PLAN_STATUS_WORDS = {
+    "optimal": "The earliest time, certified to the stated gap.",
+    "feasible": "The plan satisfies all constraints; it may not be the earliest.",
+    "none_found": "The search found no plan; there may be one.",
+    "infeasible_within_horizon": "It is certified that no plan exists within the horizon.",
+    "no_convergence": "The solver did not converge.",
+}
+_ACTION_WORDS = {
+    "stand_still": "Remain at rest.",
+    "approach": "Fly the plan with healthy measurements.",
+    "approach_on_prediction": (
+        "Fly the plan without measurements, because the prediction suffices."
+    ),
+    "hold": (
+        "Interrupt the approach, brake relative to the mass centre and keep the stand-off distance."
+    ),
+    "retreat": "Increase the distance to the target.",
+    "capture": "Fly the last plan to its end and close the gripper.",
+    "abort": "Retreat and end the approach.",
+}
 
 
 @value_class(eq=True)
@@ -178,197 +425,588 @@ class Row:
     fault).
     """
 
-    seq: int = _exact(lambda o, s: o.scan.seq, table=True)
-    t_ns: int = _exact(lambda o, s: o.scan.t_ns)
-    t_s: float = column(
-        lambda o, s: _since_start_s(o, o.scan.t_ns), "s", ".2f", 0.0, 1e-09, table=True
+    seq: int = _exact(
+        lambda o, s: o.scan.seq,
+        "Index of the scan in the replay, from 0.",
+        table=True,
+        section=Section("Scan and result"),
     )
-    status: str = _exact(lambda o, s: _status(o), table=True)
-    gamma: int = _exact(lambda o, s: o.verdict.gamma, table=True)
-    reason: str = _exact(lambda o, s: o.verdict.reason.value, table=True)
-    guess: str = _exact(lambda o, s: o.guess)
-    fault: str | None = _exact(lambda o, s: s.fault, table=True)
-    message: str | None = _exact(lambda o, s: o.alignment.message or o.scan.note or None)
-    points: int | None = _exact(lambda o, s: None if o.scan.pose else len(o.scan.points))
-    iterations: int | None = _exact(_if_points(lambda o: o.alignment.iterations), table=True)
-    inliers: int | None = column(_if_points(lambda o: o.alignment.inliers), "", "d", 0.001, 3)
+    t_ns: int = _exact(lambda o, s: o.scan.t_ns, "Time of the scan on the selected clock [ns].")
+    t_s: float = column(
+        lambda o, s: _since_start_s(o, o.scan.t_ns),
+        "Time of the scan since the first scan.",
+        "s",
+        ".2f",
+        0.0,
+        1e-09,
+        table=True,
+    )
+    status: str = _exact(
+        lambda o, s: _status(o),
+        "Status of the registration, or of the scan if nothing could be registered.",
+        table=True,
+        words=_STATUS_WORDS,
+    )
+    gamma: int = _exact(
+        lambda o, s: o.verdict.gamma,
+        (
+            "1 if the scan is healthy and updates the filter; 0 if it is faulty and the filter "
+            "only predicts."
+        ),
+        table=True,
+    )
+    reason: str = _exact(
+        lambda o, s: o.verdict.reason.value,
+        "Why gamma is 0; ok where gamma is 1.",
+        table=True,
+        words=_REASON_WORDS,
+    )
+    guess: str = _exact(
+        lambda o, s: o.guess,
+        (
+            "Where the initial guess of the registration came from. Until the first healthy scan "
+            "this is the source of the first pose."
+        ),
+        words=_GUESS_WORDS,
+    )
+    fault: str | None = _exact(
+        lambda o, s: s.fault, "Kind of the fault that was injected into this scan.", table=True
+    )
+    message: str | None = _exact(
+        lambda o, s: o.alignment.message or o.scan.note or None,
+        "Error of the back end, or what is wrong with the recorded message or its time stamp.",
+    )
+    points: int | None = _exact(
+        lambda o, s: None if o.scan.pose else len(o.scan.points),
+        "Number of points of the scan with finite coordinates.",
+        section=Section("Registration"),
+    )
+    iterations: int | None = _exact(
+        _if_points(lambda o: o.alignment.iterations),
+        "Number of iterations of the registration.",
+        table=True,
+    )
+    inliers: int | None = column(
+        _if_points(lambda o: o.alignment.inliers),
+        (
+            "Number of points that are closer to the model than the rejection distance of the "
+            "last iteration."
+        ),
+        "",
+        "d",
+        0.001,
+        3,
+    )
     inlier_ratio: float | None = column(
-        _if_points(lambda o: o.alignment.inlier_ratio), "", ".3f", 0.001, 0.001, table=True
+        _if_points(lambda o: o.alignment.inlier_ratio),
+        "Number of inliers divided by the number of points.",
+        "",
+        ".3f",
+        0.001,
+        0.001,
+        table=True,
     )
     rms_m: float | None = column(
-        _if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True
+        _if_points(lambda o: finite(o.alignment.rms_m)),
+        "Root mean square of the distances of the inliers from the model.",
+        "m",
+        ".5f",
+        0.0001,
+        1e-07,
+        table=True,
     )
-    free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None)
+    free_directions: str | None = _exact(
+        lambda o, s: o.alignment.free_directions or None,
+        "Directions of the pose that this view does not determine, in words.",
+    )
     split_nis: float | None = _number(
-        _if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f"
+        _if_points(lambda o: finite(o.alignment.split_nis)),
+        (
+            "Squared difference between the poses from two halves of the scan, normalised by its "
+            "covariance; the larger value of the divisions left/right and top/bottom."
+        ),
+        fmt=".1f",
     )
-    reg_dof: float | None = _number(_if_points(lambda o: finite(o.alignment.dof)), fmt=".0f")
-    reg_x_m: float | None = _metres(_if_measured(lambda T: T.t[0]))
-    reg_y_m: float | None = _metres(_if_measured(lambda T: T.t[1]))
-    reg_z_m: float | None = _metres(_if_measured(lambda T: T.t[2]))
-    reg_qx: float | None = _number(_if_measured(lambda T: T.q[0]))
-    reg_qy: float | None = _number(_if_measured(lambda T: T.q[1]))
-    reg_qz: float | None = _number(_if_measured(lambda T: T.q[2]))
-    reg_qw: float | None = _number(_if_measured(lambda T: T.q[3]))
+    reg_dof: float | None = _number(
+        _if_points(lambda o: finite(o.alignment.dof)),
+        (
+            "Degrees of freedom of the registration's covariance as an estimate from the "
+            "residuals; null if there is no covariance or if it is known."
+        ),
+        fmt=".0f",
+    )
+    reg_x_m: float | None = _MEASURED[0]
+    reg_y_m: float | None = _MEASURED[1]
+    reg_z_m: float | None = _MEASURED[2]
+    reg_qx: float | None = _MEASURED_ATTITUDE[0]
+    reg_qy: float | None = _MEASURED_ATTITUDE[1]
+    reg_qz: float | None = _MEASURED_ATTITUDE[2]
+    reg_qw: float | None = _MEASURED_ATTITUDE[3]
     nis: float | None = column(
-        _if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True
+        _if_innovation(lambda i: finite(i.chi2)),
+        (
+            "Normalised innovation squared. If the filter is consistent it has a chi-square "
+            "distribution with 6 degrees of freedom: its mean is 6, and 95 % of the values lie "
+            "between 1.2 and 14.4. Where the covariance of the registration is an estimate "
+            "(`reg_dof`), it is converted from Hotelling's T-squared."
+        ),
+        "",
+        ".2f",
+        0.001,
+        0.0001,
+        table=True,
+        section=Section(
+            "Innovation",
+            (
+                "The innovation is the difference between the measured pose and the pose "
+                "that the filter predicted."
+            ),
+        ),
     )
-    cauchy_weight: float | None = _number(_if_innovation(lambda i: i.weight), atol=0.0001)
-    innov_m: float | None = _metres(_if_innovation(lambda i: finite(i.distance_m)))
+    cauchy_weight: float | None = _number(
+        _if_innovation(lambda i: i.weight),
+        (
+            "Weight of the pose in the update (Cauchy); it is below 1 where the NIS is above "
+            "27.9, its 99.99 % point."
+        ),
+        atol=0.0001,
+    )
+    innov_m: float | None = _metres(
+        _if_innovation(lambda i: finite(i.distance_m)),
+        "Distance between the measured and the predicted position of the centre of the model.",
+    )
     innov_deg: float | None = column(
-        _if_innovation(lambda i: finite(math.degrees(i.angle_rad))), "deg", ".3f", 0.0001, 0.0001
+        _if_innovation(lambda i: finite(math.degrees(i.angle_rad))),
+        "Rotation angle between the measured and the predicted attitude.",
+        "deg",
+        ".3f",
+        0.0001,
+        0.0001,
     )
-    estimator: str = _exact(lambda o, s: o.estimator)
-    x_m: float | None = _metres(lambda o, s: float(o.pose.t[0]))
-    y_m: float | None = _metres(lambda o, s: float(o.pose.t[1]))
-    z_m: float | None = _metres(lambda o, s: float(o.pose.t[2]))
-    qx: float | None = _number(lambda o, s: float(o.pose.q[0]))
-    qy: float | None = _number(lambda o, s: float(o.pose.q[1]))
-    qz: float | None = _number(lambda o, s: float(o.pose.q[2]))
-    qw: float | None = _number(lambda o, s: float(o.pose.q[3]))
+    estimator: str = _exact(
+        lambda o, s: o.estimator,
+        "Estimator that gave the estimate.",
+        section=Section(
+            "Estimate",
+            (
+                "The standard deviation of a vector is the square root of the trace of "
+                "its covariance."
+            ),
+        ),
+        words=_ESTIMATOR_WORDS,
+    )
+    x_m: float | None = _ESTIMATED[0]
+    y_m: float | None = _ESTIMATED[1]
+    z_m: float | None = _ESTIMATED[2]
+    qx: float | None = _ESTIMATED_ATTITUDE[0]
+    qy: float | None = _ESTIMATED_ATTITUDE[1]
+    qz: float | None = _ESTIMATED_ATTITUDE[2]
+    qw: float | None = _ESTIMATED_ATTITUDE[3]
     pos_1s_m: float | None = _number(
-        lambda o, s: math.sqrt(max(_traces(o.pose_covariance)[0], 0.0)), "m"
+        lambda o, s: math.sqrt(max(_traces(o.pose_covariance)[0], 0.0)),
+        "Standard deviation of the estimated position.",
+        "m",
     )
     rot_1s_deg: float | None = _number(
-        lambda o, s: _full_angle_deg(_traces(o.pose_covariance)[1]), "deg"
+        lambda o, s: _full_angle_deg(_traces(o.pose_covariance)[1]),
+        "Standard deviation of the estimated attitude.",
+        "deg",
     )
-    wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "rad/s")
-    wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "rad/s")
-    wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "rad/s")
-    rx_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[0]))
-    ry_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[1]))
-    rz_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[2]))
-    vx_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[0]), "m/s")
-    vy_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[1]), "m/s")
-    vz_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[2]), "m/s")
-    sigma1: float | None = _number(lambda o, s: float(o.belief.x.sigma[0]), fmt=".4f", table=True)
-    sigma2: float | None = _number(lambda o, s: float(o.belief.x.sigma[1]), fmt=".4f", table=True)
-    sigma1_1s: float | None = _number(lambda o, s: o.body.limited_1s[0])
-    sigma2_1s: float | None = _number(lambda o, s: o.body.limited_1s[1])
-    cx_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[0]))
-    cy_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[1]))
-    cz_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[2]))
-    c_1s_m: float | None = _number(lambda o, s: o.body.limited_1s[2], "m")
-    mux: float | None = _number(lambda o, s: float(o.belief.x.q_bc[0]))
-    muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]))
-    muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]))
-    muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]))
+    wx_radps: float | None = _RATE[0]
+    wy_radps: float | None = _RATE[1]
+    wz_radps: float | None = _RATE[2]
+    rx_m: float | None = _CENTRE[0]
+    ry_m: float | None = _CENTRE[1]
+    rz_m: float | None = _CENTRE[2]
+    vx_mps: float | None = _VELOCITY[0]
+    vy_mps: float | None = _VELOCITY[1]
+    vz_mps: float | None = _VELOCITY[2]
+    sigma1: float | None = _number(
+        lambda o, s: float(o.belief.x.sigma[0]),
+        (
+            "First inertia ratio, (Iyy - Izz) / Ixx, with the principal moments of inertia in the"
+            " order of the axes of {B}."
+        ),
+        fmt=".4f",
+        table=True,
+    )
+    sigma2: float | None = _number(
+        lambda o, s: float(o.belief.x.sigma[1]),
+        "Second inertia ratio, (Izz - Ixx) / Iyy.",
+        fmt=".4f",
+        table=True,
+    )
+    sigma1_1s: float | None = _number(
+        lambda o, s: o.body.limited_1s[0],
+        "Standard deviation of sigma1; at most that of an unknown value in its range.",
+    )
+    sigma2_1s: float | None = _number(
+        lambda o, s: o.body.limited_1s[1],
+        "Standard deviation of sigma2; at most that of an unknown value in its range.",
+    )
+    cx_m: float | None = _VARRHO[0]
+    cy_m: float | None = _VARRHO[1]
+    cz_m: float | None = _VARRHO[2]
+    c_1s_m: float | None = _number(
+        lambda o, s: o.body.limited_1s[2],
+        (
+            "Standard deviation of varrho; at most that of a vector of this length with unknown "
+            "direction."
+        ),
+        "m",
+    )
+    mux: float | None = _MU[0]
+    muy: float | None = _MU[1]
+    muz: float | None = _MU[2]
+    muw: float | None = _MU[3]
     mu_1s_deg: float | None = _number(
-        lambda o, s: _full_angle_deg(o.body.limited_1s[3] ** 2), "deg"
+        lambda o, s: _full_angle_deg(o.body.limited_1s[3] ** 2),
+        "Standard deviation of mu; at most that of an unknown attitude.",
+        "deg",
     )
-    com_x_m: float | None = _metres(lambda o, s: float(o.body.centre_c[0]))
-    com_y_m: float | None = _metres(lambda o, s: float(o.body.centre_c[1]))
-    com_z_m: float | None = _metres(lambda o, s: float(o.body.centre_c[2]))
-    com_1s_m: float | None = _number(lambda o, s: o.body.centre_1s_m, "m")
-    rate_cx_radps: float | None = _number(lambda o, s: float(o.body.rate_c[0]), "rad/s")
-    rate_cy_radps: float | None = _number(lambda o, s: float(o.body.rate_c[1]), "rad/s")
-    rate_cz_radps: float | None = _number(lambda o, s: float(o.body.rate_c[2]), "rad/s")
-    rate_c_1s_radps: float | None = _number(lambda o, s: o.body.rate_1s_radps, "rad/s")
-    ixx: float | None = _number(lambda o, s: float(o.body.inertia[0, 0]))
-    iyy: float | None = _number(lambda o, s: float(o.body.inertia[1, 1]))
-    izz: float | None = _number(lambda o, s: float(o.body.inertia[2, 2]))
-    ixy: float | None = _number(lambda o, s: float(o.body.inertia[0, 1]))
-    ixz: float | None = _number(lambda o, s: float(o.body.inertia[0, 2]))
-    iyz: float | None = _number(lambda o, s: float(o.body.inertia[1, 2]))
-    inertia_1s: float | None = _number(lambda o, s: float(o.body.inertia_1s.max()))
-    moment_small: float | None = _number(lambda o, s: float(o.body.moments[0]))
-    moment_middle: float | None = _number(lambda o, s: float(o.body.moments[1]))
-    moment_large: float | None = _number(lambda o, s: float(o.body.moments[2]))
-    moments_1s: float | None = _number(lambda o, s: float(o.body.moments_1s.max()))
-    pos_err_m: float | None = _error_m(_of_error(lambda s: s.estimate, "distance_m"), table=True)
-    rot_err_deg: float | None = _error_deg(_of_error(lambda s: s.estimate, "angle_deg"), table=True)
-    reg_pos_err_m: float | None = _error_m(_of_error(lambda s: s.registration, "distance_m"))
-    reg_rot_err_deg: float | None = _error_deg(_of_error(lambda s: s.registration, "angle_deg"))
-    reference: str | None = _exact(lambda o, s: s.reference)
-    nees: float | None = column(lambda o, s: finite(s.nees), "", ".2f", 0.01, 0.001)
-    nees_attitude: float | None = _nees("attitude")
-    nees_rate: float | None = _nees("rate")
-    nees_position: float | None = _nees("position")
-    nees_velocity: float | None = _nees("velocity")
-    nees_sigma: float | None = _nees("sigma")
-    nees_varrho: float | None = _nees("varrho")
-    nees_mu: float | None = _nees("mu")
+    com_x_m: float | None = _CENTRE_C[0]
+    com_y_m: float | None = _CENTRE_C[1]
+    com_z_m: float | None = _CENTRE_C[2]
+    com_1s_m: float | None = _number(
+        lambda o, s: o.body.centre_1s_m, "Standard deviation of the mass centre in {C}.", "m"
+    )
+    rate_cx_radps: float | None = _RATE_C[0]
+    rate_cy_radps: float | None = _RATE_C[1]
+    rate_cz_radps: float | None = _RATE_C[2]
+    rate_c_1s_radps: float | None = _number(
+        lambda o, s: o.body.rate_1s_radps, "Standard deviation of the angular rate in {C}.", "rad/s"
+    )
+    ixx: float | None = _INERTIA[0]
+    iyy: float | None = _INERTIA[1]
+    izz: float | None = _INERTIA[2]
+    ixy: float | None = _INERTIA[3]
+    ixz: float | None = _INERTIA[4]
+    iyz: float | None = _INERTIA[5]
+    inertia_1s: float | None = _number(
+        lambda o, s: float(o.body.inertia_1s.max()),
+        "Largest standard deviation of the six entries of the inertia tensor.",
+    )
+    moment_small: float | None = _MOMENTS[0]
+    moment_middle: float | None = _MOMENTS[1]
+    moment_large: float | None = _MOMENTS[2]
+    moments_1s: float | None = _number(
+        lambda o, s: float(o.body.moments_1s.max()),
+        "Largest standard deviation of the three moments divided by their sum.",
+    )
+    pos_err_m: float | None = _error_m(
+        _of_error(lambda s: s.estimate, "distance_m"),
+        "Distance between the estimated and the true position of {C}.",
+        table=True,
+        section=Section(
+            "Errors",
+            (
+                "The normalised estimation error squared (NEES) has a chi-square "
+                "distribution with as many degrees of freedom as states, if the "
+                "covariance is correct. The true principal axes are taken in the order "
+                "that is nearest to the estimate."
+            ),
+        ),
+    )
+    rot_err_deg: float | None = _error_deg(
+        _of_error(lambda s: s.estimate, "angle_deg"),
+        "Rotation angle between the estimated and the true attitude of {C}.",
+        table=True,
+    )
+    reg_pos_err_m: float | None = _error_m(
+        _of_error(lambda s: s.registration, "distance_m"),
+        "Distance between the measured and the true position of {C}.",
+    )
+    reg_rot_err_deg: float | None = _error_deg(
+        _of_error(lambda s: s.registration, "angle_deg"),
+        "Rotation angle between the measured and the true attitude of {C}.",
+    )
+    reference: str | None = _exact(
+        lambda o, s: s.reference, "What the errors are computed against.", words=_REFERENCE_WORDS
+    )
+    nees: float | None = column(
+        lambda o, s: finite(s.nees),
+        "NEES of all 20 states; its mean is 20 if the covariance is correct.",
+        "",
+        ".2f",
+        0.01,
+        0.001,
+    )
+    nees_attitude: float | None = _nees(
+        "attitude", "NEES of the attitude of the principal axes (3 states)."
+    )
+    nees_rate: float | None = _nees("rate", "NEES of the angular rate (3 states).")
+    nees_position: float | None = _nees(
+        "position", "NEES of the position of the mass centre (3 states)."
+    )
+    nees_velocity: float | None = _nees(
+        "velocity", "NEES of the velocity of the mass centre (3 states)."
+    )
+    nees_sigma: float | None = _nees("sigma", "NEES of the inertia ratios (2 states).")
+    nees_varrho: float | None = _nees("varrho", "NEES of the position of the fixture (3 states).")
+    nees_mu: float | None = _nees("mu", "NEES of the attitude of the fixture (3 states).")
     r_pos_m: float | None = _number(
-        _if_innovation(lambda i: math.sqrt(max(_traces(i.R)[0] / 3.0, 0.0))), "m"
+        _if_innovation(lambda i: math.sqrt(max(_traces(i.R)[0] / 3.0, 0.0))),
+        (
+            "Standard deviation of the measured position of the centre of the model per axis in "
+            "R, the covariance of the measurement noise."
+        ),
+        "m",
+        section=Section(
+            "Adaptation and events",
+            "Counts and events are those from the first scan up to this one.",
+        ),
     )
     r_rot_deg: float | None = _number(
-        _if_innovation(lambda i: _full_angle_deg(_traces(i.R)[1] / 3.0)), "deg"
+        _if_innovation(lambda i: _full_angle_deg(_traces(i.R)[1] / 3.0)),
+        "Standard deviation of the measured attitude per axis in R.",
+        "deg",
     )
-    sigma_hits: int | None = _exact(lambda o, s: o.sigma_hits)
-    r_floors: int | None = _exact(lambda o, s: o.r_floors)
-    reinitialised: int | None = _exact(lambda o, s: o.reinitialised)
-    manoeuvres: int | None = _exact(lambda o, s: len(o.manoeuvres))
-    manoeuvre_s: float | None = _seconds(_PUSH[0])
-    manoeuvre_1s_s: float | None = _seconds(_PUSH[1])
-    manoeuvre_mps: float | None = _number(_PUSH[2], "m/s")
-    manoeuvre_1s_mps: float | None = _number(_PUSH[3], "m/s")
-    manoeuvre_radps: float | None = _number(_PUSH[4], "rad/s")
-    manoeuvre_1s_radps: float | None = _number(_PUSH[5], "rad/s")
-    drift_s: float | None = _seconds(_DRIFT[0])
-    drift_1s_s: float | None = _seconds(_DRIFT[1])
-    drift_mps2: float | None = _number(_DRIFT[2], "m/s2", atol=1e-09)
-    drift_1s_mps2: float | None = _number(_DRIFT[3], "m/s2", atol=1e-09)
-    drift_radps2: float | None = _number(_DRIFT[4], "rad/s2", atol=1e-09)
-    drift_1s_radps2: float | None = _number(_DRIFT[5], "rad/s2", atol=1e-09)
+    sigma_hits: int | None = _exact(
+        lambda o, s: o.sigma_hits,
+        "Number of updates in which a bound on sigma1 or sigma2 limited the Kalman gain.",
+    )
+    r_floors: int | None = _exact(
+        lambda o, s: o.r_floors, "Number of eigenvalues of R that were raised to the lower limit."
+    )
+    reinitialised: int | None = _exact(
+        lambda o, s: o.reinitialised,
+        (
+            "Number of times that the poses contradicted the filter or the given initial state "
+            "and a fit replaced the estimate."
+        ),
+    )
+    manoeuvres: int | None = _exact(
+        lambda o, s: len(o.manoeuvres),
+        (
+            "Number of manoeuvres: changes of the target's velocity or rate that free motion does"
+            " not explain."
+        ),
+    )
+    manoeuvre_s: float | None = _PUSH[0]
+    manoeuvre_1s_s: float | None = _PUSH[1]
+    manoeuvre_mps: float | None = _PUSH[2]
+    manoeuvre_1s_mps: float | None = _PUSH[3]
+    manoeuvre_radps: float | None = _PUSH[4]
+    manoeuvre_1s_radps: float | None = _PUSH[5]
+    drift_s: float | None = _DRIFT[0]
+    drift_1s_s: float | None = _DRIFT[1]
+    drift_mps2: float | None = _DRIFT[2]
+    drift_1s_mps2: float | None = _DRIFT[3]
+    drift_radps2: float | None = _DRIFT[4]
+    drift_1s_radps2: float | None = _DRIFT[5]
     ogm_log10_cond: float | None = column(
-        lambda o, s: o.monitors.ogm_log10_cond, "", ".1f", 0.001, 0.01, table=True
+        lambda o, s: o.monitors.ogm_log10_cond,
+        (
+            "Decimal logarithm of the condition number of the observability Gramian; null where "
+            "the rank is below 20."
+        ),
+        "",
+        ".1f",
+        0.001,
+        0.01,
+        table=True,
+        section=Section("Observability, consistency and convergence"),
     )
     ogm_log10_cond_scaled: float | None = column(
-        lambda o, s: o.monitors.ogm_log10_cond_scaled, "", ".1f", 0.001, 0.01
+        lambda o, s: o.monitors.ogm_log10_cond_scaled,
+        (
+            "Decimal logarithm of the condition number with each state scaled by its prior "
+            "standard deviation."
+        ),
+        "",
+        ".1f",
+        0.001,
+        0.01,
     )
-    ogm_rank: int | None = _exact(lambda o, s: o.monitors.ogm_rank, table=True)
-    nis_mean: float | None = _number(lambda o, s: o.monitors.nis_mean, fmt=".2f", atol=0.0001)
-    autocorrelation: float | None = _number(lambda o, s: o.monitors.autocorrelation, atol=0.0001)
-    consistent: bool | None = _exact(lambda o, s: o.monitors.consistent)
-    violations: int | None = _exact(lambda o, s: o.monitors.violations)
-    converged: bool = _exact(lambda o, s: o.monitors.converged, table=True)
-    covariance_converged: bool | None = _exact(lambda o, s: o.monitors.covariance_converged)
-    predictive_converged: bool | None = _exact(lambda o, s: o.monitors.predictive_converged)
-    unconverged_blocks: str | None = _exact(lambda o, s: ", ".join(o.monitors.unconverged) or None)
+    ogm_rank: int | None = _exact(
+        lambda o, s: o.monitors.ogm_rank,
+        (
+            "Numerical rank of the scaled observability Gramian: how many of the 20 directions of"
+            " the state the measurements determine."
+        ),
+        table=True,
+    )
+    nis_mean: float | None = _number(
+        lambda o, s: o.monitors.nis_mean,
+        "Mean of NIS over the consistency window; 6 is expected.",
+        fmt=".2f",
+        atol=0.0001,
+    )
+    autocorrelation: float | None = _number(
+        lambda o, s: o.monitors.autocorrelation,
+        (
+            "Correlation of each whitened innovation with the next one, over the consistency "
+            "window; 0 is expected."
+        ),
+        atol=0.0001,
+    )
+    consistent: bool | None = _exact(
+        lambda o, s: o.monitors.consistent,
+        (
+            "Whether the mean NIS and the sum of the innovations are below the upper limits of "
+            "their chi-square intervals, no scan is doubtful, and few poses of the window have a "
+            "reduced weight."
+        ),
+    )
+    violations: int | None = _exact(
+        lambda o, s: o.monitors.violations,
+        (
+            "Number of consistency checks that the estimate has failed so far. A failed check "
+            "withdraws converged."
+        ),
+    )
+    converged: bool = _exact(
+        lambda o, s: o.monitors.converged,
+        "Whether the planner may rely on the estimate.",
+        table=True,
+    )
+    covariance_converged: bool | None = _exact(
+        lambda o, s: o.monitors.covariance_converged,
+        (
+            "Whether the covariance of every block of states is below its limit (the criterion of"
+            " the paper)."
+        ),
+    )
+    predictive_converged: bool | None = _exact(
+        lambda o, s: o.monitors.predictive_converged,
+        "Whether the predicted standard deviations of the grasp point are below their limits.",
+    )
+    unconverged_blocks: str | None = _exact(
+        lambda o, s: ", ".join(o.monitors.unconverged) or None,
+        "Names of the blocks of states whose covariance is above its limit.",
+    )
     grasp_pos_1s_m: float | None = _number(
-        lambda o, s: float(o.monitors.forecast.pos_1s_m.max()), "m"
+        lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
+        (
+            "Largest standard deviation of the position of the grasp point, predicted over the "
+            "horizon."
+        ),
+        "m",
     )
     grasp_vel_1s_mps: float | None = _number(
-        lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()), "m/s"
+        lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()),
+        (
+            "Largest standard deviation of the velocity of the grasp point, predicted over the "
+            "horizon."
+        ),
+        "m/s",
     )
     grasp_rot_1s_deg: float | None = _number(
-        lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()), "deg"
+        lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()),
+        (
+            "Largest standard deviation of the attitude of the grasp point, predicted over the "
+            "horizon."
+        ),
+        "deg",
     )
-    plan_status: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.status.value)
+    plan_status: str | None = _exact(
+        lambda o, s: None if o.plan is None else o.plan.status.value,
+        "Result of the planner for the plan in force.",
+        section=Section(
+            "Plan and supervisor",
+            ("The conditions of the supervisor's rules are listed under [planning](planning.md)."),
+        ),
+        words=_PLAN_STATUS_WORDS,
+    )
     capture_time_s: float | None = _seconds(
-        _if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s), table=True
+        _if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s),
+        "Planned time of capture since the first scan.",
+        table=True,
     )
     t_go_s: float | None = _seconds(
-        _if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09)
+        _if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09),
+        "Time from this scan to the planned capture.",
     )
     earliest_capture_s: float | None = _seconds(
         lambda o, s: (
             None if o.plan is None else _since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s
-        )
+        ),
+        "Certified lower bound of the time of capture since the first scan.",
     )
     plan_margin_m: float | None = column(
-        lambda o, s: None if o.plan is None else finite(o.plan.margin_m), "m", ".4f", 0.0, 0.01
+        lambda o, s: None if o.plan is None else finite(o.plan.margin_m),
+        (
+            "Smallest margin of the geometric limits along the plan; negative where a limit is "
+            "violated."
+        ),
+        "m",
+        ".4f",
+        0.0,
+        0.01,
     )
-    plan_limit: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.binding or None)
+    plan_limit: str | None = _exact(
+        lambda o, s: None if o.plan is None else o.plan.binding or None,
+        (
+            "Name of the limit that has the smallest margin, for example cone, corridor, sphere "
+            "or body."
+        ),
+    )
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
+        (
+            "Smallest margin of the clearance if the robot aborts at any time of the plan before "
+            "the corridor."
+        ),
         "m",
         ".4f",
         0.0,
         0.01,
     )
     gripper_ready_s: float | None = _seconds(
-        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s))
+        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)),
+        (
+            "Time since the first scan from which the gripper has attitude and rate of the "
+            "fixture; null where its attitude is not planned."
+        ),
     )
-    plan_delay: str | None = _exact(_if_planned(lambda o, p: p.delayed_by or None))
-    plan_miss_m: float | None = _error_m(_of_error(lambda s: s.planned, "distance_m"))
-    plan_miss_mps: float | None = _error_m(_of_error(lambda s: s.planned, "speed_mps"), "m/s")
-    plan_miss_deg: float | None = _error_deg(_of_error(lambda s: s.planned, "angle_deg"))
-    action: str = _exact(lambda o, s: o.action, table=True)
-    supervisor_rule: str = _exact(lambda o, s: o.supervisor_rule)
-    capture_miss_m: float | None = _error_m(_of_error(lambda s: s.captured, "distance_m"))
-    capture_miss_mps: float | None = _error_m(_of_error(lambda s: s.captured, "speed_mps"), "m/s")
-    capture_miss_deg: float | None = _error_deg(_of_error(lambda s: s.captured, "angle_deg"))
+    plan_delay: str | None = _exact(
+        _if_planned(lambda o, p: p.delayed_by or None),
+        (
+            "What makes the planned capture later than the flight of the end-effector alone; null"
+            " where nothing does."
+        ),
+        words=_PLAN_DELAY_WORDS,
+    )
+    plan_miss_m: float | None = _error_m(
+        _of_error(lambda s: s.planned, "distance_m"),
+        (
+            "Distance between the gripper and the true grasp point at the end of the plan that "
+            "was made at this scan."
+        ),
+    )
+    plan_miss_mps: float | None = _error_m(
+        _of_error(lambda s: s.planned, "speed_mps"),
+        "Relative speed of the gripper and the true grasp point at the end of this plan.",
+        "m/s",
+    )
+    plan_miss_deg: float | None = _error_deg(
+        _of_error(lambda s: s.planned, "angle_deg"),
+        "Error of the attitude that was predicted for the end of this plan.",
+    )
+    action: str = _exact(
+        lambda o, s: o.action,
+        "Command of the supervisor to the robot.",
+        table=True,
+        words=_ACTION_WORDS,
+    )
+    supervisor_rule: str = _exact(
+        lambda o, s: o.supervisor_rule, "Name of the rule of the supervisor that gave the command."
+    )
+    capture_miss_m: float | None = _error_m(
+        _of_error(lambda s: s.captured, "distance_m"),
+        (
+            "Distance between the gripper and the true grasp point when the gripper closed; given"
+            " in the first row after that."
+        ),
+    )
+    capture_miss_mps: float | None = _error_m(
+        _of_error(lambda s: s.captured, "speed_mps"),
+        "Relative speed of the gripper and the true grasp point when the gripper closed.",
+        "m/s",
+    )
+    capture_miss_deg: float | None = _error_deg(
+        _of_error(lambda s: s.captured, "angle_deg"), "Attitude error when the gripper closed."
+    )
 
     @classmethod
     def of(cls, outcome: Outcome, score: Score) -> Row:
@@ -401,7 +1039,6 @@ _VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 
 def columns() -> tuple[Column, ...]:
     """Every column in order."""
-    names = [f.name for f in dataclasses.fields(Column) if f.name != "name"]
     return tuple(
-        Column(f.name, **{n: f.metadata[n] for n in names}) for f in dataclasses.fields(Row)
+        dataclasses.replace(f.metadata["column"], name=f.name) for f in dataclasses.fields(Row)
     )

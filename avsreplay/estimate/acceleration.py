@@ -27,12 +27,11 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import r0_covariance
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, Trajectory
+from avsreplay.records import UNLIKELY, Alignment, Trajectory
 from avsreplay.settings import given
 
 _FEWEST = 8  # poses of the first fit; the noise is estimated from its residuals
 _CONFIRM = 3  # successive poses that contradict the fit end it
-_GATE = 21.1  # 99.99 % point of chi-square with 3 degrees of freedom
 _FEW = 12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
 # 1 sigma of the prior of all but the arm, in lengths of the arm over the duration of the poses
 _UNKNOWN = 1e3
@@ -158,7 +157,7 @@ def _consistent(
         error = poses[k].t - H @ mean
         S = H @ P @ H.T + scale * C
         nis = float(error @ np.linalg.solve(S, error))
-        outside = outside + 1 if nis > _GATE * (1.0 + _FEW / freedom) else 0
+        outside = outside + 1 if nis > UNLIKELY[3] * (1.0 + _FEW / freedom) else 0
         if outside == _CONFIRM:
             return k + 1 - _CONFIRM
         if outside:

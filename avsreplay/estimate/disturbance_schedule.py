@@ -48,7 +48,7 @@ from avsreplay.estimate.params import Adaptation
 from avsreplay.estimate.track import Track
 from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
 from avsreplay.geometry import Array
-from avsreplay.records import Drift
+from avsreplay.records import UNLIKELY, Drift
 from avsreplay.settings import given
 
 FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = (
@@ -68,7 +68,6 @@ _LEAST_EXCESS = (
 )
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
-_NOT_BY_CHANCE = {3: 21.1, 6: 27.9}  # 99.99 % point of chi-square with so many degrees of freedom
 # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
 _LEAST_NIS = 1.6
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
@@ -306,9 +305,7 @@ def _significant(fitted: DrivenBelief) -> bool:
     """
     open_ = np.flatnonzero(fitted.u)
     u, P = fitted.u[open_], fitted.P_u[np.ix_(open_, open_)]
-    return (
-        bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > _NOT_BY_CHANCE[len(open_)]
-    )
+    return bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > UNLIKELY[len(open_)]
 
 
 def _all_poses(track: Track, since_ns: int = 0) -> Track:

@@ -12,9 +12,9 @@ import numpy as np
 
 from avsreplay.estimate import _motion
 from avsreplay.geometry import Array
-from avsreplay.records import BLOCKS, State
+from avsreplay.records import BLOCKS, STATES, State
 
-DIM = 20
+DIM = STATES
 # error states that a disturbance reaches: attitude to velocity; they depend on chart steps of these
 # alone
 REACHED = 12

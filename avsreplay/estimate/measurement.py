@@ -35,10 +35,10 @@ from avsreplay.estimate.error_state import (
     rotation,
 )
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, State
+from avsreplay.records import BLOCKS, UNLIKELY, Alignment, Belief, Innovation, State
 
 Triple = tuple[float, float, float]
-GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a pose above it is an outlier
+GATE = UNLIKELY[6]  # a pose above it is an outlier
 
 
 def measurement_jacobian(x: State) -> Array:

@@ -20,10 +20,9 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.monitor import _root
 from avsreplay.monitor.chi_square import mean_band
-from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
+from avsreplay.records import BLOCKS, UNLIKELY, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
-_BY_CHANCE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom
 _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
@@ -295,7 +294,7 @@ class Consistency:
         mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
         lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
         total, alike = track.white.sum(axis=0), min(common * track.share, 1.0)
-        centred = float(total @ total) <= _BY_CHANCE * n * (1.0 + (n - 1) * alike)
+        centred = float(total @ total) <= UNLIKELY[6] * n * (1.0 + (n - 1) * alike)
         return ConsistencyReport(centred and mean <= self.params.slack * band[1], mean, band, lag)
 
     def _band(self, n: int) -> tuple[float, float]:

@@ -3,7 +3,7 @@ schema of a row.
 
 Time stamps are written from integer nanoseconds, never through a float; values as the shortest text
 that reads back as the same float64. Run as a script, it prints docs/columns.md, or
-docs/rows.schema.json with ``--schema``, from the declaration of ``Row`` and from columns.toml.
+docs/rows.schema.json with ``--schema``, from the declaration of ``Row``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
@@ -122,14 +120,14 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
             "pyarrow is not installed", where="Parquet", hint="install avsreplay[report]"
         ) from None
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    types, meaning = field_types(), descriptions()
+    types = field_types()
     schema = pa.schema(
         [
             pa.field(
                 c.name,
                 kinds[types[c.name][0]],
                 types[c.name][1],
-                {"unit": c.unit, "doc": meaning[c.name]},
+                {"unit": c.unit, "doc": c.text},
             )
             for c in columns()
         ]
@@ -205,44 +203,25 @@ the expected value; *exact* columns are equal. [rows.schema.json](rows.schema.js
 schema of a row.
 
 `python -m avsreplay.report.export` makes this page (with `--schema` the schema) from
-`avsreplay/rows.py` and `avsreplay/columns.toml`; a test compares them.
+`avsreplay/rows.py`; a test compares them.
 """
-
-
-@cache
-def _sections() -> list[dict[str, Any]]:
-    text = (files("avsreplay") / "columns.toml").read_text(encoding="utf-8")
-    found: list[dict[str, Any]] = tomllib.loads(text)["sections"]
-    return found
-
-
-@cache
-def descriptions() -> dict[str, str]:
-    """Meaning of each column by its name."""
-    return {name: text for section in _sections() for name, text in section["columns"].items()}
-
-
-@cache
-def listed_values() -> dict[str, dict[str, str]]:
-    """Meaning of every value of the columns that hold one of a few words, by column and value."""
-    return {
-        name: words for section in _sections() for name, words in section.get("values", {}).items()
-    }
 
 
 def columns_page() -> str:
     """Return the Markdown page."""
-    types, declared = field_types(), {c.name: c for c in columns()}
     parts = [_HEAD]
-    for section in _sections():
-        parts.append(f"\n## {section['title']}\n\n")
-        parts += [f"{section['text']}\n\n"] if "text" in section else []
-        parts.append("| column | type | unit | golden | meaning |\n|---|---|---|---|---|\n")
-        parts += [_line(declared[name], *types[name]) for name in section["columns"]]
-        for name, words in section.get("values", {}).items():
-            parts.append(f"\n| value of `{name}` | meaning |\n|---|---|\n")
-            parts += [f"| `{word}` | {meaning} |\n" for word, meaning in words.items()]
-    return "".join(parts)
+    words: list[str] = []
+    for each in columns():
+        if each.section is not None:
+            parts += [*words, f"\n## {each.section.title}\n\n"]
+            parts += [f"{each.section.text}\n\n"] if each.section.text else []
+            parts.append("| column | type | unit | golden | meaning |\n|---|---|---|---|---|\n")
+            words = []
+        parts.append(_line(each, *field_types()[each.name]))
+        if each.words:
+            words.append(f"\n| value of `{each.name}` | meaning |\n|---|---|\n")
+            words += [f"| `{word}` | {meaning} |\n" for word, meaning in each.words.items()]
+    return "".join([*parts, *words])
 
 
 def _line(column: Column, kind: type, nullable: bool) -> str:
@@ -255,7 +234,7 @@ def _line(column: Column, kind: type, nullable: bool) -> str:
         if value
     )
     word = kind.__name__ + (" or null" if nullable else "")
-    meaning = descriptions()[column.name].replace("|", "\\|")
+    meaning = column.text.replace("|", "\\|")
     return f"| `{column.name}` | {word} | {column.unit} | {tolerance or 'exact'} | {meaning} |\n"
 
 
@@ -267,9 +246,7 @@ def row_schema() -> dict[str, Any]:
         kind, nullable = field_types()[column.name]
         properties[column.name] = {
             "type": [names[kind], "null"] if nullable else names[kind],
-            "description": (
-                descriptions()[column.name] + (f" [{column.unit}]" if column.unit else "")
-            ),
+            "description": column.text + (f" [{column.unit}]" if column.unit else ""),
         }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

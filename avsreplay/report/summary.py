@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.records import BLOCKS, Label, State
+from avsreplay.records import BLOCKS, STATES, UNLIKELY, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
 from avsreplay.report.parameters import Parameter, parameters
 from avsreplay.report.summary_parts import (
@@ -35,7 +35,7 @@ from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
-NIS_LIMIT = 27.8563
+NIS_LIMIT = UNLIKELY[6]
 BLOCK_BANDS = {
     2: (0.05064, 7.3778),
     3: (0.2158, 9.3484),
@@ -243,7 +243,7 @@ class SummaryFold:
             [gamma == 0 for gamma in taken["gamma"]],
         )
         steps = [b - a for a, b in pairwise(stamps) if b > a]
-        full = [rank == 20 for rank in taken["ogm_rank"]]
+        full = [rank == STATES for rank in taken["ogm_rank"]]
         last = self._last
         healthy = taken["gamma"].count(1)
         figures = _figures(taken)

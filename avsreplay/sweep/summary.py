@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from avsreplay import settings
+from avsreplay.records import STATES
 from avsreplay.sweep import statistics
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult, SuccessCriterion
 from avsreplay.sweep.expansion import Expansion, Point
@@ -38,7 +39,6 @@ SCORES = {
     "nis": "nis",
 }  # score: its column
 FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
-STATES = 20
 WORST = 5  # number of runs that are listed
 _ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
 _BAD = ("crashed", "failed", "lossy")  # worst status first
