@@ -41,7 +41,7 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     # of the README
     "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",
     "avsreplay run long.mcap": (
-        "test_binary_files.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption"
+        "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption"
     ),
     "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
     "avsreplay sweep docs/campaigns/blackouts.toml -o": (
