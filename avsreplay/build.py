@@ -24,6 +24,7 @@ from avsreplay.plan.guidance import Guidance
 from avsreplay.plan.limits import TargetGeometry, hull_vertices
 from avsreplay.plan.supervisor import Supervisor
 from avsreplay.records import LogHeader, Scan, Surface, Truth
+from avsreplay.region import Region
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
@@ -86,6 +87,7 @@ def stages(
         deskew=config.deskew,
         reacquire=config.reacquire,
         initialise=_initialise(config, header, truth_of),
+        region=Region(np.array(config.region_start()), low, high) if config.region else None,
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
+from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
 from avsreplay.monitor.fault_detection import FaultParams
 from avsreplay.plan.rendezvous import PlanParams
@@ -53,6 +54,12 @@ class RunConfig(Settings):
         "Initial pose: the initial state in the log, else a global search (log); the true pose"
         " (truth); a global search (auto); or the pose of {C} in {A} as x,y,z,qx,qy,qz,qw.",
     )
+    region: str = setting(
+        "",
+        "Point on the target at the first scan as x,y,z in {A} [m]. A region of the size of the"
+        " model then follows the target, and ground, walls and neighbours around it are removed;"
+        " empty: all points are used.",
+    )
     deskew: bool = setting(
         True,
         "Transform points that have their own times to the instant of the scan, along the predicted"
@@ -87,15 +94,27 @@ class RunConfig(Settings):
         """The assumed robot in one line."""
         return self.task.with_gripper(self.robot).described(self.plan, self.limits)
 
+    def region_start(self) -> tuple[float, ...]:
+        """Return the point where the region begins [m]. Raises SettingError if it is none."""
+        try:
+            at = tuple(float(word) for word in self.region.split(","))
+        except ValueError:
+            at = ()
+        if len(at) != 3 or not all(abs(v) < MAX_COORDINATE_M for v in at):
+            raise SettingError("region", f"region is '{self.region}', not three numbers x,y,z")
+        return at
+
     def check(self) -> None:
-        """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an
-        impossible robot.
+        """Raise ValueError for an invalid initial pose or region, an axis that is not a unit
+        vector, or an impossible robot.
         """
         if self.init not in ("log", "truth", "auto"):
             try:
                 parse_pose(self.init)
             except ValueError as error:
                 raise SettingError("init", str(error)) from None
+        if self.region:
+            self.region_start()
         if not is_unit(self.fixture_axis_c, 1e-6):
             raise SettingError(
                 "fixture_axis_c", f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length"

@@ -41,6 +41,7 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
+from avsreplay.region import Followed, Region
 from avsreplay.register.backend import measured_alignment
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
@@ -178,6 +179,7 @@ class Stages:
         grasp_c: (3,) grasp point in {C} [m].
         deskew: move points with times of their own to the scan's instant by the predicted motion.
         reacquire: register without a guess where the prediction is too uncertain to be one.
+        region: what follows the target and removes the points around it; None: all are used.
         initialise: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
     """
 
@@ -192,6 +194,7 @@ class Stages:
     deskew: bool
     reacquire: bool
     initialise: Callable[[Scan], tuple[Pose | None, str]]
+    region: Region | None = None
 
 
 @value_class
@@ -204,6 +207,7 @@ class PipelineState:
         last_pose: last healthy measured pose, None before one.
         failed: what the scans showed before that pose whose searches found none.
         origin: where the first pose came from.
+        followed: the target, where a region follows it.
         start_ns: instant of the first scan.
     """
 
@@ -214,6 +218,7 @@ class PipelineState:
     origin: str = ""
     start_ns: int = 0
     failed: tuple[Array, ...] = ()
+    followed: Followed | None = None
 
     @property
     def captured_ns(self) -> int | None:
@@ -232,6 +237,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     Returns:
         The state after the scan and the outcome of the scan.
     """
+    scan, followed = _in_region(stages, state, scan)
     state, track, acquired = _track(stages, state, scan)
     errors, predicted = track.errors, stages.estimator.predict(track, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted)
@@ -284,7 +290,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     pose = measurement.alignment.T_ac if gamma else state.last_pose
     failed = _failed(state, scan) if pose is None else ()
     return (
-        PipelineState(monitors, guidance, track, pose, state.origin, state.start_ns, failed),
+        PipelineState(
+            monitors, guidance, track, pose, state.origin, state.start_ns, failed, followed
+        ),
         outcome,
     )
 
@@ -309,6 +317,19 @@ def planned_segment(state: PipelineState) -> Segment | None:
     if guidance is None or track is None or guidance.plan is None or not guidance.segment.capture:
         return None
     return guidance.segment if guidance.plan.t_ns == track.belief.t_ns else None
+
+
+def _in_region(stages: Stages, state: PipelineState, scan: Scan) -> tuple[Scan, Followed | None]:
+    """The scan with the points in the region of the target, and where the target is followed to."""
+    if stages.region is None or scan.pose is not None or not len(scan.points):
+        return scan, state.followed
+    pose = None
+    if state.track is not None and state.last_pose is not None:
+        predicted = stages.estimator.predict(state.track, scan.t_ns)
+        if not _prediction_lost(stages, scan, predicted):
+            pose = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
+    kept, followed = stages.region.cut(scan.points, scan.t_ns, state.followed, pose)
+    return scan.keep(kept), followed
 
 
 def _track(

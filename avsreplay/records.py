@@ -8,7 +8,7 @@ radians; instants are ``t_ns`` [ns].
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from enum import Enum
 from itertools import accumulate
 from typing import Any
@@ -221,6 +221,14 @@ class Scan:
     places: NDArray[Any] | None = None
     sensor: Pose | None = None
 
+    def keep(self, kept: NDArray[np.bool_]) -> Scan:
+        """Return the scan with some of its points (n,)."""
+        each = (self.times_s, self.intensities, self.places)
+        times, seen, places = (None if column is None else column[kept] for column in each)
+        return replace(
+            self, points=self.points[kept], times_s=times, intensities=seen, places=places
+        )
+
 
 @value_class
 class Truth:
@@ -289,6 +297,7 @@ class Alignment:
         systematic: its part from errors of model and ranges.
         message: why it failed or is not accepted.
         free_directions: not determined, in words; free: columns d (6, k).
+        members: of an ambiguous one, the poses T_ac that explain the scan, the registered first.
         split_nis, size: see ``quality``; with the 1 sigma of the size.
         size_1s: error of the size, until it is fitted.
     """
@@ -311,6 +320,7 @@ class Alignment:
     size_1s: float | None = None
     systematic: Array | None = None
     size: tuple[float, float] | None = None
+    members: tuple[Pose, ...] = ()
 
     @property
     def measured(self) -> bool:

@@ -199,13 +199,16 @@ def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kep
     tmp_path: Path,
 ) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from avsreplay.files import output_text\n"
+        "import sys; from pathlib import Path; from avsreplay.files import output_text\n"
         "with output_text(Path(sys.argv[1])) as stream:\n"
-        "    stream.write('half'); stream.flush(); print('ready', flush=True); time.sleep(60)"
+        "    stream.write('half'); stream.flush(); print('ready', flush=True); sys.stdin.read()"
     )
     path = tmp_path / "a.txt"
     other = subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert other.stdout is not None
     assert other.stdout.readline() == "ready\n"

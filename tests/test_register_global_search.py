@@ -418,31 +418,6 @@ def test_a_panel_is_not_matched_to_its_other_side_where_the_camera_is_not_known(
     assert np.linalg.norm(step.t) < 1e-4 * surface.extent
 
 
-def test_a_search_ends_only_with_a_pose_that_little_contradicts(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A displaced pose of a plate with holes has 95 % of its points on the model and the score
-    0.34.
-    """
-    surface = boxes()
-    T_ac = example_pose()
-    points = T_ac.apply(view(surface, 12_000, T_ac.inverse().t))
-    registrar, numbers = Registrar(surface), list[int]()
-    searched = GlobalSearch.search
-
-    def counted(self: GlobalSearch, part: Array, number: int, *more: object) -> SearchResult:
-        numbers.append(number)
-        return searched(self, part, number, *more)
-
-    monkeypatch.setattr(GlobalSearch, "search", counted)
-    assert registrar.acquire(points).status is AlignStatus.ALIGNED
-    assert numbers == [0]
-    monkeypatch.setattr("avsreplay.register.plausibility.DOUBTFUL", -1.0)
-    found = registrar.acquire(points)
-    assert len(numbers) > 2
-    assert found.status is AlignStatus.BUDGET_EXHAUSTED
-
-
 @pytest.mark.parametrize(("size", "numbers"), [(0.8, [1, 0, 2]), (0.9, [0, 1, 2])])
 def test_a_scan_of_a_part_of_the_target_is_searched_with_shifted_starts_first(
     size: float, numbers: list[int]

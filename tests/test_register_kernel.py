@@ -586,6 +586,11 @@ def test_a_part_of_the_scan_leads_to_the_fixed_point_of_the_whole(
     on = model.icp(scan, found.T_ca, horn)
     assert on.step_rad < 1e-5
     assert on.step_m < 1e-6 * model.extent_m
+    assert on.inliers == found.inliers  # of the pose that is returned
+    assert on.rms_m == pytest.approx(found.rms_m, rel=1e-12)
+    again = model.icp(scan, found.T_ca, replace(rule, few=0, n_plane=0, gate_m=found.gate_m))
+    assert again.converged
+    np.testing.assert_allclose(again.T_ca, found.T_ca, rtol=0, atol=1e-14)  # it stays
     for other in (replace(rule, threads=3), replace(rule, keep=False)):
         assert everything(model, scan, other) == everything(model, scan, rule)
 

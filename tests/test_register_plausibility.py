@@ -6,18 +6,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.contract import example_pose, view
-from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.plausibility import robust_noise
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.shown import Effort, effort_for, shown
-from avsreplay.register.surface_index import SurfaceIndex, kernel_module
+from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.visibility import Visibility
 
 SEED = 7
@@ -52,112 +51,6 @@ def test_the_noise_is_found_among_outliers(share: float) -> None:
     assert robust_noise(7.0 * distance) == pytest.approx(7.0 * robust_noise(distance))
 
 
-def test_the_true_pose_is_plausible_and_others_are_not(surface: Surface) -> None:
-    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = (
-        PlausibilityTest(surface, index, visibility, 0.065),
-        example_pose(),
-        np.random.default_rng(SEED),
-    )
-    scan = hidden_view(surface, T_ac, 3000, rng)
-    assert test.check(scan, T_ac.inverse()).reason == ""
-    for _ in range(10):
-        axis = rng.standard_normal(3)
-        wrong = T_ac @ Pose(exp(0.7 * axis / np.linalg.norm(axis)), np.zeros(3))
-        assert test.check(scan, wrong.inverse()).reason != ""
-
-
-def test_the_surface_that_the_camera_sees_is_not_hidden(surface: Surface) -> None:
-    """Of the sampled points those whose line of sight no triangle crosses, but for points near an
-    outline.
-    """
-    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac = PlausibilityTest(surface, index, visibility, 0.065), example_pose()
-    found = test._expected(
-        hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED)), T_ac.inverse()
-    )
-    eye = T_ac.inverse().t
-    towards = test._points - eye
-    far = np.linalg.norm(towards, axis=1)
-    first = index.cast(eye, towards / far[:, None])[0]
-    cosine = -np.einsum("ij,ij->i", test._normals, towards) / far
-    free = (first > far - 0.05 * surface.extent) & (cosine > 0.25)
-    assert np.all(cosine[found] > 0.25)
-    assert np.mean(free[found]) > 0.97
-    assert (
-        np.mean(np.isin(np.flatnonzero(free), found)) > 0.6
-    )  # points near an outline share a cell with nearer ones
-
-
-def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surface) -> None:
-    """The camera looks through the model at a wall: the distances of the part on the model
-    alone do not show it.
-    """
-    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = (
-        PlausibilityTest(surface, index, visibility, 0.065),
-        example_pose(),
-        np.random.default_rng(SEED),
-    )
-    scan = hidden_view(surface, T_ac, 3000, rng)
-    part = scan[scan[:, 0] < np.quantile(scan[:, 0], 0.4)]
-    others = scan[scan[:, 0] >= np.quantile(scan[:, 0], 0.4)]
-    assert test.check(part, T_ac.inverse(), scan).contradicted < 0.1
-    behind = np.vstack([part, others * 1.6])
-    assert test.check(part, T_ac.inverse(), behind).contradicted > 0.5
-    assert "pass through it" in test.check(part, T_ac.inverse(), behind).reason
-
-
-def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(
-    surface: Surface,
-) -> None:
-    """Nearly all points stay on a long box that is shifted along its axis: its small end
-    alone shows the shift.
-    """
-    made = trimesh.creation.box((4.0, 1.0, 0.3))
-    box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "box", "")
-    index, visibility = SurfaceIndex.build(box, 0.6), Visibility(box)
-    test, rng = PlausibilityTest(box, index, visibility, 0.04), np.random.default_rng(SEED)
-    T_ac = Pose(exp(np.array([0.5, 0.6, 0.1])), np.array([0.0, 0.0, 12.0]))
-    scan = T_ac.apply(view(box, 3000, T_ac.inverse().t))  # convex, so that no part hides another
-    scan = scan + rng.normal(0.0, 0.005, scan.shape)
-    other = T_ac.apply(rng.uniform([-3.4, -0.4, -0.1], [-2.6, 0.4, 0.1], (len(scan) // 4, 3)))
-    both = np.vstack([scan, other])
-    assert test.check(both, T_ac.inverse()).reason == ""
-    for shift in (-0.3, -0.2, 0.2, 0.3):
-        wrong = (T_ac @ Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([shift, 0.0, 0.0]))).inverse()
-        found = test.check(both, wrong)
-        assert np.mean(test.measure(scan, wrong) < 0.04) > 0.8
-        assert found.contradicted > 0.4
-        assert "contradicts the pose" in found.reason
-
-
-def test_a_surface_that_continues_beyond_an_edge_is_another_object() -> None:
-    """A longer box fits three faces of the model, a box behind an edge of the model does not
-    continue them.
-    """
-    made = [
-        trimesh.creation.box(size) for size in ((2.0, 1.2, 0.8), (2.5, 1.2, 0.8), (0.8, 0.6, 0.7))
-    ]
-    made[1].apply_translation((0.25, 0.0, 0.0))
-    made[2].apply_transform(trimesh.transformations.euler_matrix(0.5, 0.4, 0.6)).apply_translation(
-        (1.3, 0.1, -0.2)
-    )
-    box, longer, other = (
-        Surface(np.array(m.vertices), np.array(m.faces, dtype=np.int32), "", "") for m in made
-    )
-    test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
-    T_ac, rng = (
-        Pose(exp(np.array([0.6, 0.5, 0.1])), np.array([0.0, 0.0, 8.0])),
-        np.random.default_rng(SEED),
-    )
-    for measured, continued in (([box], False), ([longer], True), ([box, other], False)):
-        points = np.vstack([T_ac.apply(view(each, 1000, T_ac.inverse().t)) for each in measured])
-        scan = points + rng.normal(0.0, 0.003, points.shape)
-        assert test.continued(scan, T_ac.inverse()) is continued
-        assert (test.check(scan, T_ac.inverse()).reason != "") is continued
-
-
 @pytest.mark.parametrize("count", [700, 5000])
 def test_points_well_off_the_model_are_counted_as_their_distances_say(
     registrar: Registrar, count: int
@@ -173,23 +66,6 @@ def test_points_well_off_the_model_are_counted_as_their_distances_say(
     off = (distance > 2.0 * registrar.limits.gate_m) & (distance < registrar.index.reach_m)
     assert found.inlier_ratio > 0.9
     assert found.well_off == np.count_nonzero(off) > 10
-
-
-def test_points_on_faces_that_face_away_from_the_camera_are_not_of_this_model() -> None:
-    """The near side of a plate is matched to the far side of a box, and its surroundings to
-    nothing.
-    """
-    made = trimesh.creation.box((2.0, 1.2, 0.8))
-    box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "", "")
-    test = PlausibilityTest(box, SurfaceIndex.build(box, 0.4), Visibility(box), 0.025)
-    T_ac = Pose(exp(np.array([0.1, 0.2, 0.0])), np.array([0.0, 0.0, 8.0]))
-    rng = np.random.default_rng(SEED)
-    far = np.insert(rng.uniform([-0.9, -0.5], [0.9, 0.5], (800, 2)), 2, 0.4, axis=1)
-    beside = np.insert(rng.uniform([1.5, -0.5], [1.8, 0.5], (200, 2)), 2, 0.0, axis=1)
-    assert "face away" in test.check(T_ac.apply(np.vstack([far, beside])), T_ac.inverse()).reason
-    assert (
-        test.check(T_ac.apply(far), T_ac.inverse()).reason == ""
-    )  # perhaps the camera is not at the origin
 
 
 @pytest.mark.parametrize("guess_deg", [0.1, 3.0])
@@ -312,7 +188,7 @@ def test_searches_of_a_tumbling_body_with_a_wrong_model_end() -> None:
     rng = np.random.default_rng(SEED)
     scans = [
         rng.normal(size=(int(800 * s), 3)) * [1.0, s, 0.2 * s] + [0.0, 0.0, 9.0]
-        for s in 0.75 + 0.25 * np.sin(0.1 * np.arange(1000))
+        for s in 0.75 + 0.25 * np.sin(0.4 * np.arange(250))
     ]
     assert len(_searched(scans)) < 20
 
@@ -391,18 +267,6 @@ def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
     found, reversed_ = mesh.outward(both.vertices, inwards)
     assert reversed_ == 4
     np.testing.assert_array_equal(found[4:, ::-1], inwards[4:])
-
-
-def test_a_complete_visible_side_is_told_from_one_with_gaps(surface: Surface) -> None:
-    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
-    test, T_ac, rng = (
-        PlausibilityTest(surface, index, visibility, 0.065),
-        example_pose(),
-        np.random.default_rng(SEED),
-    )
-    scan = hidden_view(surface, T_ac, 3000, rng)
-    assert test.check(scan, T_ac.inverse()).covered
-    assert not test.check(scan[scan[:, 0] < np.median(scan[:, 0])], T_ac.inverse()).covered
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -14,7 +14,7 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import neighbourhood, quality
+from avsreplay.register import quality
 from avsreplay.register.budget import Budget
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
@@ -152,56 +152,6 @@ def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise
     assert (found.T_ca.matrix.tobytes() == whole.T_ca.matrix.tobytes()) is not rough
     assert rough is (found.work < 0.5 * whole.work)
     assert registrar.register(scan, guess.inverse()).status is AlignStatus.ALIGNED
-
-
-def test_the_size_is_fitted_for_the_pose_that_is_returned(monkeypatch):
-    """Half of the points are far away: two alignments are graded, and the size is fitted to
-    the second only.
-    """
-    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(5)
-    registrar, graded, sized = Registrar(surface), [], []
-    scan = seen(surface, T_ac, 0.002, rng)
-    scan = np.vstack([scan, scan + np.array([0.0, 0.0, 0.8 * surface.extent])])
-    grade, fitted = registrar._grader.graded, neighbourhood.size_error
-    monkeypatch.setattr(
-        registrar._grader,
-        "graded",
-        lambda *args, **named: graded.append(1) or grade(*args, **named),
-    )
-    monkeypatch.setattr(neighbourhood, "size_error", lambda *args: sized.append(1) or fitted(*args))
-    found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
-    assert found.status is AlignStatus.ALIGNED
-    assert (len(graded) > 1, len(sized)) == (True, 1)
-    assert found.size_1s is None
-
-
-def test_a_misfit_that_neighbours_share_is_told_from_noise():
-    surface, T_ac = boxes(), example_pose()
-    restarter, rng = Registrar(surface)._restarter, np.random.default_rng(4)
-    noise = 0.008 * surface.extent
-    shift = Pose([0.0, 0.0, 0.0, 1.0], np.array([0.0, 0.0, noise]))
-    noisy, exact = (seen(surface, T_ac, share, rng) for share in (0.008, 0.0))
-    assert restarter.structure(noisy, T_ac.inverse()) < 0.3 * noise
-    assert restarter.structure(exact, T_ac.inverse() @ shift) > 0.4 * noise
-
-
-def test_noise_as_large_as_a_patch_is_not_a_common_misfit_of_neighbours():
-    """Patches of the measured points would divide each face by the sign of the noise."""
-    surface, T_ac = boxes(), example_pose()
-    restarter, share = Registrar(surface)._restarter, 0.015
-    for seed in range(4):
-        noisy = seen(surface, T_ac, share, np.random.default_rng(seed))
-        assert (
-            restarter.structure(noisy, T_ac.inverse(), side=share) < 0.18 * share * surface.extent
-        )
-
-
-def test_points_of_a_wrong_pose_share_their_distances_and_those_of_the_true_pose_do_not() -> None:
-    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
-    scan, restarter = seen(surface, T_ac, 0.002, rng), Registrar(surface)._restarter
-    beside = T_ac @ Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.full(3, 0.004 * surface.extent))
-    assert not restarter.misfit(scan, T_ac.inverse(), Budget(30_000))
-    assert restarter.misfit(scan, beside.inverse(), Budget(30_000))
 
 
 def behind_a_plate(points: Array, visible: float, extent: float, rng: np.random.Generator) -> Array:
@@ -548,22 +498,3 @@ def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
     found = Registrar(target).register(scan, off(truth, 10.0, 0.15, 103).inverse())
     assert found.status is AlignStatus.ALIGNED
     assert error(found.T_ac.inverse().matrix, truth)[0] < 0.2
-
-
-def test_a_fit_whose_points_share_their_distances_is_not_close() -> None:
-    """A pose shifted by a third of the gate, with points off the model; noise of single
-    points is a close fit.
-    """
-    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
-    registrar = Registrar(surface)
-    gate, T_ca = registrar.limits.gate_m, T_ac.inverse()
-    scan = T_ac.apply(view(surface, 3000, T_ca.t))
-    first = registrar._grader.graded(scan, T_ac, Budget(10**7), None, False, False)
-    off = replace(first, inliers=int(0.95 * first.points), rms_m=0.28 * gate, well_off=20)
-    shift = Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.35 * gate]))
-    noisy = scan * (
-        1.0
-        + 0.25 * gate * rng.standard_normal((len(scan), 1)) / np.linalg.norm(scan, axis=1)[:, None]
-    )
-    assert registrar._restarter.sound(noisy, replace(off, T_ac=T_ac), Budget(10**7))
-    assert not registrar._restarter.sound(scan, replace(off, T_ac=shift @ T_ac), Budget(10**7))

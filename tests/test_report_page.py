@@ -686,8 +686,7 @@ def test_play_runs_to_the_end_and_stops(opened):
     browser = opened()
     _slide(browser, 55)
     browser.find_element("id", "play").click()
-    deadline = time.monotonic() + 5
-    while _text(browser, "#play") == "Pause" and time.monotonic() < deadline:
+    while _text(browser, "#play") == "Pause":  # without an end if the button does not stop
         time.sleep(0.05)
     assert _text(browser, "#play") == "Play"
     assert _text(browser, "#now").startswith("scan 59 ")

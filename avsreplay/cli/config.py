@@ -32,6 +32,7 @@ ASSIGNED = {
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",
+    "region": "region",
     "reference": "reference",
 }
 
@@ -156,7 +157,7 @@ def run_settings(command: F) -> F:
             f"--{name}",
             key=key,
             envvar=_variable(name),
-            metavar="log|truth|auto|POSE" if name == "init" else None,
+            metavar={"init": "log|truth|auto|POSE", "region": "X,Y,Z"}.get(name),
         )
         for name, key in ASSIGNED.items()
     ]

@@ -366,6 +366,9 @@ def _replayed(
         record["preflight"] += [
             {"grade": grade, "text": note} for note in _model_notes(run, advice)
         ]
+        record["preflight"] += [
+            {"grade": "check", "text": note} for note in _untimed_notes(run, rows)
+        ]
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target and not growing else ""
@@ -400,6 +403,24 @@ def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
     for note in (*notes, remark) if remark else notes:
         click.echo(f"avsreplay: {note}", err=True)
     return notes
+
+
+def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return the finding on points without times, unless the log is simulated, the user has stated
+    their meaning, or the order of the points excludes a duration of the scans.
+    """
+    from avsreplay.report.pose_checks import times_may_matter
+
+    options, source = run.job.options, run.source
+    stated = options.point_time is not None or options.scan_duration_s is not None
+    timed = source.meaning.time is not None or stated or run.header.scenario
+    if timed or run.config.register.backend == "poses" or run.model_check.duration_known:
+        return ()
+    period_s = source.clock.period_s * source.options.every
+    note = times_may_matter(rows, run.surface.extent, period_s)
+    if note:
+        click.echo(f"avsreplay: {note}", err=True)
+    return (note,) if note else ()
 
 
 def _collect(

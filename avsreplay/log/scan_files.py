@@ -53,10 +53,34 @@ def _pcd(data: bytes, budget: ReadBudget) -> NDArray[Any]:
     return read_pcd(data, budget)
 
 
+_BIN_COLUMNS = (4, 5, 6, 3, 7, 8)  # values of a point, in the order in which they are tried
+_FAR_BETTER = 1.3  # ratio of variances from which another number than the first is taken
+
+
 def _kitti(data: bytes, _budget: ReadBudget) -> NDArray[Any]:
-    if len(data) % 16:
-        raise BadFile(f"{len(data)} bytes are not whole KITTI points of 16")
-    return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
+    return np.frombuffer(data, "<f4").reshape(-1, bin_columns(data))[:, :3]
+
+
+def bin_columns(data: bytes) -> int:
+    """Return the number of float32 values of a point of a ``.bin`` file, which does not state it.
+
+    The values of a column are alike, so that with the right number the variance within the columns
+    is least. Four (KITTI) is taken unless another number explains the values far better.
+
+    Args:
+        data: the file.
+
+    Raises:
+        BadFile: no number of values divides it.
+    """
+    fitting = [n for n in _BIN_COLUMNS if len(data) % (4 * n) == 0]
+    if not fitting:
+        raise BadFile(f"{len(data)} bytes are not whole KITTI points of 16, or others up to 32")
+    values = np.nan_to_num(np.frombuffer(data, "<f4").astype(np.float64), posinf=0.0, neginf=0.0)
+    values = np.clip(values, -1e6, 1e6)
+    within = {n: float(values.reshape(-1, n).var(axis=0).mean()) for n in fitting}
+    least = _FAR_BETTER * min(within.values(), default=0.0)
+    return next(n for n in fitting if within[n] <= least or n == fitting[-1])
 
 
 def _npy(data: bytes, _budget: ReadBudget) -> NDArray[Any]:

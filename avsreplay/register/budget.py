@@ -42,10 +42,7 @@ TEST_WORK, SIZE_WORK = (
     15_000,
     15_000,
 )  # cost of a test of a pose, and of fitting the size [point searches]
-STRUCTURE_WORK, FREE_WORK = (
-    3000,
-    8000,
-)  # cost of the residuals that neighbours share, and of free directions
+FREE_WORK = 8000  # cost of free directions
 STAGE_WORK, CALL_WORK = (
     1200,
     600,

@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
+from avsreplay.register.evidence import robust_noise
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
+from avsreplay.register.plausibility import NOISE_OF_EXTENT
 from avsreplay.register.sampling import (
     attitudes,
     sample_evenly,
@@ -78,6 +80,8 @@ SYMMETRIC, SYMMETRIES = (
     0.3,
     6,
 )  # largest unexplained share of the surface turned onto itself; most motions tried
+# a point that an exact symmetry carries is this near the surface; share of points that may not be
+EXACT_OF_EXTENT, MOST_INEXACT = 0.002, 0.02
 TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = (
     6,
@@ -394,7 +398,14 @@ class GlobalSearch:
         apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         best, width = poses[apart & (costs < SYMMETRIC)], COARSE_OF_EXTENT * self._extent
         ended = [self._ended(self._refine, points, Pose.from_matrix(T), width).matrix for T in best]
-        return self._different(np.stack([np.eye(4), *ended]), 1 + SYMMETRIES, 1.0)[1:]
+        exact = [T for T in principal_turns(self._target.surface) if self._is_exact(points, T)]
+        return self._different(np.stack([np.eye(4), *exact, *ended]), 1 + SYMMETRIES, 1.0)[1:]
+
+    def _is_exact(self, points: Array, T: Array) -> bool:
+        """Whether a motion (4, 4) carries nearly all points (n, 3) of the surface onto it."""
+        moved = np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
+        off = self._target.index.closest(moved).d2 > (EXACT_OF_EXTENT * self._extent) ** 2
+        return bool(np.count_nonzero(off) <= MOST_INEXACT * len(points))
 
     def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
         distance, work = self._target.visibility.distances(
@@ -464,6 +475,36 @@ def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> 
     excess = second.unexplained(width) - best.unexplained(width)
     error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
     return bool(excess.mean() < max(margin, error))
+
+
+def principal_turns(surface: Surface) -> Array:
+    """Return the half turns (3, 4, 4) about the principal axes of a surface, through its centroid.
+
+    An exact half turn of a surface is one of these, as it carries centroid and principal axes onto
+    themselves, unless two of its principal moments are equal.
+
+    Args:
+        surface: mesh or cloud.
+    """
+    if len(surface.faces):
+        corners = surface.vertices[surface.faces]
+        weight = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        middle = corners.mean(axis=1)
+        total = weight.sum()
+        centre = weight @ middle / total
+        # of a triangle: (sum over the corners + 9 times that of its middle) / 12
+        away = np.concatenate([corners.reshape(-1, 3), middle]) - centre
+        weight = np.concatenate([np.repeat(weight, 3), 9.0 * weight])
+    else:
+        centre = surface.vertices.mean(axis=0)
+        away, weight = surface.vertices - centre, np.ones(len(surface.vertices))
+    axes = np.linalg.eigh((away * weight[:, None]).T @ away)[1].T
+    turns = np.tile(np.eye(4), (3, 1, 1))
+    turns[:, :3, :3] = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
+    turns[:, :3, 3] = centre - turns[:, :3, :3] @ centre
+    return turns
 
 
 def best_of(poses: Array, costs: Array, most: int) -> Array:

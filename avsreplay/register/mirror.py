@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.plausibility import robust_noise
+from avsreplay.register.evidence import robust_noise
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import directions, sample_evenly
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex

@@ -275,6 +275,14 @@ class ModelCheck:
         without = (weight @ values - weight * values) / (weight.sum() - weight)
         return float(weight @ values / weight.sum()), spread_of(without), weight
 
+    @property
+    def duration_known(self) -> bool:
+        """Whether the order of the points excludes that a scan takes a part of the period, or
+        gives this part.
+        """
+        durations = self._durations
+        return not durations.open or durations.result(self._registrar.index) is not None
+
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there
         are none.

@@ -23,6 +23,7 @@ from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
 from avsreplay.register.budget import FAR_WORK, LAST_WORK, LEAST_RATIO, SIZE_WORK, Budget
 from avsreplay.register.degenerate import scaled_information
+from avsreplay.register.evidence import Observed
 from avsreplay.register.grading import Grader
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import STOP_OF_EXTENT, Restart, Restarter
@@ -328,7 +329,7 @@ class Neighbourhood:
             )
         few = self._restarter.part(scan)
         found = self.regraded(scan, few, T_ca, budget, True, carried)
-        reason = self._restarter.reason(few, found, budget, None)
+        reason = self._restarter.reason(Observed(scan), found, budget, None)
         return (
             replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
             if reason

@@ -189,7 +189,8 @@ def grade(
     compare the poses from two halves of the scan. ``accuracy``: of the back end on an exact scan
     [deg, share of the extent]. ``systematic``: the covariance includes errors that vary slowly over
     the target. ``guess``: T_ca from which the back end began. A pose that equals this guess,
-    although the residuals require a step, is FAILED. The pose of a degenerate view has its
+    although the residuals require a step, is FAILED, unless it is one of least squared distances:
+    these do not move from where they end. The pose of a degenerate view has its
     unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the
     pose is one of least squared distances. The bias that noise causes in it is taken from the pose,
     and the mean that noise adds to the residuals from the covariance, see ``kernel/noise.hpp``. The
@@ -211,7 +212,7 @@ def grade(
         systematic,
         simulated,
     )
-    step = found.overlap and found.statistic > UNCHANGED
+    step = found.overlap and found.statistic > UNCHANGED and not simulated
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(

@@ -27,6 +27,7 @@ from avsreplay.register.budget import (
     near_work,
 )
 from avsreplay.register.degenerate import motions_outside
+from avsreplay.register.evidence import TOO_FEW, Observed
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.grading import FAR_RAD, Grader
 from avsreplay.register.neighbourhood import NOT_COMPARED, NOT_FOUND, POSTPONED, Neighbourhood
@@ -97,7 +98,7 @@ class Registrar:
         near = near_work(surface, self.index)
         self._target = Target(surface, self.index, self.limits, self._visibility, near)
         self._backend = create_backend(self.params, factory, self._target)
-        self._test = PlausibilityTest(surface, self.index, self._visibility, self.limits.gate_m)
+        self._test = PlausibilityTest(self._target)
         self._restarter = restarts.Restarter(self._target, self._test)
         self._grader = Grader(self._target, self.params, self._backend, self._restarter)
         self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter, self._grader)
@@ -131,9 +132,26 @@ class Registrar:
             The pose T_ac with its quality. A failure is its status, never an exception; T_ac is
             then the guess.
         """
-        scan = usable_points(points, self.params.subsample_m)
-        if refused := self._test.refused(scan, len(points), guess):
+        whole = usable_points(points, self.params.subsample_m)
+        if refused := self._test.refused(whole, len(points), guess):
             return refused
+        seen, scan = Observed(whole), self._test.around(whole, guess)
+        found = self._registered(seen, scan, guess, seq, carried, effort, unknown)
+        return found if found.points == len(whole) else replace(found, points=len(whole))
+
+    def _registered(
+        self,
+        seen: Observed,
+        scan: NDArray[Any],
+        guess: Pose,
+        seq: int,
+        carried: bool,
+        effort: Effort,
+        unknown: Array | None,
+    ) -> Alignment:
+        """Register the part of a scan around its guess; the whole scan is searched where that
+        fails.
+        """
         halves, budget = (
             seq % self.params.split_every == 0,
             Budget(healthy_work(len(scan), self._target.near_work)),
@@ -146,14 +164,14 @@ class Registrar:
         first = self._grader.graded(scan, guess, budget, None, halves, carried, rough=True)
         if first.status is AlignStatus.FAILED:
             return first
-        sound = self._restarter.sound(scan, first, budget)
+        sound = self._restarter.sound(seen, first, budget)
         found, searched = (
             (first, False)
             if sound
-            else self._recovered(scan, guess, first, halves, carried, budget)
+            else self._recovered(seen, scan, guess, first, halves, carried, budget)
         )
         if self._far(guess, found) and not searched:
-            found = self._searched(scan, found, carried, budget)
+            found = self._searched(seen.points, found, carried, budget)
         elif not searched:
             found = self._unique(scan, guess, found, budget, halves, carried)
             found = self._settled(scan, found, budget, halves, carried, unknown)
@@ -197,6 +215,7 @@ class Registrar:
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(sum(SCATTER_WORK[: 2 if len(target) < len(scan) else 1]) * len(scan))
         few, results, doubt = self._restarter.part(target), list[Alignment](), list[bool]()
+        seen = Observed(scan)
         none = quality.not_measured(
             len(scan), AlignStatus.NO_OVERLAP, None if known is None else known.inverse()
         )
@@ -221,16 +240,12 @@ class Registrar:
             )
             budget.spend(search.work)
             whole = search if part is target else whole
-            found, alone, doubtful = self._acquired(scan, part, search, budget, carried)
+            found, alone, doubtful = self._acquired(seen, part, search, budget, carried)
             results.append(found)
             doubt.append(doubtful)
             if found.status is AlignStatus.FAILED:
                 return found
-            fits = (
-                alone
-                and not search.rivals
-                and not self._restarter.misfit(few, found.T_ac.inverse(), budget)
-            )
+            fits = alone and not search.rivals
             little = search.inlier_ratio >= SURE_RATIO or fits  # little is left to explain
             if found.measured and little and not doubtful and search.width_m <= self.limits.gate_m:
                 break
@@ -249,22 +264,21 @@ class Registrar:
         sure = measured and not doubt[results.index(best)]
         if best.status in ACCEPTED:
             best = self._verified(scan, target, best, budget, carried)
-        if (more and not budget.exhausted) or (
-            sure and not self._restarter.misfit(few, best.T_ac.inverse(), budget)
-        ):
+        if (more and not budget.exhausted) or sure:
             return best
         return replace(
             best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND
         )
 
     def _acquired(
-        self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
+        self, seen: Observed, part: Array, search: SearchResult, budget: Budget, carried: bool
     ) -> tuple[Alignment, bool, bool]:
         """Register the result of a search of a part on the whole scan, and test it.
 
         Also: whether the points off the model are another object's (far away, or nothing is
             missing); if doubtful.
         """
+        scan = seen.points
         if not budget.allows(LAST_WORK):
             return (
                 quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()),
@@ -286,9 +300,7 @@ class Registrar:
             or search.inlier_ratio < p.least_separate
         )
         budget.spend(0 if spread or sure else TEST_WORK)
-        if spread or not (
-            sure or self._test.check(few, search.best, self._restarter.part(scan)).covered
-        ):
+        if spread or not (sure or ((at := self._test.check(seen, search.best)) and at.covered)):
             return (
                 quality.not_measured(len(scan), AlignStatus.NO_OVERLAP, search.best.inverse()),
                 False,
@@ -298,20 +310,23 @@ class Registrar:
         if found.status is AlignStatus.FAILED:
             return found, False, True
         budget.spend(TEST_WORK)
-        at = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan))
-        alone = away or at.covered
+        at = self._test.check(seen, found.T_ac.inverse())
+        covered = at is not None and at.covered
+        alone = away or covered
         if (
             search.inlier_ratio < (p.least_separate if alone else p.least_ratio)
             or not found.measured
         ):
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False, True
-        if at.reason:
+        reason = TOO_FEW if at is None else at.reason()
+        if at is None or reason:
             return (
-                replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason),
+                replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason),
                 False,
                 True,
             )
-        rivals, marked = list(search.rivals), self._symmetry.marked
+        marked = self._symmetry.marked
+        rivals = list(search.rivals)
         decided = marked and budget.allows(self._symmetry.work(len(part), len(rivals)))
         if marked and not decided and not rivals:
             status = AlignStatus.BUDGET_EXHAUSTED
@@ -319,12 +334,15 @@ class Registrar:
         if decided:
             work = self._symmetry.work(len(part), len(rivals))
             best, rivals, extra = self._symmetry.decided(
-                part, found.T_ac.inverse(), rivals, at.covered
+                part, found.T_ac.inverse(), rivals, covered
             )
             budget.spend(work + extra)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
                 found = self._neighbourhood.regraded(scan, few, best, budget, True, carried)
-        return self._unrivalled(scan, found, rivals, at.covered, budget), alone, at.doubtful
+        images, same = self._symmetry.images(found.T_ac.inverse()), self._symmetry.search.same
+        rivals = [each for each in rivals if not any(same(each, image) for image in images)]
+        rivals = images + rivals
+        return self._unrivalled(scan, found, rivals, covered, budget), alone, at.doubtful
 
     def _verified(
         self, scan: NDArray[Any], target: Array, found: Alignment, budget: Budget, carried: bool
@@ -415,7 +433,7 @@ class Registrar:
             or not self._symmetry.turned
         ):
             return found
-        T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
+        T_ca = found.T_ac.inverse()
         none = replace(
             found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_TURNED
         )
@@ -426,7 +444,11 @@ class Registrar:
             budget.spend(screened)
             return found if turned == [] else none
         best, rivals, extra = self._symmetry.decided(
-            scan, T_ca, [], self._test.check(part, T_ca).covered, turned
+            scan,
+            T_ca,
+            [],
+            (at := self._test.check(Observed(scan), T_ca)) is not None and at.covered,
+            turned,
         )
         budget.spend(work + extra)
         if best is not T_ca:  # the rays contradict the pose, whatever the status of the turned one
@@ -475,6 +497,7 @@ class Registrar:
 
     def _recovered(
         self,
+        seen: Observed,
         scan: NDArray[Any],
         guess: Pose,
         first: Alignment,
@@ -502,8 +525,8 @@ class Registrar:
             if len(tried) == 1
             else self._restarter.nearest(few, tried, self.limits.gate_m, budget)
         )
-        reason = self._restarter.reason(few, final, budget, guess)
-        if not (reason or self._restarter.doubtful(few, guess, final, budget)):
+        reason = self._restarter.reason(seen, final, budget, guess)
+        if not (reason or self._restarter.doubtful(few, seen, guess, final, budget)):
             return self._restarter.consistent(few, guess, final, budget), False
         before, overlap = (
             None,
@@ -519,7 +542,8 @@ class Registrar:
                 known = final.T_ac.inverse() if final.measured else None
                 if (
                     overlap
-                    and (found := self._acquire(scan, budget, carried, 1, known)).status in ACCEPTED
+                    and (found := self._acquire(seen.points, budget, carried, 1, known)).status
+                    in ACCEPTED
                 ):
                     return found, True
                 continue
@@ -529,11 +553,11 @@ class Registrar:
                 work if reason and step == "restart" and restart else 0
             )
             before = self._restarter.best(
-                few, guess.inverse(), final.T_ac.inverse(), budget, before, kept
+                few, seen, guess.inverse(), final.T_ac.inverse(), budget, before, kept
             )
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._neighbourhood.regraded(scan, few, before, budget, halves, carried)
-                reason = self._restarter.reason(few, final, budget, guess)
+                reason = self._restarter.reason(seen, final, budget, guess)
             if final.measured and not reason:
                 return self._restarter.consistent(few, guess, final, budget), False
         if not reason:

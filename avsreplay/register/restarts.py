@@ -27,13 +27,12 @@ from avsreplay.register.budget import (
     FAR_WORK,
     LEAST_RATIO,
     STAGE_WORK,
-    STRUCTURE_WORK,
     TEST_WORK,
     Budget,
 )
-from avsreplay.register.plausibility import LEAST_BEYOND, NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.evidence import Observed
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.quality import PART
-from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
 # with at least LEAST_RATIO of inliers and a smaller rms (in units of the gate) a fit is close
@@ -47,15 +46,7 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 # with more inliers too few points are left that could continue beyond an edge of the model
 COMPLETE = 0.985
-PATCH_OF_EXTENT, CELLS = (
-    0.05,
-    64,
-)  # side of a cube of neighbouring points; cubes along the extent, at least
-SHARED_OF_GATE = (
-    0.2  # with a larger rms distance and points off the model it is tested what neighbours share
-)
-# of the rms distance; a correct pose of a correct model has less than 0.3 in common to neighbours
-SHARED = 0.4
+LEAST_BEYOND = 10  # of 1,000 points well off the model, from which a close fit is judged
 BETTER_THAN, NEARER = (
     0.9,
     0.999,
@@ -219,74 +210,10 @@ class Restarter:
         cost = [self.measure(few, each.T_ac.inverse(), budget).cost(width_m) for each in found]
         return found[cost[1] < NEARER * cost[0]]
 
-    def reason(
-        self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose | None
-    ) -> str:
+    def reason(self, scan: Observed, found: Alignment, budget: Budget, guess: Pose | None) -> str:
         """Return why a pose is not plausible; "" if it is, or nothing was measured."""
         budget.spend(TEST_WORK)
-        return (
-            self._test.check(few, found.T_ac.inverse(), None, guess).reason
-            if found.measured
-            else ""
-        )
-
-    def misfit(self, points: NDArray[Any], T_ca: Pose, budget: Budget) -> bool:
-        """Return whether neighbouring points on the model share most of their distances from it,
-        (n, 3) in {A}.
-
-        Then the pose or the model is wrong, and another pose may fit better, however few points are
-        off the model.
-        """
-        distance, gate = self.measure(points, T_ca, budget).distance, self._target.limits.gate_m
-        budget.spend(STRUCTURE_WORK)
-        shared, rms = (
-            self.structure(points, T_ca, gate),
-            np.sqrt(np.mean(distance[distance < gate] ** 2)),
-        )
-        return bool(np.isfinite(shared) and shared > SHARED * rms)
-
-    def structure(
-        self,
-        points: NDArray[Any],
-        T_ca: Pose,
-        most_m: float = np.inf,
-        side: float = PATCH_OF_EXTENT,
-    ) -> float:
-        """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
-
-        From the products of the sums of two halves of each patch: noise of single points cancels in
-        the mean, a wrong pose and errors of the model do not. A point belongs to the patch in which
-        its projection onto its face lies. With patches of the measured points, noise as large as a
-        patch would divide a face by the sign of the noise.
-
-        Args:
-            points: (n, 3) in {A} [m].
-            T_ca: the pose.
-            most_m: points farther from the model are left out [m], as are those farther than
-                ``START_OF_EXTENT``.
-            side: side of a cube of neighbouring points, over the extent.
-
-        Returns:
-            The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near
-            the model.
-        """
-        target, p = self._target, T_ca.apply(points)
-        found = target.index.closest(
-            p, camera_c=target.visibility.camera_c(target.index, points, T_ca)
-        )
-        near = found.d2 < min(most_m, START_OF_EXTENT * self._extent) ** 2
-        if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
-            return float("inf")
-        e = np.einsum("ij,ij->i", normal := found.normal[near], p[near] - found.foot[near])
-        on = p[near] - e[:, None] * normal
-        cells = np.floor((on - self._middle) / (side * self._extent)).astype(np.int64) + CELLS // 2
-        patch = np.unique(cells @ np.array([CELLS * CELLS, CELLS, 1]), return_inverse=True)[1]
-        half = 2 * patch + np.arange(len(patch)) % 2
-        sums, counts = (
-            np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None)
-        )
-        shared = float(sums.prod(axis=1).sum()) / max(float(counts.prod(axis=1).sum()), 1.0)
-        return float(np.sqrt(max(shared, 0.0)))
+        return self._test.reason(scan, found.T_ac.inverse(), guess) if found.measured else ""
 
     def healthy(self, inlier_ratio: float, rms_m: float) -> bool:
         """Return whether an alignment is a close fit of nearly all points, which needs no further
@@ -294,33 +221,32 @@ class Restarter:
         """
         return inlier_ratio >= LEAST_RATIO and rms_m <= POOR_OF_GATE * self._target.limits.gate_m
 
-    def sound(self, points: NDArray[Any], found: Alignment, budget: Budget) -> bool:
-        """Return whether an alignment of a scan (n, 3) in {A} is healthy, and no surface continues
-        beyond the model.
-
-        Where some points are off the model, the others must not share a distance from it.
+    def sound(self, scan: Observed, found: Alignment, budget: Budget) -> bool:
+        """Return whether an alignment of a scan is healthy; where points are well off the
+        model, also by its evidence.
         """
         close = self.healthy(found.inlier_ratio, found.rms_m)
         if not close or found.inlier_ratio >= COMPLETE or found.well_off < LEAST_BEYOND:
             return close
-        few, T_ca = self.part(points), found.T_ac.inverse()
-        budget.spend(STRUCTURE_WORK)
-        if found.rms_m > SHARED_OF_GATE * self._target.limits.gate_m and self.misfit(
-            few, T_ca, budget
-        ):
-            return False
-        return not self._test.continued(few, T_ca)
+        budget.spend(TEST_WORK)
+        return not self._test.reason(scan, found.T_ac.inverse())
 
-    def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget) -> bool:
+    def doubtful(
+        self,
+        points: NDArray[Any],
+        scan: Observed,
+        guess: Pose,
+        found: Alignment,
+        budget: Budget,
+    ) -> bool:
         """Return whether an alignment may be a local minimum.
 
-        After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess.
-        A misfit of nearly all points of which neighbours share less than half is noise and no sign
-        of a local minimum. The neighbours are close together, because on small parts of a target
-        the distances at a wrong pose change their sign.
+        After a failure, a poor fit of a part of the scan, or away from the guess a poor fit of all
+        whose evidence leaves a doubt.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.
+            scan: the scan.
             guess: T_ac from which it was registered.
             found: its result.
             budget: of the scan.
@@ -329,14 +255,17 @@ class Restarter:
             return True
         T_ca, gate = found.T_ac.inverse(), self._target.limits.gate_m
         poor = POOR_OF_GATE * gate
-        if found.rms_m <= poor or found.inlier_ratio < LEAST_RATIO:
-            return found.rms_m > poor
-        moved = T_ca.apply(points) - guess.inverse().apply(points)
-        if float(np.linalg.norm(moved, axis=1).mean()) <= gate:
+        if found.rms_m <= poor:
             return False
-        budget.spend(STRUCTURE_WORK)
-        shared = self.structure(points, T_ca, side=0.5 * PATCH_OF_EXTENT)
-        return bool(shared > max(poor, np.sqrt(0.5) * found.rms_m))
+        moved = T_ca.apply(points) - guess.inverse().apply(points)
+        if (
+            found.inlier_ratio >= LEAST_RATIO
+            and float(np.linalg.norm(moved, axis=1).mean()) <= gate
+        ):
+            return False
+        budget.spend(TEST_WORK)
+        at = self._test.check(scan, T_ca)
+        return at is None or at.doubtful
 
     def graduated(
         self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget
@@ -365,6 +294,7 @@ class Restarter:
     def best(
         self,
         points: NDArray[Any],
+        scan: Observed,
         guess: Pose,
         result: Pose,
         budget: Budget,
@@ -376,6 +306,7 @@ class Restarter:
 
         Args:
             points: the part of the scan in {A} [m].
+            scan: the scan.
             guess: initial pose of the first registration.
             result: its result.
             budget: work that is left.
@@ -395,7 +326,7 @@ class Restarter:
             ):
                 continue  # not yet confirmed by a second start
             budget.spend(TEST_WORK)
-            if not self._test.check(points, best.T_ca).reason:
+            if not self._test.reason(scan, best.T_ca):
                 break
             tested = best
         return self.least(found)

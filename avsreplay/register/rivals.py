@@ -39,7 +39,7 @@ from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 
-VERSION = 10  # version of the kept data of a model
+VERSION = 11  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
@@ -56,6 +56,9 @@ NOT_VERIFIED = (
 NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
+# an exact symmetry carries all but this share of the surface to within this of it, over the extent
+EXACT_OF_EXTENT, MOST_INEXACT = 5e-4, 5e-4
+MOST_NAMED = 4  # turned poses that are named in words
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
@@ -96,10 +99,23 @@ class NearSymmetry:
             kept["least"] = np.array(found.least_rad)
         self._kinds = np.split(kept["kinds"], kept["ends"])[:-1]
         search.same_rad = min(search.same_rad, 0.5 * float(kept["least"]))
+        if "exact" not in kept:
+            kept["exact"] = self._exact_ones()
+        self._exact = kept["exact"]
         if "marks" not in kept:
             kept["marks"], kept["marked"] = self._found()
         self._marks, self._normals = kept["marks"]
         self._share, self._area = (float(x) for x in kept["marked"])
+
+    def _exact_ones(self) -> Array:
+        """The near-symmetries (k, 4, 4) that carry all of the surface onto itself."""
+        motions = np.concatenate([np.zeros((0, 4, 4)), *self._kinds])
+        if not len(motions):
+            return motions
+        width = EXACT_OF_EXTENT * self._target.index.extent_m
+        points = sample(self._target.surface, SAMPLES)[0]
+        off = [self._distances(points, T[None], width)[0] >= width for T in motions]
+        return motions[[float(each.mean()) <= MOST_INEXACT for each in off]]
 
     def _found(self) -> tuple[Array, Array]:
         """Points on the marks and their normals (2, n, 3); the share of the surface that they have,
@@ -246,6 +262,20 @@ class NearSymmetry:
         ]
         return best.T_ca, rivals, extra
 
+    def images(self, T_ca: Pose) -> list[Pose]:
+        """Return the poses onto which the exact symmetries of the model carry a pose, where they
+        carry it.
+
+        No scan can tell them apart. Each is a different pose. A registration could only move it
+        away.
+        """
+        found = list[Pose]()
+        for T in self._exact:
+            turned = Pose.from_matrix(T) @ T_ca
+            if not any(self.search.same(turned, each) for each in (T_ca, *found)):
+                found.append(turned)
+        return found
+
     def elsewhere(
         self, scan: NDArray[np.floating], T_ca: Pose, partial: bool, left: int
     ) -> tuple[Pose, list[Pose], int]:
@@ -294,8 +324,14 @@ class NearSymmetry:
             rivals = [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
         if not rivals:
             return found
-        words = turn_words(at @ rivals[0].inverse())
-        return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
+        words = dict.fromkeys(turn_words(at @ each.inverse()) for each in rivals)
+        return replace(
+            found,
+            status=AlignStatus.AMBIGUOUS,
+            covariance=None,
+            free_directions=", ".join([*words][:MOST_NAMED]),
+            members=(found.T_ac, *(each.inverse() for each in rivals)),
+        )
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)

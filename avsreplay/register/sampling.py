@@ -33,10 +33,6 @@ EMPTY, SPACED = (
     2.5,
     125,
 )  # for the density of rays; no ray within so many spacings: nothing was measured
-AMONG, SURROUNDED = (
-    4,
-    2.0,
-)  # nearest rays, all of them within so many spacings: not beyond the border of the scan
 # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 SCATTERED = 2.0
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
@@ -393,23 +389,3 @@ class Rays:
             self.points[::stride] / self.ranges[::stride, None], k=NEIGHBOUR + 1
         )[0][:, -1]
         return float(np.median(apart) * np.sqrt(np.pi / NEIGHBOUR))
-
-    def through(
-        self, points: Array, behind_m: float
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return through which points (k, 3) in {A} rays passed, and which are in directions
-        without rays.
-
-        Args:
-            points: where the model should be.
-            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind,
-                and all are near.
-        """
-        far = np.linalg.norm(points, axis=1)
-        if not len(points) or self.tree is None:
-            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-        angle, k = self.tree.query(points / far[:, None], AMONG, 1.01 * EMPTY * self.spacing)
-        k = np.minimum(k, len(self.ranges) - 1)  # where fewer are so near
-        empty = angle[:, 0] > EMPTY * self.spacing
-        near = angle[:, -1] < SURROUNDED * self.spacing
-        return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty

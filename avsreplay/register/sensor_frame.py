@@ -83,4 +83,5 @@ class SensorFrame:
 
     @staticmethod
     def _in_a(found: Alignment, sensor: Pose) -> Alignment:
-        return replace(found, T_ac=sensor @ found.T_ac)
+        members = tuple(sensor @ each for each in found.members)
+        return replace(found, T_ac=sensor @ found.T_ac, members=members)

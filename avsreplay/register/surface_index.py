@@ -112,7 +112,7 @@ class IcpResult:
         converged: the stopping rule held before n_max.
         inliers, rms_m: of the last pass, before its step.
         gate_m: rejection distance after the last pass.
-        step_rad, step_m: the last step.
+        step_rad, step_m: the last step; that of Horn's which is not made where it converged.
         ignored: points not finite.
         searched: neighbour searches made over all passes.
         work: of all passes, counted in ordinary searches.

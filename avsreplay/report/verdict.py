@@ -18,6 +18,7 @@ from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
 from avsreplay.report.charts import values
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
+from avsreplay.report.pose_checks import error_over_sigma
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
@@ -332,6 +333,8 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
                 f" {100 * share.above:.0f} % above it"
             )
             yield Concern(Grade.CHECK, f"{where}only {shares}")
+    if text := error_over_sigma(rows):
+        yield Concern(Grade.CHECK, text)
     if len(inconsistent := [row.t_s for row in rows if row.consistent is False]) > 0.1 * len(rows):
         begin = inconsistent[0]
         text = (

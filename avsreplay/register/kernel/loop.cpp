@@ -94,7 +94,6 @@ class Newton {
     Step step;
     bool undo;     // go back to the pose before the last step first
     bool settled;  // the pose is stationary as far as Newton's step can tell
-    Step last;     // what is made where Horn's step is small as well
   };
 
   Choice choose(const Sums& sums, double outside, double gate, double longest, double eps_rad, double eps_m) {
@@ -107,12 +106,12 @@ class Newton {
     used_ = extended_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
     Motion motion;
     const double most = std::min(longest, longest_);
-    if (longest_ <= eps_m || !newton_motion(sums, motion) || !to_step(motion, most, plain_)) return {horn, false, true, horn};
-    if (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_) return {horn, false, true, plain_};
+    const bool none = longest_ <= eps_m || !newton_motion(sums, motion) || !to_step(motion, most, plain_);
+    if (none || (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_)) return {horn, false, true};
     Step step = plain_;
     used_ = true, extended_ = extend(motion, second) && to_step(motion, most, step);
     length_ = step.length, slope_ = motion.slope;
-    return {step, false, false, step};
+    return {step, false, false};
   }
 
  private:
@@ -130,10 +129,10 @@ class Newton {
     if (extended_) {
       extended_ = false, length_ = plain_.length;
       std::copy(newton_, newton_ + 6, made_);
-      return {plain_, true, false, plain_};
+      return {plain_, true, false};
     }
     used_ = false, longest_ = SHORTER * length_;
-    return {horn_, true, false, horn_};
+    return {horn_, true, false};
   }
 
   // Broyden's step from the Newton step and the last step, where both have about the same direction; no longer than the last
@@ -208,12 +207,13 @@ class Passes {
         const Newton::Choice c = newton.choose(sums, outside, o_.gate, rule_.gate, rule_.eps_rad, rule_.eps_m);
         settled = c.settled;
         if (c.undo) std::memcpy(o_.T, before, sizeof before);
-        step = small && settled ? c.last : c.step;
+        step = c.step;
       }
+      o_.turn = step.turn, o_.move = step.move;
       o_.converged = small && settled && !few;
+      if (o_.converged) return true;  // at the pose and with the rejection distance of the sums
       std::memcpy(before, o_.T, sizeof before);
       apply(s_, step, o_.T);
-      o_.turn = step.turn, o_.move = step.move;
       o_.gate = gate;
       if (few && (small || (steady && !plane && within_error(step)))) return true;
       plane = plane && o_.passes < last_plane && !small && !(few && steady && within_error(step));

@@ -49,7 +49,8 @@ void copy_point(const View& points, int64_t k, double* p);
 Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);
 // T: rows of [R t], scan into {C}. A scan of at least twice `rule.few` points is first aligned by that many of its points,
 // or by one in four if these are fewer, until a step is below the error that so few points leave; then all of its points
-// go to the fixed point, unless the rms distance of the part is poor.
+// go to the fixed point, unless the rms distance of the part is poor. A converged pose is that of the last pass, with
+// its inliers and rejection distance: a further step could move a point across that distance, and the next step with it.
 Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team,
             Matches& matches);
 

@@ -1,0 +1,73 @@
+"""Two findings about a run whose truth are poses only, or whose points have no times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avsreplay.report.charts import values
+from avsreplay.report.moments import median_of
+from avsreplay.rows import Row
+
+MOST_SIGMAS = 5.0  # median error of the pose over its own 1 sigma from which it is reported
+_LEAST_ROWS = 10  # used scans with a true pose from which the median is judged
+_SIGNIFICANT = 3.0  # displacement during a scan over the 1 sigma of the position that matters
+
+
+def error_over_sigma(rows: Sequence[Row]) -> str:
+    """Return what is said if the errors of the pose exceed what the estimate states of them.
+
+    It is the consistency check of runs whose truth has no rates, from which NEES is not known.
+
+    Args:
+        rows: one per scan.
+
+    Returns:
+        The finding, "" if there is none.
+    """
+    used = [row for row in rows if row.gamma == 1]
+    said = []
+    for name, error, sigma in (
+        ("position", "pos_err_m", "pos_1s_m"),
+        ("attitude", "rot_err_deg", "rot_1s_deg"),
+    ):
+        stated = values(used, sigma)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(stated > 0.0, values(used, error) / stated, np.nan)
+        ratio = ratio[np.isfinite(ratio)]
+        if len(ratio) >= _LEAST_ROWS and (typical := median_of(ratio) or 0.0) > MOST_SIGMAS:
+            said.append(f"{name} {typical:.2g}")
+    if not said or any(row.nees is not None for row in used):
+        return ""
+    return (
+        f"the error of the pose is many times the 1 sigma that is stated of it (median:"
+        f" {', '.join(said)}): the true poses may be late, in another frame or of another model,"
+        " or the covariance is too small"
+    )
+
+
+def times_may_matter(rows: Sequence[Row], extent_m: float, period_s: float) -> str:
+    """Return what is said of points without times, if the target moves so fast that these would
+    matter if a scan took all the time to the next one.
+
+    Args:
+        rows: one per scan.
+        extent_m: of the model.
+        period_s: time between two scans.
+
+    Returns:
+        The finding, "" if times cannot matter.
+    """
+    used = [row for row in rows if row.gamma == 1]
+    rate = np.linalg.norm([values(used, f"w{axis}_radps") for axis in "xyz"], axis=0)
+    speed = np.linalg.norm([values(used, f"v{axis}_mps") for axis in "xyz"], axis=0)
+    motion = median_of(np.asarray(speed + 0.5 * extent_m * rate))
+    sigma = median_of(values(used, "pos_1s_m"))
+    if motion is None or sigma is None or 0.5 * motion * period_s <= _SIGNIFICANT * sigma:
+        return ""
+    return (
+        f"the points have no times, and the target moves up to {motion * period_s:.2g} m from scan"
+        " to scan: whether a scan takes part of this time is not known; record times, or state"
+        " --scan-duration, or --point-time none if all points of a scan are measured at once"
+    )
