@@ -57,8 +57,10 @@ class Plan:
             constraints.
         margin_m, binding: Smallest margin of the geometric constraints along the plan [m], and the
             constraint with it; NaN and "" without constraints.
-        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before
-            the corridor [m]; NaN without a clearance.
+        abort_margin_m: Lower bound of the smallest margin of ``withdrawal_clearance_m`` if the
+            robot withdraws at any instant of the plan [m]; NaN: not checked, without a clearance.
+        escapes: (m, 4) instants of the plan [s after t_ns], ascending, and the directions in {A} in
+            which the robot withdraws there; None: not planned.
         steps: Number of steps of the search.
         attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN
             where not planned.
@@ -81,6 +83,7 @@ class Plan:
     margin_m: float = math.nan
     binding: str = ""
     abort_margin_m: float = math.nan
+    escapes: Array | None = None
     steps: int = 0
     attitude_s: float = math.nan
     delayed_by: str = ""

@@ -14,8 +14,13 @@ from scipy.interpolate import CubicSpline
 
 from avsreplay.plan import _cone
 from avsreplay.plan.cone_programme import PointRows, Subproblem, solve
-from avsreplay.plan.convexification import ReferencePath, convex_subproblem, interval_fractions
-from avsreplay.plan.limits import Case, SampledScene, margins
+from avsreplay.plan.convexification import (
+    Case,
+    ReferencePath,
+    convex_subproblem,
+    interval_fractions,
+)
+from avsreplay.plan.limits import SampledScene, margins
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 

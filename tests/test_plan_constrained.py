@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.limits import Scene, margin
+from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
+from avsreplay.plan.withdrawal import KEPT_SHARE, Space, coasting, withdrawal
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from plan_scenes import problems
@@ -287,24 +288,64 @@ def test_the_robot_keeps_clear_of_the_body_and_arrives_from_outside(phase):
     assert along[before][-1] > 0.0
 
 
+def ball_margin(limits, y):
+    """Margin of a withdrawal at points in {C}: of the corridor, else to the ball."""
+    along = y[:, 0]
+    side = (
+        math.tan(math.radians(limits.final_deg)) * along
+        + limits.mouth_m
+        - np.linalg.norm(y[:, 1:], axis=1)
+    )
+    corridor = np.minimum(side, limits.final_range_m - np.linalg.norm(y, axis=1))
+    gap = np.linalg.norm(y + np.array([1.0, 0, 0]), axis=1) - 0.8
+    required = limits.kept_m
+    if corridor[0] > 0.0:
+        required = min(required, KEPT_SHARE * gap[0])
+    return np.maximum(gap - required, corridor).min()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.5, 1.8, 4.5])
-def test_an_abort_at_any_instant_outside_the_corridor_keeps_the_clearance(phase):
-    scene = replace(body(0.05, phase=phase), surface=ball)
-    limits = Limits(final_deg=15.0, final_range_m=0.5, mouth_m=0.01, clearance_m=0.3)
-    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
-    unsafe = constrained(scene, ORIGIN, ORIGIN, PARAMS, replace(limits, abort=False))
-    assert plan.found
+def test_a_withdrawal_from_any_instant_keeps_the_stated_margin(phase):
+    """What guidance would fly from 300 instants, propagated in steps of 50 ms."""
+    hull = 0.8 * np.concatenate([np.eye(3), -np.eye(3)]) - np.array([1.0, 0, 0])
+    scene = replace(body(0.05, phase=phase), surface=ball, hull_c=hull)
+    limits = Limits(final_deg=15.0, clearance_m=0.3).resolved(2.0)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits, extent_m=2.0)
+    path = path_of(plan, ORIGIN, ORIGIN)
     assert plan.abort_margin_m >= 0.0
-    assert unsafe.found
-    assert unsafe.t_go_s <= plan.t_go_s + 0.1
-    path, after = path_of(plan, ORIGIN, ORIGIN), np.linspace(0.0, 30.0, 301)[:, None]
-    for t in np.linspace(0.0, plan.t_go_s, 200, endpoint=False):
-        r, v = (x[0] for x in path.at(np.array([t])))
-        if np.linalg.norm(r - scene.goal(np.array([t]))[0][0]) > 0.5:
-            away = (r - CENTRE) / np.linalg.norm(r - CENTRE)
-            flown_off = r + v * after + 0.5 * PARAMS.a_max_mps2 * away * after**2
-            gap = np.linalg.norm(flown_off - CENTRE, axis=1) - 0.8  # the ball does not move
-            assert gap.min() >= 0.3 - 0.02  # aborts are tried at 16 instants of the plan
+    for t in np.linspace(0.0, plan.t_go_s, 300, endpoint=False):
+        (r,), (v,) = path.at(np.array([t]))
+        later = scene.after(t)
+        space = Space(SampledScene(later, 60.0, 0.2, 45.0), limits, PARAMS.a_max_mps2, 2.0)
+        planned = path.escapes[np.abs(path.escapes[:, 0] - t).argmin(), 1:]
+        away = withdrawal(space, r, v, 1.0, planned=planned).path
+        times = np.arange(0.0, away.t_go_s + 0.05, 0.05)
+        turn = Rotation.from_quat(later.attitude(times))
+        y = turn.inv().apply(away.at(times)[0] - later.goal(times)[0])
+        assert ball_margin(limits, y) >= plan.abort_margin_m - space.resolution_m
+        rest = away.at(np.array([away.t_go_s + 20.0]))[0][0] - CENTRE
+        assert np.linalg.norm(rest) >= 0.8 + 1.0 - 1e-6
+
+
+def test_a_coast_that_passes_the_body_is_bounded_from_below():
+    """Straight past a ball at rest: the exact smallest distance, and a bound just below it."""
+    scene = replace(body(0.0), surface=ball, hull_c=np.array([[0.0, 0.0, 0.0]]))
+    (rho,), (x,) = scene.goal(np.zeros(1))[0], axis_of(scene, np.zeros(1))
+    side = np.cross(x, [0.0, 1.0, 0.0])
+    centre = rho - x
+    start, v = centre + 1.5 * side - 2.0 * np.array([0, 1.0, 0]), np.array([0.0, 0.2, 0.0])
+    path = StepPath(start, v, np.zeros((1, 3)), 0.0, 5.0)
+    limits = Limits(final_deg=15.0, clearance_m=0.3).resolved(2.0)
+    space = Space(SampledScene(scene, 60.0, 0.2, 45.0), limits, 0.05, 2.0)
+    found = coasting(space, path, 0.0)
+    assert 0.0 <= found.margin_m <= 1.5 - 0.8 - limits.kept_m + 1e-9
+    assert found.safe_s == math.inf
+    near = coasting(
+        Space(space.sampled, replace(limits, withdrawal_clearance_m=0.8), 0.05, 2.0), path, 0.0
+    )
+    assert near.margin_m < 0.0
+    assert near.safe_s == 0.0
 
 
 def test_the_clearance_grows_with_the_predicted_uncertainty():

@@ -19,10 +19,11 @@ from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.cone_programme import PointRows, solve
 from avsreplay.plan.convexification import (
-    ABORT_S,
     BETWEEN,
+    BUFFER_OF_EXTENT,
+    Case,
     ReferencePath,
-    aborted,
+    Withdrawn,
     coarse_nodes,
     convex_subproblem,
     entry_fractions,
@@ -33,14 +34,18 @@ from avsreplay.plan.convexification import (
     interval_fractions,
     largest_change,
     margins_at,
+    proven,
     shortened,
     warm_reference,
+    withdrawal_margin,
+    withdrawn,
     worst_margin,
 )
-from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
+from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
+from avsreplay.plan.withdrawal import COAST_S, Tried
 
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
@@ -53,7 +58,7 @@ LATER, LATER_S = (
     1.02,
     0.1,
 )  # a renewed plan that is later than the earlier one by more starts the full search
-KEPT = 1  # earlier iterations whose aborts are required too: the worst moment may alternate
+KEPT = 1  # earlier sets of withdrawals that are required too: the worst moment may alternate
 NEAR_REFERENCE = (
     0.02  # relative change of the end time below which the excess tightens the constraints
 )
@@ -65,6 +70,7 @@ MOVES = 6  # largest number of moves of the entry in one direction
 RETRIED = 3
 TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
+SHORT_S_PER_M = 20.0  # time that a shortage of withdrawals costs when paths are compared
 STUCK = (
     4  # from this iteration on an initial path without a plan ends where the slack does not shrink
 )
@@ -117,9 +123,10 @@ def constrained(
     free = _necessary(scene, free, r0, params, limits)
     if not free.found:
         return free
-    span_s = 1.5 * unbound.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
+    span_s = 1.5 * unbound.t_go_s + (0.0 if limits.clearance_m is None else COAST_S)
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
-    case = Case(sampled, limits, params, r0, v0, 1e-5 * extent_m, earliest_s=earliest_s)
+    buffer_m = BUFFER_OF_EXTENT * extent_m
+    case = Case(sampled, limits, params, r0, v0, buffer_m, earliest_s=earliest_s)
     return _free_plan(case, free) or _graded(
         case, free, _best_path(case, free, unbound, warm), t_ns
     )
@@ -194,10 +201,15 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
         if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
             return None
     worst, name = worst_margin(case, path)
-    abort = aborted(case, path)
-    if worst < 0.0 or abort.short > 0.0:
+    if worst < 0.0 or proven(case, path, withdrawn(case, path, Tried.first())).short_m > 0.0:
         return None
-    return replace(free, violation_m=0.0, margin_m=worst, binding=name, abort_margin_m=abort.margin)
+    return replace(
+        free,
+        violation_m=0.0,
+        margin_m=worst,
+        binding=name,
+        abort_margin_m=withdrawal_margin(case, path),
+    )
 
 
 def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
@@ -222,7 +234,8 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         violation_m=max(-worst, 0.0),
         margin_m=worst,
         binding=name,
-        abort_margin_m=aborted(case, found).margin,
+        abort_margin_m=withdrawal_margin(case, found),
+        escapes=found.escapes,
     )
 
 
@@ -295,13 +308,20 @@ def _improved(
             ):
                 best = min(
                     filter(None, (best, _refined(case, draft, trust=trust))),
-                    key=_duration,
+                    key=_safest,
                     default=None,
                 )
     return best
 
 
 _duration = attrgetter("t_go_s")
+
+
+def _safest(path: StepPath) -> tuple[bool, float]:
+    """Paths whose withdrawals keep what is required come first, then the earliest; a withdrawal
+    that misses it costs time.
+    """
+    return path.short_m > 0.0, path.t_go_s + SHORT_S_PER_M * path.short_m
 
 
 def _different(drafts: list[StepPath]) -> list[StepPath]:
@@ -335,6 +355,8 @@ def _moved(case: Case, path: StepPath) -> StepPath:
             trial = _refined(moved, best, latest_s=best.t_go_s)
             if trial is None or trial.t_go_s > best.t_go_s - TIME_TOLERANCE_S:
                 break
+            if trial.short_m > best.short_m:
+                break
             best = trial
         if best is not path:
             break
@@ -349,9 +371,26 @@ def _refined(
     trust: float = TRUST,
     rough: bool = False,
 ) -> StepPath | None:
-    """Iterate from the rest of an earlier path, whose aborts the first iteration requires."""
-    rows = aborted(case, path, since_s).rows
+    """Iterate from the rest of an earlier path, whose withdrawals the first iteration
+    requires.
+    """
+    rows = withdrawn(case, path, Tried.first(), since_s).rows
     return _converged(case, warm_reference(case, path, since_s), latest_s, trust, rough, rows)
+
+
+def _accepted(
+    case: Case, path: StepPath, over: Array, away: Withdrawn
+) -> tuple[StepPath, Withdrawn] | None:
+    """Return the path without terminal errors, with its withdrawals, and whether these are proven;
+    None where another constraint does not hold.
+    """
+    path = path.ending_at(case.scene.goal)
+    allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
+    if not feasible(case, path, over.max(), allowed):
+        return None
+    away = proven(case, path, away)
+    escapes = away.tried.table(case.wait_s, path.t_go_s)
+    return replace(path, escapes=escapes, short_m=away.short_m), away
 
 
 def _converged(
@@ -366,9 +405,10 @@ def _converged(
     seen.
 
     The iterations end without a result where the end time remains later than ``latest_s``. The
-    first iteration requires ``rows``, the aborts of an earlier path.
+    first iteration requires ``rows``, the withdrawals of an earlier path.
     """
     best: StepPath | None = None
+    tried = Tried.first()
     n, tolerance = (
         case.limits.nodes,
         ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE,
@@ -385,13 +425,17 @@ def _converged(
             return best
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
-        over, abort = excess(case, path), aborted(case, path)
-        rows = (*abort.rows, *rows[:KEPT])
-        if found.slack <= case.buffer_m:
-            path = path.ending_at(case.scene.goal)
-            allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
-            if feasible(case, path, max(over.max(), abort.short), allowed):
-                best = path if best is None else min(best, path, key=_duration)
+        over = excess(case, path)
+        if found.slack > case.buffer_m:  # the programme cannot keep as much
+            tried = replace(tried, reserve_m=tried.reserve_m - found.slack)
+        away = withdrawn(case, path, tried, improve=found.slack > case.buffer_m)
+        tried = away.tried
+        rows = (*away.rows, *rows[:KEPT])
+        done = _accepted(case, path, over, away) if found.slack <= case.allowed_slack_m else None
+        if done is not None:
+            path, tried = done[0], done[1].tried
+            rows = (*done[1].rows, *rows)
+            best = path if best is None else min(best, path, key=_safest)
         settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
         if settled and best is not None and (settled > 1 or path is best):
             return best

@@ -5,7 +5,7 @@ constraints.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -19,15 +19,17 @@ from avsreplay.plan import _cone
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
 from avsreplay.plan.limits import (
     CONSTRAINTS,
-    THRUST_SHARE,
-    Case,
     Margins,
+    SampledScene,
     Scene,
     in_fixture_axes,
+    largest_acceleration,
     margins,
 )
 from avsreplay.plan.path import RobotPath, StepPath, path_of
+from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
+from avsreplay.plan.withdrawal import STARTS, Certificate, Space, Tried, certified, sampled
 
 COARSE_NODES = 16  # least number of thrust intervals while initial paths are compared
 COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
@@ -39,10 +41,98 @@ RESERVE = (
 # a constraint with a larger margin at the reference, in units of the buffer, is left out of the
 # programme
 FAR = 2e4
-ABORT_S = 30.0  # duration of an abort
-ABORTS = 16  # instants at which an abort is tried
+# slack of the withdrawals in units of that of the other constraints: they are corrected later
+SOFT = 1.0
+# margin of withdrawals that the programme requires, in resolutions of their certificate
+RESERVE_RESOLUTIONS = 2.0
+BUFFER_OF_EXTENT = 1e-5  # length below which an excess is rounding
+THRUST_SHARE = (
+    1.0 - 1e-5
+)  # share of a_max used by the cone programme; the rest corrects the terminal errors
 TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the grasp point
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
+
+
+@value_class
+class Case:
+    """Everything that does not change with the reference.
+
+    Attributes:
+        entry: Fractions of the flight from which the cone and the corridor are required; None: the
+            reference decides.
+        begin_c: (3,) position in {C} where the thrust begins.
+        start: (5,) margins there.
+        space: What a withdrawal has to keep clear of; None where no clearance is required.
+    """
+
+    sampled: SampledScene
+    limits: Limits
+    params: PlanParams
+    r0: Array
+    v0: Array
+    buffer_m: float
+    coarse: bool = False
+    earliest_s: float = 0.0
+    entry: tuple[float, float] | None = None
+    begin_c: Array = field(init=False)
+    start: Array = field(init=False)
+    space: Space | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        at, r = np.array([self.params.latency_s]), (self.r0 + self.params.latency_s * self.v0)[None]
+        y = self.sampled.coordinates(at, r)
+        object.__setattr__(self, "begin_c", y[0])
+        found = margins(self.scene, self.limits, y, r, self.sampled.sigma(at))
+        object.__setattr__(self, "start", found.values[0])
+        space = None
+        if self.limits.clearance_m is not None and self.scene.surface is not None:
+            extent_m = self.buffer_m / BUFFER_OF_EXTENT
+            space = Space(self.sampled, self.limits, self.params.a_max_mps2, extent_m)
+        object.__setattr__(self, "space", space)
+
+    @property
+    def wait_s(self) -> float:
+        """Coasting time before the thrust [s]."""
+        return self.params.latency_s
+
+    @property
+    def reserve_m(self) -> float:
+        """Margin that the programme requires of withdrawals; its slack may use it up [m]."""
+        return 0.0 if self.space is None else RESERVE_RESOLUTIONS * self.space.resolution_m
+
+    @property
+    def allowed_slack_m(self) -> float:
+        """Slack of the programme up to which a path is checked [m]."""
+        return max(self.buffer_m, self.reserve_m)
+
+    @property
+    def a_max(self) -> float:
+        """Largest acceleration in any direction [m/s2]."""
+        return largest_acceleration(self.limits, self.params)
+
+    @property
+    def axes(self) -> Array | None:
+        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each
+        component; None without.
+        """
+        bounds = self.limits.accel_axes_mps2
+        return (
+            None
+            if bounds is None
+            else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
+        )
+
+    def within_axes(self, u: Array) -> bool:
+        """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the
+        base.
+        """
+        bounds = self.limits.accel_axes_mps2
+        return bounds is None or bool(np.all(np.abs(u @ self.limits.base_axes) <= bounds))
+
+    @property
+    def scene(self) -> Scene:
+        """The target."""
+        return self.sampled.scene
 
 
 @value_class
@@ -243,68 +333,115 @@ def feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
 
 
 @value_class
-class Abort:
-    """Aborts from instants of a path outside the corridor: the largest acceleration away from the
-    centre of mass.
+class Withdrawn:
+    """Withdrawals from instants of a path.
 
     Attributes:
-        margin: Smallest margin of the clearance during these aborts [m]; NaN without a clearance.
-        short: By how much it is negative, less what the start itself lacks; 0 where aborts are not
-            required [m].
+        margin_m: Smallest margin of the clearance during them [m]; NaN without a clearance.
+        short_m: What is missing, less what the withdrawal from the start itself lacks; 0 where
+            withdrawals are not required [m].
         rows: Rows that require the margin; empty where they are not needed.
+        tried: The instants.
     """
 
-    margin: float = math.nan
-    short: float = 0.0
+    margin_m: float = math.nan
+    short_m: float = 0.0
     rows: tuple[PointRows, ...] = ()
+    tried: Tried = field(default_factory=Tried.first)
 
 
-def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
-    """Return the aborts from instants of a path later than ``since_s`` after its begin, each with
-    its worst moment.
+def withdrawn(
+    case: Case, path: RobotPath, tried: Tried, since_s: float = 0.0, improve: bool = True
+) -> Withdrawn:
+    """Return the withdrawals from some instants of a path.
+
+    Args:
+        case: The problem; withdrawals are left out on the coarse grid.
+        path: The path.
+        tried: The instants.
+        since_s: Time between its begin and the instant of planning [s].
+        improve: Search better directions where the margin is negative.
     """
-    limits, scene = case.limits, case.scene
-    if limits.clearance_m is None or scene.surface is None:
-        return Abort()
-    begin = np.linspace(case.wait_s, path.t_go_s - since_s, ABORTS, endpoint=False)
-    r, v = path.at(since_s + begin)
-    rho, R = case.sampled.at(begin)
-    outside = np.linalg.norm(r - rho, axis=1) > (limits.final_range_m or 0.0)
-    if not outside.any():
-        return Abort()
-    begin, r, v = begin[outside], r[outside], v[outside]
-    away = (
-        r - rho[outside] - R[outside] @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
-    )
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
-    positions = (
-        r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
-    )
-    times = (begin[:, None] + after[0, :, 0]).ravel()
-    rho, R = case.sampled.at(times)
-    y = in_fixture_axes(R, positions.reshape(-1, 3) - rho)
-    foot, gap = scene.surface(y)
-    k = gap.reshape(len(begin), -1).argmin(axis=1) + np.arange(len(begin)) * after.size
-    margins_m = gap[k] - limits.clearance_m
-    short = (
-        max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
-    )
-    if not limits.abort:
-        return Abort(float(margins_m.min()), short)
-    normal = (y[k] - foot[k]) / np.where(np.abs(gap[k]) > 1e-9, gap[k], 1e-9)[:, None]
-    in_a = (R[k] @ normal[:, :, None])[:, :, 0]
-    lead = times[k] - begin
-    part = (begin - case.wait_s) * limits.nodes / (path.t_go_s - since_s - case.wait_s)
-    interval = np.minimum(part.astype(np.int64), limits.nodes - 1)
-    offset = margins_m - RESERVE * case.buffer_m - np.sum(in_a * (r + lead[:, None] * v), axis=1)
+    if case.space is None or case.coarse or not case.limits.abort:
+        return Withdrawn()
+    found, tried = sampled(case.space, path, tried, case.wait_s, since_s, improve)
+    least = _accepted(case.space, found)
+    short = max(least - found.margin_m, 0.0)
+    rows = _withdrawal_rows(case, case.space, path.t_go_s - since_s, found, least, tried.reserve_m)
+    return Withdrawn(found.margin_m, short, (rows,), tried)
+
+
+def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
+    """Return whether withdrawals from every instant keep the margin, and otherwise rows for the
+    worst, whose instants are tried from then on.
+
+    Args:
+        case: The problem; on the coarse grid nothing is proven.
+        path: The path.
+        away: Withdrawals from some instants of about the same path.
+    """
+    if case.space is None or case.coarse or not case.limits.abort or away.short_m > 0.0:
+        return away
+    start = Tried(away.tried.share[:1], away.tried.d[:1])
+    least = _accepted(case.space, sampled(case.space, path, start, case.wait_s)[0])
+    found = certified(case.space, path, case.wait_s, away.tried, least)
+    short, length = max(least - found.margin_m, 0.0), path.t_go_s - case.wait_s
+    poor = found.margins_m < least + case.space.resolution_m
+    share = (found.worst.t[poor] - case.wait_s) / length
+    tried = away.tried.also(share, found.worst.push[poor] / case.space.a_max, short)
+    rows = _withdrawal_rows(case, case.space, path.t_go_s, found, least, tried.reserve_m)
+    return Withdrawn(found.margin_m, short, (rows,), tried)
+
+
+def withdrawal_margin(case: Case, path: RobotPath) -> float:
+    """Return a lower bound of the margin of withdrawals from every instant of a path [m]; NaN
+    without a clearance.
+    """
+    if case.space is None:
+        return math.nan
+    escapes = path.escapes if isinstance(path, StepPath) else None
+    tried = Tried.of(escapes, case.wait_s, path.t_go_s)
+    return certified(case.space, path, case.wait_s, tried).margin_m
+
+
+def _accepted(space: Space, found: Certificate) -> float:
+    """The margin that is required: what the withdrawal from the start itself lacks is accepted."""
+    return min(0.0, float(found.margins_m[0]) - space.resolution_m)
+
+
+def _withdrawal_rows(
+    case: Case, space: Space, end_s: float, found: Certificate, least_m: float, reserve_m: float
+) -> PointRows:
+    """Rows that keep the worst moments of withdrawals at a margin; of those from about the same
+    instant and about the same time after it the worst.
+    """
+    limits, length = case.limits, end_s - case.wait_s
+    reserve = least_m + max(case.reserve_m + reserve_m, 2.0 * space.resolution_m)
+    near = np.flatnonzero(found.margins_m < max(FAR * case.buffer_m, reserve))
+    part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
+    late = found.at[near] > 0.5 * found.worst.span[near]
+    order = np.lexsort((found.margins_m[near], late, part))
+    key = (2.0 * part + late)[order]
+    k = near[order][np.r_[True, np.diff(key) > 0.0]] if len(order) else near
+    m, lead = found.worst.of(k), found.at[k]
+    t, r, v = m.t + lead, m.r, m.v
+    rho, R = case.sampled.at(t) if len(k) else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    after = r + lead[:, None] * (v + 0.5 * lead[:, None] * m.push)
+    slope = space.gradient(in_fixture_axes(R, after - rho), t, m.most) if len(k) else rho
+    in_a = (R @ slope[:, :, None])[:, :, 0]
+    at = (m.t - case.wait_s) * limits.nodes / length
+    interval = np.clip(at.astype(np.int64), 0, limits.nodes - 1)
+    coast = np.sum(in_a * (r + lead[:, None] * v), axis=1)
     rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
-    on = margins_m < FAR * case.buffer_m
-    ones = np.ones(int(on.sum()))
-    rows = PointRows(
-        interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], ones, lead[on]
+    return PointRows(
+        interval,
+        np.clip(at - interval, 0.0, 1.0),
+        in_a,
+        found.margins_m[k] - reserve - coast,
+        rate,
+        np.full(len(k), SOFT),
+        lead,
     )
-    return Abort(float(margins_m.min()), short, (rows,))
 
 
 def allowed(start: Array, fraction: Array) -> Array:

@@ -30,7 +30,7 @@ from avsreplay.plan.limits import (
     in_fixture_axes,
     margins,
 )
-from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
+from avsreplay.plan.path import BurnPath, CostatePath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import (
@@ -328,7 +328,7 @@ def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
     since_s = (t_ns - segment.t_ns) * 1e-9
     r0, v0 = segment.r0 + dr - since_s * dv, segment.v0 + dv
     path = segment.path
-    if isinstance(path, (CostatePath, StepPath)):
+    if isinstance(path, (CostatePath, StepPath, BurnPath)):
         path = replace(path, r0=r0, v0=v0)
     previous = None if segment.previous is None else pushed(segment.previous, t_ns, dr, dv)
     return replace(segment, r0=r0, v0=v0, path=path, previous=previous)

@@ -20,11 +20,12 @@ from avsreplay.outcome import Plan
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, next_turn, with_turn, without_turn
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.limits import Scene, margin
-from avsreplay.plan.path import RobotPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.limits import SampledScene, Scene, margin
+from avsreplay.plan.path import BurnPath, RobotPath, StepPath, path_of
+from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
-from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory, resting
+from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
+from avsreplay.plan.withdrawal import COAST_S, Space, Withdrawal, withdrawal
 from avsreplay.records import Forecast
 
 # ratio to the time to go of the latest full search from which on all initial paths are searched
@@ -112,7 +113,7 @@ class GuidanceState:
         supervisor: State of the supervisor.
         plan: The latest capture plan; its ``t_ns`` is the instant of planning.
         decision: The latest decision.
-        made_ns: When the latest segment of a hold or retreat was planned.
+        made_ns: When the withdrawal that is flown was last renewed.
         captured_ns: When the gripper closed.
         draft: Segment of the latest capture plan that was found, flown or not; the next plan begins
             with its path.
@@ -152,7 +153,7 @@ class Guidance:
         """
         self.gripper, self.arm = gripper, arm
         self.params, self.supervisor = params, supervisor
-        self.limits = (limits or Limits()).resolved(extent_m)
+        self.limits, self.extent_m = (limits or Limits()).resolved(extent_m), extent_m
 
     def initial(self, t_ns: int) -> GuidanceState:
         """Return the state at the first scan: the robot at its configured position and velocity.
@@ -361,31 +362,49 @@ class Guidance:
             distance_m=float(np.linalg.norm(known.scene.goal(np.zeros(1))[0][0] - position)),
             now_1s_m=float(sigma.pos_1s_m[0]),
             margin=self._margin(state, known.scene, position, velocity),
+            withdrawal_m=self._withdrawal_margin(state, known),
         )
+
+    def _withdrawal_margin(self, state: GuidanceState, known: PlannerInput) -> float:
+        """Return the margin of a withdrawal from now, which matters while no scan is healthy."""
+        if known.gamma or state.decision.action not in _CLOSING:
+            return math.inf
+        p = self.supervisor.params
+        return self._withdrawal(state, known, p.standoff_m or 0.0)[0].margin_m
 
     def _withdraw(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
-        """Fly a hold, a retreat or an abort.
-
-        Hold and retreat are replanned at the replanning period.
-        """
+        """Fly a hold, a retreat or an abort; it is renewed at the replanning period."""
         action = state.decision.action
-        due = (
-            state.made_ns is None
-            or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
-        )
-        if (
-            action is Action.STAND_STILL
-            or not due
-            or (action is Action.ABORT and state.made_ns is not None)
-        ):
+        since_s = math.inf if state.made_ns is None else (known.t_ns - state.made_ns) * 1e-9
+        if action is Action.STAND_STILL or since_s < self.params.replan_period_s - 1e-6:
             return state
-        p, moving = self.supervisor.params, state.segment.at(known.t_ns)
+        p = self.supervisor.params
         least_m = (p.standoff_m if action is Action.HOLD else p.retreat_m) or 0.0
-        refuge = resting(known.scene, *moving, least_m, self.params.a_max_mps2)
-        _, segment = self._plan(
-            state.segment, refuge, known.t_ns, lambda s, *rest: rendezvous(s.goal, *rest)
-        )
-        return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
+        found, made = self._withdrawal(state, known, least_m)
+        segment = state.segment if found.continued else made
+        return replace(state, segment=segment, made_ns=known.t_ns)
+
+    def _withdrawal(
+        self, state: GuidanceState, known: PlannerInput, least_m: float
+    ) -> tuple[Withdrawal, Segment]:
+        """Return the withdrawal that begins when the latency is over, and the segment that flies
+        it.
+        """
+        segment, wait_s = state.segment, self.params.latency_s
+        begin_ns = known.t_ns + round(wait_s * 1e9)
+        r, v = segment.at(begin_ns)
+        scene = known.scene.after(wait_s) if wait_s else known.scene
+        sampled = SampledScene(scene, self.params.horizon_s, self.params.grid_s, 1.5 * COAST_S)
+        space = Space(sampled, self.limits, self.params.a_max_mps2, self.extent_m)
+        path, after_s = segment.path, (begin_ns - segment.t_ns) * 1e-9
+        current = planned = None
+        if isinstance(path, BurnPath):
+            current = path.after(after_s)
+        elif isinstance(path, StepPath) and path.escapes is not None:
+            planned = path.escapes[np.abs(path.escapes[:, 0] - after_s).argmin(), 1:]
+        found = withdrawal(space, r, v, least_m, current, planned)
+        previous = segment if known.t_ns < segment.t_ns else replace(segment, previous=None)
+        return found, Segment(begin_ns, r, v, found.path, previous, turn=segment.turn)
 
     def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:
         """Return the margin of the constraints; what the plan in force itself violates at its

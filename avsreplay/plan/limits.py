@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.records import Trajectory
 
-THRUST_SHARE = (
-    1.0 - 1e-5
-)  # share of a_max used by the cone programme; the rest corrects the terminal errors
 CONSTRAINTS = (
     "cone",
     "corridor",
@@ -245,15 +242,44 @@ def margins(
         second[:, 2] = np.linalg.norm(y - scene.centre_c, axis=1) - limits.keepout_m
     if limits.clearance_m is not None and scene.surface is not None:
         foot, gap = scene.surface(y)
-        clearance = np.full(n, limits.clearance_m)
-        if sigma is not None:
-            clearance += limits.clearance_sigmas * (sigma[0] + sigma[1] * distance)
+        clearance = required_clearance(limits, distance, sigma)
         first[:, 3], second[:, 3] = corridor, gap - clearance
     if limits.reach_max_m is not None or limits.reach_min_m is not None:
         from_base = np.linalg.norm(r - np.array(limits.base_m), axis=1)
         shell = limits.reach_min_m or -math.inf, limits.reach_max_m or math.inf
         second[:, 4] = np.minimum(from_base - shell[0], shell[1] - from_base)
     return Margins(first, second, foot, gap, clearance)
+
+
+def required_clearance(limits: Limits, distance: Array, sigma: tuple[Array, Array] | None) -> Array:
+    """Return the distance to the surface (n,) that is required at n points [m].
+
+    Args:
+        limits: Limits; without a clearance the centre of the end-effector must not touch.
+        distance: (n,) distances to the grasp point [m].
+        sigma: Predicted 1 sigma of position [m] and attitude [rad], each (n,); None: exact.
+    """
+    clearance = np.full(len(distance), limits.clearance_m or 0.0)
+    if sigma is not None:
+        clearance += limits.clearance_sigmas * (sigma[0] + sigma[1] * distance)
+    return clearance
+
+
+def corridor_margin(scene: Scene, limits: Limits, y: Array) -> tuple[Array, Array]:
+    """Return the margins inside the corridor [m]: to its side and to its end, each (n,).
+
+    Args:
+        scene: The target.
+        limits: Resolved limits; without a corridor no point is inside.
+        y: (n, 3) positions in {C} [m].
+    """
+    distance = np.linalg.norm(y, axis=1)
+    if scene.axis_c is None or limits.final_deg is None:
+        return np.full(len(y), -math.inf), np.full(len(y), -math.inf)
+    along = y @ scene.axis_c
+    across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
+    side = math.tan(math.radians(limits.final_deg)) * along + (limits.mouth_m or 0.0) - across
+    return side, (limits.final_range_m or 0.0) - distance
 
 
 def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
@@ -333,71 +359,6 @@ class SampledScene:
         if self.scene.attitude is not None:
             turn = geometry.matrix(self.scene.attitude(times)).reshape(-1, 9)
         return _cone.spline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1)), times
-
-
-@value_class
-class Case:
-    """Everything that does not change with the reference.
-
-    Attributes:
-        entry: Fractions of the flight from which the cone and the corridor are required; None: the
-            reference decides.
-        begin_c: (3,) position in {C} where the thrust begins.
-        start: (5,) margins there.
-    """
-
-    sampled: SampledScene
-    limits: Limits
-    params: PlanParams
-    r0: Array
-    v0: Array
-    buffer_m: float
-    coarse: bool = False
-    earliest_s: float = 0.0
-    entry: tuple[float, float] | None = None
-    begin_c: Array = field(init=False)
-    start: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        at, r = np.array([self.params.latency_s]), (self.r0 + self.params.latency_s * self.v0)[None]
-        y = self.sampled.coordinates(at, r)
-        object.__setattr__(self, "begin_c", y[0])
-        found = margins(self.scene, self.limits, y, r, self.sampled.sigma(at))
-        object.__setattr__(self, "start", found.values[0])
-
-    @property
-    def wait_s(self) -> float:
-        """Coasting time before the thrust [s]."""
-        return self.params.latency_s
-
-    @property
-    def a_max(self) -> float:
-        """Largest acceleration in any direction [m/s2]."""
-        return largest_acceleration(self.limits, self.params)
-
-    @property
-    def axes(self) -> Array | None:
-        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each
-        component; None without.
-        """
-        bounds = self.limits.accel_axes_mps2
-        return (
-            None
-            if bounds is None
-            else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
-        )
-
-    def within_axes(self, u: Array) -> bool:
-        """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the
-        base.
-        """
-        bounds = self.limits.accel_axes_mps2
-        return bounds is None or bool(np.all(np.abs(u @ self.limits.base_axes) <= bounds))
-
-    @property
-    def scene(self) -> Scene:
-        """The target."""
-        return self.sampled.scene
 
 
 def largest_acceleration(limits: Limits, params: PlanParams) -> float:

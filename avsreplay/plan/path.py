@@ -46,6 +46,9 @@ class RobotPath(Protocol):
             times: (n,) [s after the instant of planning].
         """
 
+    def u_max(self) -> float:
+        """Return the largest |u| [m/s2]."""
+
 
 @value_class
 class CostatePath:
@@ -180,6 +183,9 @@ class StepPath:
         u: (n, 3) acceleration of each interval in {A} [m/s2].
         latency_s: Coasting time before the first interval [s].
         t_go_s: End of the last interval [s after the instant of planning].
+        escapes: (m, 4) instants of the path [s after the instant of planning], ascending, and the
+            directions in {A} in which the robot withdraws there; None: not planned.
+        short_m: By how much withdrawals miss what is required of them [m].
     """
 
     r0: Array
@@ -187,6 +193,8 @@ class StepPath:
     u: Array
     latency_s: float
     t_go_s: float
+    escapes: Array | None = None
+    short_m: float = 0.0
     _nodes: tuple[Array, Array] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -267,6 +275,60 @@ class StepPath:
         return float(np.max(np.linalg.norm(self.u, axis=1)))
 
 
+@value_class
+class BurnPath:
+    """The robot thrusts with constant acceleration over each of a few intervals, then it coasts.
+
+    Attributes:
+        r0, v0: (3,) position [m] and velocity [m/s] of the robot in {A} at the begin.
+        u: (n, 3) acceleration of each interval in {A} [m/s2].
+        ends: (n,) end of each interval, ascending [s after the begin].
+    """
+
+    r0: Array
+    v0: Array
+    u: Array
+    ends: Array
+
+    @property
+    def t_go_s(self) -> float:
+        """End of the last interval [s after the begin]."""
+        return float(self.ends[-1]) if len(self.ends) else 0.0
+
+    def u_max(self) -> float:
+        """Return the largest |u| [m/s2]."""
+        return float(np.linalg.norm(self.u, axis=1).max(initial=0.0))
+
+    def after(self, since_s: float) -> BurnPath:
+        """Return the rest of the path from ``since_s`` after its begin on."""
+        (r,), (v,) = self.at(np.array([since_s]))
+        left = self.ends > since_s
+        return BurnPath(r, v, self.u[left], self.ends[left] - since_s)
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}.
+
+        Args:
+            times: (n,) [s after the begin].
+        """
+        r, v = self.r0 + times[:, None] * self.v0, np.tile(self.v0, (len(times), 1))
+        for u, begin, end in zip(self.u, np.r_[0.0, self.ends][:-1], self.ends, strict=True):
+            on = np.clip(times, begin, end)[:, None] - begin
+            v = v + on * u
+            r = r + (0.5 * on + np.maximum(times - end, 0.0)[:, None]) * on * u
+        return r, v
+
+    def thrust(self, times: Array) -> Array:
+        """Return the acceleration (n, 3) in {A} [m/s2]; it is zero outside the intervals.
+
+        Args:
+            times: (n,) [s after the begin].
+        """
+        k = np.searchsorted(self.ends, times, side="left")
+        on = (times >= 0.0) & (k < len(self.u))
+        return np.where(on[:, None], np.r_[self.u, np.zeros((1, 3))][k], 0.0)
+
+
 def path_of(plan: Plan, r0: Array, v0: Array) -> RobotPath:
     """Return the path of a plan.
 
@@ -276,7 +338,7 @@ def path_of(plan: Plan, r0: Array, v0: Array) -> RobotPath:
         v0: (3,) its velocity [m/s].
     """
     if plan.thrust is not None:
-        return StepPath(r0, v0, plan.thrust, plan.latency_s, plan.t_go_s)
+        return StepPath(r0, v0, plan.thrust, plan.latency_s, plan.t_go_s, plan.escapes)
     return CostatePath.of(plan, r0, v0)
 
 

@@ -46,7 +46,7 @@ class Limits(Settings):
         None, "Length of the final approach.", unit="m", above=0.0, of_extent=0.06
     )
     mouth_m: float | None = setting(
-        None, "Radius of both cones at the grasp point.", unit="m", above=0.0, of_extent=0.00125
+        None, "Radius of both cones at the grasp point.", unit="m", above=0.0, of_extent=0.005
     )
     speed_max_mps: float | None = setting(
         None, "Largest speed of the robot in {A}.", unit="m/s", above=0.0
@@ -71,6 +71,14 @@ class Limits(Settings):
         unit="m",
         above=0.0,
     )
+    withdrawal_clearance_m: float | None = setting(
+        None,
+        "Smallest distance of the end-effector's centre to the target's surface while the robot"
+        " withdraws.",
+        unit="m",
+        above=0.0,
+        unset="half of clearance_m",
+    )
     clearance_sigmas: float = setting(
         3.0,
         "Multiple of the predicted standard deviation of the surface's position that is added to"
@@ -79,8 +87,8 @@ class Limits(Settings):
     )
     abort: bool = setting(
         True,
-        "Require that the robot keeps the clearance if it aborts at any instant outside the final"
-        " approach cone.",
+        "Require that the robot keeps withdrawal_clearance_m if it withdraws at any instant of a"
+        " plan; from within the final approach cone it does not come nearer.",
     )
     base_m: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0),
@@ -119,7 +127,16 @@ class Limits(Settings):
         """
         if radius_m <= 0.0 or (self.clearance_m is None and self.final_deg is None):
             return self
-        return replace(self, clearance_m=(self.clearance_m or 0.0) + radius_m)
+        kept = self.kept_m + radius_m
+        clearance = (self.clearance_m or 0.0) + radius_m
+        return replace(self, clearance_m=clearance, withdrawal_clearance_m=kept)
+
+    @property
+    def kept_m(self) -> float:
+        """Distance to the surface that a withdrawal keeps [m]."""
+        if self.withdrawal_clearance_m is not None:
+            return self.withdrawal_clearance_m
+        return 0.5 * (self.clearance_m or 0.0)
 
     @property
     def any(self) -> bool:

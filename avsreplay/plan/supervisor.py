@@ -15,11 +15,7 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 from types import MappingProxyType
 
-import numpy as np
-
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array
-from avsreplay.plan.limits import Scene
 from avsreplay.settings import Settings, setting
 
 
@@ -65,7 +61,8 @@ class SupervisorParams(Settings):
     patience_s: float = setting(
         1.5,
         "Time without a healthy scan after which the approach continues only if the prediction is"
-        " within the tolerances up to the end of the plan.",
+        " within the tolerances up to the end of the plan. A hold that is not longer ends no"
+        " attempt.",
         unit="s",
         above=0.0,
     )
@@ -114,6 +111,8 @@ class Facts:
         now_1s_m: 1 sigma of the grasp point's position now [m].
         margin: Smallest margin of the constraints now, negative if one is violated (1 without
             constraints).
+        withdrawal_m: Smallest margin of a withdrawal from now if no further measurement arrives
+            [m]; infinite with a healthy scan.
     """
 
     t_s: float
@@ -127,6 +126,7 @@ class Facts:
     distance_m: float
     now_1s_m: float
     margin: float = 1.0
+    withdrawal_m: float = math.inf
 
 
 @value_class(eq=True)
@@ -274,8 +274,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         "short_gap",
         Action.APPROACH_ON_PREDICTION,
-        (Condition("blind_s", "<=", "patience_s"),),
-        "short gaps are bridged",
+        (Condition("blind_s", "<=", "patience_s"), Condition("withdrawal_m", ">=", 0.0)),
+        "short gaps are bridged while a withdrawal remains safe",
     ),
     Rule("prediction_poor", Action.HOLD, (), "not accurate enough without measurements"),
 )
@@ -334,6 +334,9 @@ class Supervisor:
         )
         moving = memory.moving or rule.action is not Action.STAND_STILL
         begins = rule.action in _CLOSING and memory.action not in _CLOSING
+        since_s = memory.held_since_s  # a hold as short as a gap that is bridged ends no attempt
+        if since_s is not None and facts.t_s - since_s <= self.params.patience_s:
+            begins = False
         after = replace(
             now,
             action=rule.action,
@@ -383,6 +386,7 @@ class Supervisor:
             "healthy_run": float(memory.healthy_run),
             "distance_margin_m": facts.distance_m - self.params.sigmas * facts.now_1s_m,
             "margin": facts.margin,
+            "withdrawal_m": facts.withdrawal_m,
         }
 
     def _holds(self, condition: Condition, measures: Mapping[str, float]) -> bool:
@@ -392,29 +396,3 @@ class Supervisor:
             else condition.bound
         )
         return _COMPARE[condition.compare](measures[condition.measure], bound)
-
-
-def resting(scene: Scene, r: Array, v: Array, least_m: float, a_max: float) -> Scene:
-    """Return the rest point of a hold, a retreat or an abort as the goal of a rendezvous.
-
-    The robot brakes as hard as possible relative to the centre of mass. If it would stop closer to
-    the sphere that contains the target than required, the rest point has this distance, directly
-    away from the target.
-
-    Args:
-        scene: The target now.
-        r: (3,) position of the robot in {A} [m].
-        v: (3,) its velocity [m/s].
-        least_m: Smallest distance to the sphere that contains the target in every attitude [m].
-        a_max: Largest acceleration [m/s2].
-    """
-    centre = scene.centre(np.array([0.0, 1.0]))
-    drift = centre[1] - centre[0]
-    relative, away = v - drift, r - centre[0]
-    distance = float(np.linalg.norm(away))
-    outward = away / distance if distance > 0.0 else np.array([1.0, 0.0, 0.0])
-    least = scene.radius_m + least_m
-    rest = away + relative * np.linalg.norm(relative) / (2.0 * a_max)
-    if float(np.linalg.norm(rest)) < least:
-        rest = outward * max(least, distance)
-    return Scene(lambda t: (centre[0] + rest + t[:, None] * drift, np.tile(drift, (len(t), 1))))
