@@ -19,6 +19,7 @@ from avsreplay.log.options import Loss
 _SQLITE = (sqlite3.Error, OverflowError, ValueError)
 _HEAD = 64  # the first bytes of a cloud message contain its header stamp
 _STEPS = 4096  # rows tried one by one behind a damaged page before the stride doubles
+_COLUMNS = "SELECT * FROM pragma_table_xinfo(?)"  # the last value of a column: whether hidden
 _MAX_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few steps are needed
 
 
@@ -137,17 +138,22 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
         db.text_factory = lambda raw: raw.decode("utf-8", "backslashreplace")
         db.execute("PRAGMA trusted_schema = OFF")
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
+        # A virtual table has no pages of its own; a hidden column is computed when it is read.
         found = {
-            str(name): str(sql).upper()
-            for name, sql in db.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+            str(name): not any(column[6] for column in db.execute(_COLUMNS, (name,)))
+            for (name,) in db.execute(
+                "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
+            ).fetchall()
         }
     except _SQLITE as error:
         raise _unreadable(path, error) from None
     for name in ("topics", "messages"):
-        if name not in found or "VIRTUAL" in found[name] or "GENERATED" in found[name]:
+        if not found.get(name):
             db.close()
             raise UnreadableInput(
-                f"a database without the table '{name}'", where=shown(path), hint="give a ROS 2 bag"
+                f"a database without the table '{name}' of stored values",
+                where=shown(path),
+                hint="give a ROS 2 bag",
             )
     return db
 

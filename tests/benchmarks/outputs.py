@@ -38,6 +38,7 @@ RUN = ("log.mcap", "--init", "truth", "--n-scans", "2")
 # (command, output) -> arguments; OUT is the output, the other words name intact inputs.
 CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("record", "output"): ("scenario.toml", "-o", "OUT", "--overwrite"),
+    ("info", "job_file"): ("log.mcap", "--write", "OUT", "--overwrite"),
     ("run", "output"): (*RUN, "-o", "OUT", "--overwrite"),
     ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
     ("info", "job_file"): ("log.mcap", "--write", "OUT", "--overwrite"),
