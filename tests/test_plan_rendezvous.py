@@ -277,3 +277,11 @@ def test_a_newton_step_solves_the_system_of_the_plane(damping):
         step -= (b @ step) * P
         found = newton_step([*residual], blocks, [*P], [*b], damping)
         np.testing.assert_allclose(found, step, rtol=1e-7, atol=1e-9 * np.abs(step).max())
+
+
+def test_a_capture_hours_ahead_is_found():
+    """From rest to rest over 20,000 km at 0.05 m/s2: 2 sqrt(d / a) = 40,000 s."""
+    goal = lambda t: (np.tile([2e7, 0.0, 0.0], (len(t), 1)), np.zeros((len(t), 3)))  # noqa: E731
+    params = PlanParams(horizon_s=5e4, grid_s=10.0)
+    plan = rendezvous(goal, np.zeros(3), np.zeros(3), params)
+    assert plan.t_go_s == pytest.approx(40_000.0, rel=1e-9)

@@ -25,7 +25,9 @@ from avsreplay.records import Trajectory
 from avsreplay.settings import Settings, setting
 
 MAX_STEPS = 400
-STRETCH_S = 30.0  # the goal is sampled over this time span at once; most captures need no more
+# the goal is sampled over this time span at once, then over ever longer ones; most captures need
+# no more
+STRETCH_S = 30.0
 NEAR_ROOT = (
     1e-2  # where a* exceeds a_max by less than this fraction, Newton's method finishes the search
 )
@@ -249,7 +251,7 @@ def _first_feasible(
     end, t, found = params.horizon_s - params.latency_s, 0.0, None
     begin, steps = 0.0, 0
     while True:
-        stretch = min(begin + STRETCH_S, end)
+        stretch = min(max(begin + STRETCH_S, 2.0 * begin), end)
         sampled = sample_goal(goal, r0, v0, params.latency_s, begin, stretch, params.grid_s)
         if begin == 0.0:
             if _met(sampled):
