@@ -41,7 +41,6 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("info", "job_file"): ("log.mcap", "--write", "OUT", "--overwrite"),
     ("run", "output"): (*RUN, "-o", "OUT", "--overwrite"),
     ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
-    ("info", "job_file"): ("log.mcap", "--write", "OUT", "--overwrite"),
     ("doctor", "output"): ("log.mcap", "--repair", "OUT", "--overwrite"),
     ("plan", "export"): (
         "result",
