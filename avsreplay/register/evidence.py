@@ -55,6 +55,7 @@ PIXELS = 70  # of the image of the model at most, along its longer side
 LEAST_COSINE = 0.2  # of the incidence at which a return is expected
 LEAST_RAYS = 20  # near the model; with fewer a pose is not measured
 NEIGHBOUR_OF_EXTENT = 0.1  # neighbouring rays whose points on the model are nearer share an error
+BEFORE_OF_EXTENT = 0.25  # a return that hides the model is this much nearer, as a rule
 SURFACE_POINTS = 800  # of the model, which bound its image
 LEAST_MEAN, LEAST_SURE = 0.8, 1.0  # of the log likelihood ratio per patch: accepted, ends a search
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
@@ -78,6 +79,8 @@ class Evidence:
         extent_m: of the model.
         away: most points are on faces that face away from the origin, where the sensor may be.
         share: of the returns around the model that are on it.
+        elsewhere: patches that were not measured, up to as many as have returns near the model that
+            are not on it: the surface may be there instead.
     """
 
     on: Array
@@ -92,6 +95,7 @@ class Evidence:
     extent_m: float
     away: bool
     share: float
+    elsewhere: float
 
     @property
     def total(self) -> float:
@@ -101,7 +105,7 @@ class Evidence:
         on = float(self.on.sum())
         spread = np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
         tail = 4.0 * float(self.on[2]) + 9.0 * float(self.on[3])
-        against = (self.beside + self.through) * np.log(CONTRADICTING)
+        against = (self.beside + self.through + self.elsewhere) * np.log(CONTRADICTING)
         return float(
             on * np.log(WRONG_OF_EXTENT / spread) + SHARES * (self._shares - 0.5 * tail) + against
         )
@@ -140,19 +144,23 @@ class Evidence:
 
     @property
     def doubtful(self) -> bool:
-        """Return whether a search goes on, because another pose may have more evidence."""
-        return self.mean < LEAST_SURE
+        """Return whether a search goes on, because another pose may have more evidence.
+
+        That a part of the target is hidden or outside of the scan is no such doubt.
+        """
+        return self.mean - SHARES * self._shares / self.patches < LEAST_SURE
 
     def reason(self, predicted: bool = False) -> str:
         """Return why a pose is not accepted, "" if it is: what speaks most against it.
 
         Args:
             predicted: the pose is the predicted one, so that surface which is hidden or outside of
-                the scan says nothing.
+                the scan says nothing, unless it may be where points off the model are.
         """
         if self.away and self.share < LEAST_ALONE:
             return TURNED_AWAY
-        allowed = -SHARES * self._shares / self.patches if predicted else 0.0
+        hidden = predicted and self.elsewhere <= MOST_MISSING * self.patches
+        allowed = -SHARES * self._shares / self.patches if hidden else 0.0
         if self.mean + allowed >= LEAST_MEAN:
             return ""
         on, spread = float(self.on.sum()), np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
@@ -160,6 +168,8 @@ class Evidence:
             "neighbouring points have the same distance from it": on
             * np.log(spread / RIGHT_OF_EXTENT),
             "points beside the model": -self.beside * np.log(CONTRADICTING),
+            "surface that is not in the scan, and points off the model": -self.elsewhere
+            * np.log(CONTRADICTING),
             "rays that pass through it": -self.through * np.log(CONTRADICTING),
             "the surface in the scan continues beyond the edges of the model, as that of another"
             " or a larger object": -self.continued * np.log(CONTINUES / 0.5),
@@ -289,6 +299,11 @@ class EvidenceModel:
         on = ~through & close & (z < PLANES[-1])
         beside = ~through & ~on & (distance < BESIDE_OF_EXTENT * L)
         hidden = hit & ~through & ~on & ~beside
+        # returns near the model that do not explain its absence elsewhere by hiding it
+        around = np.einsum("ij,ij->i", p - self._middle, p - self._middle) < (AROUND * L) ** 2
+        stray = around & ~(on | beside | through)
+        stray &= ~hidden | (ranges - seen.ranges < BEFORE_OF_EXTENT * L)
+        rays = max(1, int(np.count_nonzero(on | beside | through)))
         kind = np.full(len(p), -1)
         kind[on] = np.searchsorted(PLANES[:-1], z[on], side="right")
         kind[beside], kind[hidden], kind[through] = 4, 5, 6
@@ -321,6 +336,10 @@ class EvidenceModel:
             extent_m=L,
             away=may_be and camera is None,
             share=float(np.mean(on)),
+            elsewhere=min(
+                float(counts[7]),
+                float(counts[:5].sum() + counts[6]) * np.count_nonzero(stray) / rays,
+            ),
         )
 
     def _cast(self, eye: Array, D: Array) -> tuple[Array, Array, Array]:

@@ -264,7 +264,8 @@ class Registrar:
         sure = measured and not doubt[results.index(best)]
         if best.status in ACCEPTED:
             best = self._verified(scan, target, best, budget, carried)
-        if (more and not budget.exhausted) or sure:
+        ambiguous = best.status is AlignStatus.AMBIGUOUS  # which no longer search changes
+        if (more and not budget.exhausted) or sure or ambiguous:
             return best
         return replace(
             best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND
