@@ -521,7 +521,7 @@ def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(
     trimesh.creation.icosphere(subdivisions=2, radius=1.2).export(tmp_path / "ball.stl")
     options = ["--model", tmp_path / "ball.stl", "--init", "auto", "--n-scans", 3, "--json"]
     done = cli("run", fixtures_folder / "tumble.mcap", *options)
-    assert done.code == 0, done.err
+    assert done.code == 1, done.err
     verdict = json.loads(done.out)["verdict"]
     assert verdict["grade"] == "FAIL"
     assert "is it the right model" in verdict["reasons"][0]["text"]

@@ -131,6 +131,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     ("run", "model"): ((("log.mcap", "--model", "IN", *RUN),), MODELS),
     ("run", "truth_file"): ((("scans", "--model", "model.ply", "--truth", "IN", *RUN),), POSES),
     ("run", "robot_file"): ((("log.mcap", "--robot", "IN", *RUN),), ("robot.toml",)),
+    ("run", "task_file"): ((("log.mcap", "--task", "IN", *RUN),), ("task.toml",)),
     ("run", "golden"): ((("log.mcap", "--golden", "IN", *RUN),), ("result/rows.jsonl",)),
     ("info", "source"): ((("IN",), ("IN", "--model", "model.ply")), LOGS),
     ("info", "model"): ((("log.mcap", "--model", "IN"),), MODELS),
@@ -206,6 +207,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     ("config", "log"): ((("IN",),), ("log.mcap", "zstd.mcap")),
     ("config", "config_file"): ((("--config", "IN"),), ("config.toml",)),
     ("config", "robot_file"): ((("--robot", "IN"),), ("robot.toml",)),
+    ("config", "task_file"): ((("--task", "IN"),), ("task.toml",)),
     # Inputs without an option of their own.
     ("run", "measured poses"): (
         (("IN", *MEASURED), ("IN", *MEASURED[:-1])),
@@ -305,6 +307,7 @@ def build(folder: Path) -> None:
         "scenario.toml": SCENARIO,
         "rules.toml": RULES,
         "robot.toml": ROBOT,
+        "task.toml": b"[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
         "dense.toml": SCENARIO.replace("[40, 40]", "[80, 80]"),
         "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml")),
     }
