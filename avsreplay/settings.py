@@ -238,13 +238,13 @@ class Tables:
         return cast(S, dict(self.given).get(name) or kind())
 
     def including(self, name: str, values: Settings) -> Tables:
-        """Return these tables and that of a further part, in the place of one that it had.
+        """Return the tables that change something, and that of a further part.
 
         Args:
             name: Its name.
             values: Its parameters.
         """
-        return Tables(tuple(sorted({**dict(self.given), name: values}.items())))
+        return Tables(tuple(sorted({**dict(self._changed()), name: values}.items())))
 
 
 def declared_of(field: dataclasses.Field[Any]) -> Setting:

@@ -102,9 +102,7 @@ def test_a_known_acceleration_changes_poses_and_velocities_only(tmp_path: Path) 
     assert summary.acceleration is not None
     assert "given" in summary.acceleration
     ignored, _ = rows(tmp_path / "moved.tum", extent_m=2.0)
-    assert (
-        ignored[-1].grasp_pos_1s_m > 10.0 * under[-1].grasp_pos_1s_m
-    )  # without it the poses show a random force
+    assert ignored[-1].pos_1s_m > 1.5 * under[-1].pos_1s_m  # the poses show a random force
 
 
 def test_predictions_contain_the_acceleration() -> None:
