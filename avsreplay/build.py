@@ -124,7 +124,7 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
     """Return the geometry of the target for guidance.
 
     Args:
-        surface: model of the target in {C} [m]; it is indexed at the first distance that is asked
+        surface: model of the target in {C} [m]; it is indexed at the first distance that is needed
             for.
         axis_c: outward axis of the fixture in {C}.
     """

@@ -92,7 +92,7 @@ class Region:
             local = pose.inverse().apply(p[near])
             margin = _MARGIN * self.extent_m
             inside = ((local > self.low - margin) & (local < self.high + margin)).all(axis=1)
-            if 2 * np.count_nonzero(inside) > len(chosen):  # else the prediction is not trusted
+            if 2 * np.count_nonzero(inside) > len(chosen):  # else the prediction is not used
                 chosen = near[inside]
         kept = np.zeros(len(points), bool)
         if len(chosen) < _LEAST:

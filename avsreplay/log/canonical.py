@@ -71,7 +71,7 @@ class Inference:
         finding: what was found, in words.
         evidence: the values from which it follows, or that it was given.
         option: with which it is stated or overridden.
-        grade: "ok", "check" (the user should look at it) or "fail" (refused).
+        grade: "ok", "check" (the user should look at it) or "fail" (the values do not decide).
     """
 
     about: str

@@ -151,7 +151,7 @@ class Evidence:
         return self.mean - SHARES * self._shares / self.patches < LEAST_SURE
 
     def reason(self, predicted: bool = False) -> str:
-        """Return why a pose is not accepted, "" if it is: what speaks most against it.
+        """Return why a pose is not accepted, "" if it is: the term that is most against it.
 
         Args:
             predicted: the pose is the predicted one, so that surface which is hidden or outside of
@@ -226,7 +226,7 @@ class Region:
 
 
 class Observed:
-    """A scan, of which the rays around the places of poses are prepared when they are asked for.
+    """A scan, of which the rays around the places of poses are prepared when they are needed.
 
     Attributes:
         points: (n, 3) in {A} [m].

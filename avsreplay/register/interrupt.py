@@ -1,4 +1,4 @@
-"""The end of long registrations on request: the compiled code asks between parts of its work."""
+"""The end of long registrations on request: the compiled code polls between parts of its work."""
 
 from __future__ import annotations
 
