@@ -297,7 +297,7 @@ def test_a_crop_refers_to_the_frame_of_the_cloud_also_with_a_fixed_frame(own_bag
 def test_background_is_the_first_reason_of_a_run_without_used_scans(cli, own_bag):
     model = ("--model", own_bag / "target.stl", "--model-unit", "mm")
     done = cli("run", own_bag / "own.bag", *model, "--fixed-frame", "map", "--n-scans", 3, "--json")
-    assert done.code == 0, done.err
+    assert done.code == 1, done.err
     verdict = json.loads(done.out)["verdict"]
     assert verdict["grade"] == "FAIL"
     assert "add --crop-range" in verdict["reasons"][0]["text"]
