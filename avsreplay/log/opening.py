@@ -346,9 +346,9 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     metadata = path / BAG_METADATA
     if not metadata.is_file():
         if len({_NUMBERED.sub("", file.name) for file in there}) > 1:
-            named = ", ".join(shown(file.name) for file in there[:3])
+            first = ", ".join(shown(file.name) for file in there[:3])
             raise UnreadableInput(
-                f"{len(there)} logs that are not parts of one bag: {named}",
+                f"{len(there)} logs that are not parts of one bag: {first}",
                 where=shown(path),
                 hint="name one of them",
             )
