@@ -236,8 +236,7 @@ def relative_s(raw: RawCloud, time: PointTime, stamp_ns: int) -> NDArray[np.floa
 
 
 def _bounded(times: Array, limit_s: float) -> Array:
-    with np.errstate(invalid="ignore"):
-        return np.where(np.abs(times) <= limit_s, times, np.nan)
+    return np.where(np.abs(times) <= limit_s, times, np.nan)
 
 
 def _within(value_ns: int, cycle_ns: int) -> int:
