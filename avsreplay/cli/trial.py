@@ -122,9 +122,7 @@ def job_with(source: Path, reading: Mapping[str, Any], options: Sequence[str]) -
     with run_command.make_context("run", [str(source), *words]) as context:
         flags = dict(context.params)
         for name, value in given.items():
-            if name == "start_s":
-                flags["starts"] = (value,)
-            elif name == "poses":
+            if name == "poses":
                 flags["backend"] = "poses" if value else flags["backend"]
             elif flags.get(name) is None:
                 flags[name] = value
