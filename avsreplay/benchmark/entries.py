@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from avsreplay.errors import MissingBackend
-from avsreplay.estimate.params import OWN, PRINTED
 from avsreplay.estimate.plugin import load_method
-from avsreplay.parts import BACKENDS
-from avsreplay.register.backend import available
+from avsreplay.parts import OWN, PRINTED
+from avsreplay.register.backend import load_backend
 
 HORN = "horn"
 SAMPLES = "surface_points=20000"  # of the model; with 100,000 no figure changes, and time doubles
@@ -87,14 +86,13 @@ class Entry:
         Raises:
             UsageError: no back end or estimator has this name.
         """
-        BACKENDS.load(self.variant.backend)
-        states = {state.name: state.installed for state in available()}
         try:
+            load_backend(self.variant.backend)
             if self.estimator not in (OWN, PRINTED):
                 load_method(self.estimator)
         except MissingBackend:
             return "not installed"
-        return "" if states[self.variant.backend] else "not installed"
+        return ""
 
 
 def entries_of(backends: Sequence[str] = (), named: Sequence[str] = ()) -> tuple[Entry, ...]:
