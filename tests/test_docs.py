@@ -38,8 +38,6 @@ SHORT = {
     "AVSREPLAY_SWEEP_LIMIT": "2",
 }  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
-    # of the README
-    "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",
     "avsreplay run long.mcap": (
         "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption"
     ),
@@ -386,7 +384,7 @@ def test_the_glossary_explains_terms_that_occur_and_names_sections_that_exist():
         for cell in re.findall(r"^\| ([^|]+) \| .*[.?] \|$", terms, flags=re.M)
         for term in cell.split(", ")
     ]
-    assert len(named) > 40
+    assert len(named) > 30
     assert [term for term in named if term.lower() not in text] == []
     equations = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
     sections = set(re.findall(r"\| (\d) \|$", symbols, flags=re.M))

@@ -113,7 +113,7 @@ class Requirement(click.ParamType[str | float]):
     help="Initialisation (cold, near, paper) or start time [s].",
 )
 @click.option(
-    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
+    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/equations.md)."
 )
 @source_options
 @pose_options
