@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import Command
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -38,7 +40,7 @@ same libraries, or how far a pose can differ: libraries that stop by their own
 rules may take another number of iterations. See docs/ci.md."""
 
 
-@click.command("backends", epilog=EPILOG)
+@click.command("backends", cls=Command, epilog=EPILOG)
 @click.option(
     "--check",
     "name",
@@ -187,7 +189,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but data was lost."""
 
 
-@click.command("bench", epilog=BENCH_EPILOG)
+@click.command("bench", cls=Command, epilog=BENCH_EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option(
     "--backends",

@@ -8,6 +8,7 @@ import json
 import click
 
 from avsreplay.cli.backends import print_plain_table
+from avsreplay.cli.config import Command
 
 EPILOG = """\b
 Examples:
@@ -16,7 +17,7 @@ Examples:
   avsreplay run tumble.mcap --estimator ekf"""
 
 
-@click.command("estimators", epilog=EPILOG)
+@click.command("estimators", cls=Command, epilog=EPILOG)
 @click.option(
     "--check",
     "name",

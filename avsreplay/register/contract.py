@@ -245,9 +245,8 @@ def repeats(bench: Bench) -> LawResult:
     bits = {
         (run.T_ac.q.tobytes(), run.T_ac.t.tobytes(), run.iterations, run.inliers) for run in runs
     }
-    return LawResult(
-        "runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3"
-    )
+    said = f"{len(bits)} different results of 3" if len(bits) > 1 else "3 equal results"
+    return LawResult("runs repeat to the bit", len(bits) == 1, said)
 
 
 def roughly(bench: Bench) -> LawResult:
