@@ -4,6 +4,7 @@ builds.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -204,8 +205,28 @@ def test_marked_blocks_run_in_order(page, folder):
         kind, _, rest = (block["mark"] or "").partition(":")
         if kind == "file":
             (folder / rest.strip()).write_text(block["text"], encoding="utf-8")
-        elif kind == "run":
+        elif kind == "run" and not _tool(block):
             _run(block, folder)
+
+
+def _tool(block):
+    """The program or module of others that a block needs, "" for none: ``run: needs NAME``."""
+    return (block["mark"] or "").partition("needs ")[2]
+
+
+RECIPES = ROOT / "docs" / "recipes.md"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "block", [b for b in _blocks(RECIPES) if _tool(b)], ids=lambda block: _tool(block)
+)
+def test_a_recipe_runs_with_its_tool(block, folder):
+    tool = _tool(block)
+    if not shutil.which(tool) and importlib.util.find_spec(tool) is None:
+        pytest.skip(f"{tool} is not installed")
+    _run(_blocks(RECIPES)[0], folder)
+    _run(block, folder)
 
 
 def _commands(block):

@@ -451,12 +451,13 @@ def _page() -> Iterator[str]:
         for table, rows in tables.items():
             if table:
                 yield f"### [{table}]\n"
-            yield "| setting | default | range | meaning |\n|---|---|---|---|"
+            yield "| setting | default, range | meaning |\n|---|---|---|"
             yield "\n".join(map(_row, rows)) + "\n"
 
 
 def _row(entry: Entry) -> str:
-    cells = (f"`{entry.key}`", _default(entry), _range(entry), entry.declared.doc)
+    value = ", ".join(part for part in (_default(entry), _range(entry)) if part)
+    cells = (f"`{entry.key}`", value, entry.declared.doc)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -478,7 +479,7 @@ def _default(entry: Entry) -> str:
 def _range(entry: Entry) -> str:
     """The range in short, with the unit: "0 to 1", ">0 m"; names where these are the values."""
     if entry.choices:
-        return ", ".join(f"`{choice}`" for choice in entry.choices)
+        return "of " + "/".join(f"`{choice}`" for choice in entry.choices)
     declared = entry.declared
     lower = f">{declared.above:g}" if declared.above is not None else ""
     lower = f"≥{declared.low:g}" if declared.low is not None else lower
