@@ -16,6 +16,8 @@ from click.testing import CliRunner
 
 from avsreplay.cli.sweep import sweep_command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
+from avsreplay.log import SourceOptions
+from avsreplay.run import Job, Run
 from avsreplay.sweep.campaign import load_campaign
 from avsreplay.sweep.execute import _crashed, run_tasks, write_results
 from avsreplay.sweep.expansion import Task, expand
@@ -292,6 +294,23 @@ def test_recorded_logs_are_swept_as_well(tmp_path):
     said = json.loads(done.output)
     assert [cell["values"]["run.guess"] for cell in said["cells"]] == ["predicted", "last"]
     assert said["status"] == {"ok": 2}
+
+
+@pytest.mark.slow
+def test_a_job_file_is_swept_as_its_log_with_its_options(tmp_path):
+    (tmp_path / "job.toml").write_text(
+        f'log = "{FIXTURES / "tumble.mcap"}"\nset = ["guess=last"]\n[input]\nn_scans = 4\n'
+    )
+    path = tmp_path / "jobs.toml"
+    path.write_text('logs = ["job.toml"]\n')
+    done = sweep(path, tmp_path / "out", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    import pyarrow.parquet as pq
+
+    options, log = SourceOptions(n_scans=4), FIXTURES / "tumble.mcap"
+    with Run(Job(source=log, options=options, assignments=("guess=last",))) as run:
+        expected = [row.rms_m for row in run.rows()]
+    assert pq.read_table(tmp_path / "out" / "scans.parquet").to_pydict()["rms_m"] == expected
 
 
 def test_a_dry_run_only_prints_the_plan(campaign, tmp_path):
