@@ -342,7 +342,8 @@ def test_a_cut_log_is_lossy_and_exit_4_as_in_run(cli, tmp_path):
     data = (FIXTURES / "tumble.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
     (tmp_path / "c.toml").write_text('logs = ["cut.mcap"]\n')
-    assert cli("run", tmp_path / "cut.mcap", "--json").code == DataLost.exit_code
+    replay = cli("run", tmp_path / "cut.mcap", "--json", "--require", "any")
+    assert replay.code == DataLost.exit_code
     done = sweep(tmp_path / "c.toml", tmp_path / "out", "--workers", "0", "--json")
     assert isinstance(done.exception, DataLost)
     assert "1 of 1 run not ok (1 lossy)" in str(done.exception)
