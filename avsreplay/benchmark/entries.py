@@ -32,7 +32,7 @@ class Variant:
     thinned: bool = False
 
 
-# Of 10 and 20 neighbours, and 5,000, 20,000 and 100,000 points, measured on clean-slow and clean-fast.
+# Of 10 and 20 neighbours and 5,000 to 100,000 points, as measured on clean-slow and clean-fast.
 NEAR = "register.small_gicp.neighbours=10"
 VARIANTS = {
     "horn": Variant("horn"),
