@@ -507,7 +507,9 @@ def _slide(browser, k):
 
 
 def _pin(browser, chart="position"):
-    script = "return document.querySelector(arguments[0]).getBoundingClientRect().left"
+    """Place of the marker of the chosen scan in the plot of a chart [px]."""
+    script = """const pin = document.querySelector(arguments[0]);
+    return pin.getBoundingClientRect().left - pin.parentElement.getBoundingClientRect().left"""
     return browser.execute_script(script, f"#chart-{chart} .pin")
 
 
