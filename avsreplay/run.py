@@ -405,7 +405,13 @@ class Run:
             "robot": self.config.robot_line,
             "approach": settings.dump(self.approach),
             "task": self.task.record(),
-            "config": settings.dump(replace(self.config, register=self.config.register.with_own())),
+            "config": settings.dump(
+                replace(
+                    self.config,
+                    register=self.config.register.with_own(),
+                    estimator=self.config.estimator.with_own(),
+                )
+            ),
         }
 
     def _new_stages(self) -> Stages:

@@ -17,14 +17,14 @@ import click
 from avsreplay.cli.config import Command
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from avsreplay.geometry import Pose
+    from avsreplay.parts import LawResult
     from avsreplay.records import Alignment, Surface
     from avsreplay.register.backend import Availability
-    from avsreplay.register.contract import LawResult
     from avsreplay.register.registrar import Registrar
 
     TrueScan = tuple[NDArray[Any], Pose | None]
@@ -61,7 +61,7 @@ def _list(as_json: bool) -> None:
 
     states = available()
     if as_json:
-        _print_json([dataclasses.asdict(state) for state in states])
+        print_json([dataclasses.asdict(state) for state in states])
     else:
         heads = (
             "name",
@@ -86,14 +86,28 @@ def _state_row(state: Availability) -> tuple[str, ...]:
 
 
 def _check(name: str, as_json: bool) -> None:
-    from avsreplay.errors import CheckFailed
     from avsreplay.register.contract import check
 
-    findings = check(name)
+    report_laws("backend", name, check(name), as_json)
+
+
+def report_laws(kind: str, name: str, findings: Sequence[LawResult], as_json: bool) -> None:
+    """Print the laws of a contract and what was found of a part.
+
+    Args:
+        kind: of the part, the key of its name in JSON.
+        name: of the part.
+        findings: of the laws.
+        as_json: print JSON.
+
+    Raises:
+        CheckFailed: a law does not hold.
+    """
+    from avsreplay.errors import CheckFailed
+
     if as_json:
-        _print_json(
-            {"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]}
-        )
+        laws = [dataclasses.asdict(finding) for finding in findings]
+        print_json({kind: name, "findings": laws})
     else:
         print_plain_table(
             f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings)
@@ -109,7 +123,12 @@ def _finding_row(finding: LawResult) -> tuple[str, ...]:
     return finding.law, "yes" if finding.held else "NO", finding.detail
 
 
-def _print_json(value: Any) -> None:
+def print_json(value: Any) -> None:
+    """Print one JSON document.
+
+    Args:
+        value: of plain JSON values.
+    """
     click.echo(json.dumps(value, indent=2))
 
 

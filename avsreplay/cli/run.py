@@ -103,7 +103,7 @@ class Requirement(click.ParamType[str | float]):
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
+    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/equations.md)."
 )
 @source_options
 @pose_options

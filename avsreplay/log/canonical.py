@@ -247,8 +247,10 @@ def coordinates(raw: RawCloud) -> NDArray[Any]:
         size = x.dtype.itemsize
         at = [column.__array_interface__["data"][0] for column in (x, y, z)]
         if at[1] - at[0] == at[2] - at[1] == size:
+            # an explicit byte order, although it is the native one, is not that of plain floats
+            native = x.view(np.float32 if size == 4 else np.float64)
             return np.lib.stride_tricks.as_strided(
-                x, (len(x), 3), (x.strides[0], size), writeable=False
+                native, (len(x), 3), (x.strides[0], size), writeable=False
             )
     kinds = [column.dtype for column in (x, y, z)]
     kind = np.float32 if all(k.kind == "f" and k.itemsize <= 4 for k in kinds) else np.float64
