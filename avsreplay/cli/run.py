@@ -267,9 +267,7 @@ def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
     """Return the log of a job file and put its options into ``flags`` where none is given; any
     other log is returned as it is.
     """
-    if log.suffix != ".toml" or not log.is_file():
-        return log
-    from avsreplay.cli.job import read_job
+    from avsreplay.job_file import read_job
 
     job = read_job(log)
     if job is None:
