@@ -40,6 +40,9 @@ _FIRST_RATE = 3.0  # 1 sigma of the rate before a second pose [rad/s, extents/s]
 # A pose whose error has a smaller probability contradicts the poses before it.
 _LEAST_PROBABILITY = 1e-4
 _LEAST_POSES = 3  # of a track, from which on it judges poses: fewer determine no acceleration
+# A pose nearer to the last one than this share of its claimed 1 sigma, in attitude and position, is
+# no new measurement: independent errors make it so in one of 10^8 poses.
+_REPEATED = 0.1
 _MOST_MISSED = 3  # poses in a row that contradict a track; the next track begins with the last one
 # 3 sigma of a prediction [rad, extents], above which it judges no pose: any one would agree.
 _MOST_PREDICTED = (math.radians(15.0), 0.15)
@@ -225,7 +228,7 @@ class Tracker:
         begun = Kinematics(t_ns, found.T_ac, first[0], first[1])
         if before is None:
             return begun, False
-        if t_ns <= before.t_ns:
+        if t_ns <= before.t_ns or self._repeated(before.T_ac, found.T_ac, variances):
             return before, False
         dt = (t_ns - before.t_ns) * 1e-9
         turn, move = before.turn.after(dt), before.move.after(dt)
@@ -249,6 +252,13 @@ class Tracker:
         if track is None or track.t_ns != t_ns or track.connected:
             return track
         return replace(track, connected=True)
+
+    def _repeated(self, last: Pose, pose: Pose, variances: tuple[float, float]) -> bool:
+        """Whether a pose is the last one again, as that of a sensor that repeats its scan."""
+        turned = float(geometry.angle(geometry.multiply(geometry.conjugate(last.q), pose.q)))
+        moved = float(np.linalg.norm(pose.apply(self.middle) - last.apply(self.middle)))
+        changes = turned, moved / self.extent_m
+        return all(c < _REPEATED * math.sqrt(v) for c, v in zip(changes, variances, strict=True))
 
     def _attitudes(self, before: Kinematics, turn: Bank, dt: float) -> Array:
         """The attitudes (k, 4) after ``dt`` [s]."""

@@ -104,6 +104,18 @@ def test_poses_after_a_jump_are_not_confirmed_until_one_is_used():
     assert all(found[33:])
 
 
+def test_a_pose_that_is_repeated_is_not_confirmed():
+    """As of a sensor that sends its last scan again, while the target moves slowly."""
+    rng, tracker, state = np.random.Generator(np.random.PCG64(9)), Tracker(MIDDLE, EXTENT), None
+    for k in range(20):
+        found = alignment(Pose(geometry.exp([0.0, 0.0, 0.001 * k]), [0.0, 0.001 * k, 5.0]), rng)
+        state, sure = tracker.after(state, round(k / HZ * 1e9), found)
+        state = tracker.used(state, round(k / HZ * 1e9))
+    assert sure
+    again, sure = tracker.after(state, round(2.0 * 1e9), found)
+    assert (again, sure) == (state, False)
+
+
 @pytest.mark.parametrize("status", [AlignStatus.AMBIGUOUS, AlignStatus.DEGENERATE])
 def test_a_pose_that_is_not_determined_is_no_part_of_a_track(status):
     rng, tracker = np.random.Generator(np.random.PCG64(1)), Tracker(MIDDLE, EXTENT)
