@@ -12,11 +12,12 @@ import numpy as np
 
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
-from avsreplay.estimate.params import OWN, Start
+from avsreplay.estimate.params import Start
 from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.parts import OWN
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan._cone import Winding, winding
 from avsreplay.plan.arm import with_arm

@@ -123,7 +123,7 @@ def _grid() -> tuple[Array, Array]:
 def _leak() -> Array:
     """(k, k) probabilities of each filter's noise at a scan by those at the scan before it."""
     one = [_neighbours(len(_ACCELERATIONS)), _neighbours(len(_ERRORS))]
-    return np.kron(*one)
+    return np.asarray(np.kron(*one), dtype=np.float64)
 
 
 def _neighbours(count: int) -> Array:
