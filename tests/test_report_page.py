@@ -261,7 +261,7 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     empty = CliRunner().invoke(
         report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")]
     )
-    assert "holds no row" in str(empty.exception)
+    assert "has no rows" in str(empty.exception)
     missing = CliRunner().invoke(
         report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")]
     )

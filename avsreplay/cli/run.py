@@ -367,8 +367,9 @@ def _replayed(
     listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
-        rows = _resumed(run, keeper) if keeper and wanted.resume else []
-        kept = len(rows)
+        if keeper and wanted.resume:
+            _resume(run, keeper)
+        rows, kept = run.taken, run.done
         listeners += keeper.listeners if keeper else ()
         if run.config.reference.value == "fit" and not kept:
             run.fit_reference(tracked)
@@ -379,7 +380,7 @@ def _replayed(
         )
         if growing and not interrupted and growing.outdated():
             raise Outdated
-        changed = run.rescore(rows) if growing else []
+        changed = run.rescore() if growing else []
         for taker in (viewer, keeper) if changed else ():
             if taker:
                 taker.correct(rows, changed)
@@ -406,19 +407,18 @@ def _replayed(
             text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
             click.echo(f"avsreplay: {text}", err=True)
         if keeper:
-            keeper.finish(rows, record, resumable=interrupted and not growing)
+            keeper.finish(record, resumable=interrupted and not growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
     )
 
 
-def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
-    """The rows of the interrupted run, whose state the open run continues from."""
+def _resume(run: Run, keeper: ResultWriter) -> None:
+    """Let the open run continue from the state of the interrupted one."""
     from avsreplay.cli.main import versions
 
-    rows = keeper.resume({**run.facts(), "versions": versions()})
-    click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
-    return rows
+    keeper.resume({**run.facts(), "versions": versions()})
+    click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
@@ -455,9 +455,13 @@ def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _collect(
-    found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False
+    found: Generator[Row],
+    rows: Sequence[Row],
+    growing: GrowingLog | None = None,
+    *,
+    live: bool = False,
 ) -> bool:
-    """Take all rows; True if the user interrupted the replay after at least one row.
+    """Take all rows, which the run keeps; True if the user interrupted after one or more.
 
     An interrupt takes effect between two scans, so that all results hold the same scans; a second
     one at once. With ``live`` a line is printed for each row.
@@ -472,7 +476,6 @@ def _collect(
             for row in found:
                 if live:
                     say_live(row)
-                rows.append(row)
                 if stopped() and not growing:
                     return True
             return stopped()

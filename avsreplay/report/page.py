@@ -37,6 +37,7 @@ from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of
 from avsreplay.report.view import View, cone_lines, scene, thin_surface
 from avsreplay.rows import Row
+from avsreplay.tables import chosen, column_of, numbers
 
 MOST_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
@@ -159,23 +160,30 @@ def build_page(
     """
     verdict = verdict_of(rows, summary, header)
     kept = charts.most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
-    place, all_rows, rows = {k: n for n, k in enumerate(kept)}, rows, [rows[k] for k in kept]
+    place, all_rows = {k: n for n, k in enumerate(kept)}, rows
+    rows = chosen(rows, np.array(kept, int))
+    stamps = set(column_of(rows, "t_ns"))
     columns = charts.derived(rows)
     t1 = summary.convergence.t1_s
     data = {
         "runs": [
             {
                 "name": title,
-                "t": charts.pack(charts.values(rows, "t_s"), "f8"),
+                "t": charts.pack(numbers(rows, "t_s"), "f8"),
                 "columns": _packed(columns),
             }
         ],
         "charts": charts.charts(columns, truth, (header or {}).get("limits")),
         "spans": charts.spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
-        "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
-        "scans": [row.seq for row in rows],
-        "scene": scene(rows, dict(poses), view),
+        "states": [
+            [gamma, reason, fault or ""]
+            for gamma, reason, fault in zip(
+                *(column_of(rows, name) for name in ("gamma", "reason", "fault")), strict=True
+            )
+        ],
+        "scans": column_of(rows, "seq"),
+        "scene": scene(rows, {t_ns: pose for t_ns, pose in poses if t_ns in stamps}, view),
     }
     errors, faults, manoeuvres, *others = summary_tables(summary, rows)
     picture = approach_picture(rows, view, header or {})
@@ -223,7 +231,7 @@ def build_comparison(
         "runs": [
             {
                 "name": run.name,
-                "t": charts.pack(charts.values(run.rows, "t_s"), "f8"),
+                "t": charts.pack(numbers(run.rows, "t_s"), "f8"),
                 "columns": _packed(own),
             }
             for run, own in zip(runs, columns, strict=True)

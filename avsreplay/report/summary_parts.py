@@ -9,8 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
-from itertools import groupby
-from operator import attrgetter
+from itertools import compress, groupby
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,21 +17,7 @@ from numpy.typing import ArrayLike
 
 from avsreplay.errors import value_class
 from avsreplay.rows import Row
-
-_BLOCK = 256  # rows whose values are taken together, so that they are read from the cache
-
-
-def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
-    """Append the values of some rows to columns.
-
-    Args:
-        table: column name -> its values so far.
-        rows: the next rows.
-    """
-    for begin in range(0, len(rows), _BLOCK):
-        block = rows[begin : begin + _BLOCK]
-        for name, column in table.items():
-            column.extend(map(attrgetter(name), block))
+from avsreplay.tables import column_of
 
 
 @value_class(eq=True)
@@ -172,7 +157,8 @@ def events(
         yield f"the target's velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
-    if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:
+    reasons = (reason == "sensor_bias" for reason in column_of(rows, "reason"))
+    if biased := list(compress(column_of(rows, "t_s"), reasons)):
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
 
 
