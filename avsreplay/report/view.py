@@ -37,6 +37,8 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "faces": ("i4", (3,)),
 }
 
+_CLOUDS = ("cloud_seq", "cloud_size", "cloud_points", "cloud_residual", "cloud_intensity")
+
 Floats = NDArray[np.float32]
 Faces = NDArray[np.int32]
 
@@ -65,9 +67,7 @@ class CloudTable(Sequence[CloudView]):
                 cloud_points, cloud_residual and cloud_intensity.
         """
         file = SpoolFile()
-        self._arrays = arrays or {
-            name: Spool(*_ARRAYS[name], file) for name in _ARRAYS if name.startswith("cloud_")
-        }
+        self._arrays = arrays or {name: Spool(*_ARRAYS[name], file) for name in _CLOUDS}
         self._ends: list[NDArray[np.int64]] = []  # place after the points of each cloud, if known
         for cloud in clouds:
             self.append(cloud)
@@ -211,7 +211,7 @@ def write_view(path: str | Path, view: View) -> None:
     arrays: dict[str, NDArray[Any] | Spool] = {
         "vertices": view.vertices,
         "faces": view.faces,
-        **clouds.arrays,
+        **{name: clouds.arrays[name] for name in _CLOUDS},
         "path_t_ns": np.array([p.t_ns for p in view.paths], dtype=np.int64),
         "path_size": np.array([len(p.points) for p in view.paths], dtype=np.int64),
         "path_points": _joined([p.points for p in view.paths]),
@@ -279,7 +279,7 @@ def _view(arrays: dict[str, Spool]) -> View:
             strict=True,
         )
     )
-    clouds = {name: each for name, each in arrays.items() if name.startswith("cloud_")}
+    clouds = {name: arrays[name] for name in _CLOUDS}
     return View(vertices, faces, CloudTable((), clouds), paths)
 
 
