@@ -29,7 +29,7 @@ from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.settings import SettingError
-from avsreplay.task import Task, patches, target_at, task_of
+from avsreplay.task import Patch, Task, patches, target_at, task_of
 
 INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
@@ -159,19 +159,25 @@ def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]
     return closest
 
 
-def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
+def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
+    """Return flat patches of a model that a straight approach reaches, the largest first.
+
+    Args:
+        surface: model of the target in {C}.
+    """
+    return patches(surface, _signed_distance(surface))
+
+
+def grasp_advice(task: Task, surface: Surface) -> str:
     """Return in words which grasp points could be used in place of one that cannot.
 
     Args:
         task: compared with the model.
         surface: model of the target.
-        axis_c: outward axis of the fixture in {C}.
     """
     if not task.problem:
         return ""
-    closest = target_geometry(surface, axis_c).surface
-    assert closest is not None
-    found = patches(surface, closest)
+    found = grasp_patches(surface)
     if not found:
         return "name one with task.grasp_m and task.axis"
     return f"patches that can be reached: {', '.join(patch.option for patch in found)}"

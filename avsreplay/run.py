@@ -368,7 +368,7 @@ class Run:
             since_ns=first_ns,
             thrust_noise_mps2=robot.thrust_noise * self._stages.guidance.params.a_max_mps2,
             noise=self.flight.noise,
-            advice=grasp_advice(self.task, surface, self.config.fixture_axis_c),
+            advice=grasp_advice(self.task, surface),
         )
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
         given = None if motion is None else (lambda times: motion(times + since_s))
@@ -406,7 +406,13 @@ class Run:
             "robot": self.config.robot_line,
             "approach": settings.dump(self.approach),
             "task": self.task.record(),
-            "config": settings.dump(replace(self.config, register=self.config.register.with_own())),
+            "config": settings.dump(
+                replace(
+                    self.config,
+                    register=self.config.register.with_own(),
+                    estimator=self.config.estimator.with_own(),
+                )
+            ),
         }
 
     def _new_stages(self) -> Stages:

@@ -22,7 +22,7 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import SupervisorParams
 from avsreplay.records import Belief, Surface
-from avsreplay.report.result import load_result, motion_samples
+from avsreplay.report.result import load_result, motion_samples, result_path
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
@@ -128,13 +128,14 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     """Read a result directory.
 
     Args:
-        path: the directory.
+        path: the directory, or one of its files.
         extent_m: diagonal of the target's bounding box [m]; that of the result if None.
 
     Raises:
         UnreadableInput: the path is not a complete result directory.
         UsageError: a setting in it is invalid, or the size of the target is not known.
     """
+    path = path.parent if path.name == "rows.jsonl" and path.is_file() else result_path(path)
     result = load_result(path)
     beliefs = read_beliefs(path / "beliefs.npz")
     if not result.rows or len(beliefs) != len(result.rows):

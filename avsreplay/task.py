@@ -224,6 +224,13 @@ class Patch:
         """The option that selects it."""
         return f"--set task.patch={self.name}"
 
+    @property
+    def text(self) -> str:
+        """Where it lies, how it is oriented and how large it is."""
+        point = ", ".join(f"{x:.4g}" for x in self.point)
+        axis = ", ".join(f"{x:.3g}" for x in self.axis)
+        return f"flat, {1e4 * self.area_m2:.3g} cm2 at ({point}) m, outward normal ({axis})"
+
 
 def task_of(
     params: TaskParams,

@@ -354,8 +354,14 @@ def _dotted(path: Sequence[str | int]) -> str:
 
 
 def _type_name(hint: Any) -> str:
+    """The type of a value in words, for example "a list of 3 numbers"."""
     names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    return names.get(hint, f"a list like {hint}" if typing.get_origin(hint) is tuple else str(hint))
+    if typing.get_origin(hint) is not tuple:
+        return names.get(hint, str(hint))
+    of = typing.get_args(hint)
+    words = {"a number": "numbers", "a whole number": "whole numbers", "text": "texts"}
+    inside = words.get(names.get(of[0], ""), "values")
+    return f"a list of {inside}" if of[-1] is Ellipsis else f"a list of {len(of)} {inside}"
 
 
 def _line_of(text: str, path: Sequence[str | int]) -> int | None:

@@ -17,13 +17,23 @@ import tumbling
 from scipy.stats import multivariate_normal
 
 from avsreplay import geometry
-from avsreplay.estimate import _motion, hypotheses, noise, pose_differences, scan_window
+from avsreplay.estimate import (
+    Estimator,
+    EstimatorParams,
+    _motion,
+    hypotheses,
+    noise,
+    pose_differences,
+    scan_window,
+)
 from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state, with_change
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
 from avsreplay.geometry import Pose
-from avsreplay.records import Belief, Innovation
+from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
+from avsreplay.records import Belief, Innovation, MeasuredPose, ScanStatus
+from avsreplay.register.backend import measured_alignment
 
 CLEAN = surprises.Case("clean", seconds=60.0)
 
@@ -239,6 +249,32 @@ def test_a_bias_before_convergence_does_not_stay() -> None:
     assert max(error for error, _ in result.error[after + 5 :]) < 0.02
     assert result.track is not None
     assert result.track.reinitialised == 1
+
+
+@pytest.mark.slow
+def test_a_body_that_is_driven_back_and_forth_keeps_its_poses_in_order_and_its_levels_finite() -> (
+    None
+):
+    """No free motion: changes are reported one after the other, and the memory of a fit is shorter
+    than the scans that a change is found in.
+    """
+    params = EstimatorParams().at_interval(0.1, 1.5)
+    estimator, track = Estimator(params, None, 1.5), None
+    detector = FaultDetector(FaultParams(), 1.5)
+    for t in (0.1 * np.arange(180)).tolist():
+        turn = geometry.exp(np.array([math.sin(0.9 * t), math.cos(0.7 * t), 0.1 * t]))
+        pose = Pose(turn, np.array([math.sin(t), math.cos(0.3 * t), 5.0 + 0.5 * math.sin(0.2 * t)]))
+        seen = measured_alignment(MeasuredPose(pose, None))
+        track = estimator.initial(0, pose) if track is None else track
+        prior = estimator.predict(track, round(t * 1e9))
+        innovation = estimator.innovate(prior, seen)
+        verdict = detector.judge(ScanStatus.OK, seen, innovation, prior.belief)
+        track, _ = estimator.step(track, prior, innovation, verdict, False)
+        instants = [fix.t_ns for fix in (*track.older, *track.fixes)]
+        assert instants == sorted(set(instants))
+        assert np.isfinite([track.levels.torque, track.levels.force]).all()
+    assert track is not None
+    assert track.manoeuvres
 
 
 def test_a_new_start_fails_no_check() -> None:

@@ -18,15 +18,18 @@ from rosbags.rosbag1 import Writer
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 import avsreplay.model_size
+from avsreplay.build import task_and_target
+from avsreplay.config import RunConfig
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
 from avsreplay.log.canonical import Meaning
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.preflight import preflight
-from avsreplay.records import Scan, ScanStatus
+from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register.contract import view
 from avsreplay.register.sampling import diameter
+from avsreplay.task import TaskParams
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
 
@@ -470,7 +473,7 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
     assert "mirror" not in done.err
     right = cli("run", log, "--model", model_in_mm, "--model-unit", "mm", "--n-scans", 5)
     assert "model-unit" not in right.err.splitlines()[0]
-    assert "5 healthy" in right.out
+    assert "TRACKING PASS." in right.out
 
 
 def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures_folder, tmp_path):
@@ -535,6 +538,25 @@ def test_an_origin_far_outside_of_the_model_is_reported_as_the_grasp_point(
     moved = dataclasses.replace(surface, vertices=vertices, sha256="a")
     advice = [a for a in preflight(Log(_seen(surface)), moved) if a.about == "grasp point"]
     assert [a.option for a in advice] == ["--grasp X,Y,Z"] * reported
+
+
+@pytest.mark.parametrize("usable", [True, False])
+def test_patches_that_a_gripper_reaches_are_proposed(usable):
+    mesh = trimesh.creation.box([1.0, 0.6, 0.4])
+    at = np.array([0.0, 0.0, -0.2] if usable else [0.1, 0.0, 0.0])  # of the origin, along +z
+    body = Surface(mesh.vertices + at, mesh.faces.astype(np.int32), "box", "a")
+    found = preflight(Log([]), body, search=True)
+    at_origin = [a for a in found if a.about == "grasp point"]
+    offered = [a for a in found if a.about.startswith("patch")]
+    assert [a.option for a in at_origin] == ([] if usable else ["--set task.patch=flat-1"])
+    assert len(offered) == 3
+    for advice in offered:
+        name = advice.option.removeprefix("--set task.patch=")
+        config = RunConfig(task=TaskParams(patch=name))
+        task, target = task_and_target(config, body)
+        assert not task.problem
+        away = target.surface(np.linspace(0.01, 1.0, 20)[:, None] * task.axis_c)[1]
+        assert (away > 0.0).all()  # the approach does not meet the body
 
 
 def test_points_far_from_the_origin_of_their_frame_are_named(surface):

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, check_outputs, read_result
+from avsreplay.cli.config import Command
+from avsreplay.cli.options import HTML, PATH, check_outputs, check_suffix, read_result
 from avsreplay.errors import DataLost, UsageError, value_class
 from avsreplay.files import output_text
 from avsreplay.report import gate as gates
@@ -52,7 +53,7 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     ctx.exit()
 
 
-@click.command("compare", epilog=EPILOG)
+@click.command("compare", cls=Command, epilog=EPILOG)
 @click.argument("results", nargs=-1, required=True, type=PATH)
 @click.option(
     "--gate",
@@ -117,6 +118,8 @@ def compare_command(
         )
     check_outputs("junit")
     check_outputs("output", overwrite=overwrite)
+    if output:
+        check_suffix(output, *HTML)
     rules = gates.load_rules(gate) if gate else ()
     groups = _with_distinct_names([_group(path) for path in results])
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,23 +13,21 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from avsreplay.errors import UsageError
+
 if TYPE_CHECKING:
     from avsreplay.settings import Entry
 
 F = TypeVar("F", bound=Callable[..., Any])
 CONFIG = "avsreplay.config:RunConfig"
-METHOD = {
-    "no_deskew",
-    "config_file",
-    "robot_file",
-    "assignments",
-    "starts",
-    "paper",
-    "init",
-}  # names of parameters
+SOURCE = "avsreplay.log.options:SourceOptions"
+# names of parameters that are settings of a run, besides those that have an option of their own
+METHOD = {"no_deskew", "config_file", "robot_file", "task_file", "assignments", "paper", "init"}
+RARE = ("policy", "guess", "reference")  # of ASSIGNED: not in the short help
 ASSIGNED = {
     "backend": "register.backend",
     "estimator": "estimator.method",
+    "start_mode": "estimator.start",
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",
@@ -75,13 +74,25 @@ class _Choice(click.ParamType[str]):
 
 
 class SettingOption(click.Option):
-    """An option for one setting. ``owner`` is ``module:class``; ``key`` is the parameter's
-    name where not given.
+    """An option for one setting.
+
+    Attributes:
+        owner: class that declares the setting, as ``module:class``.
+        key: its dotted key; the parameter's name where not given.
+        common: whether the short help of a command lists it.
     """
 
-    def __init__(self, names: list[str], owner: str = CONFIG, key: str = "", **more: Any) -> None:
+    def __init__(
+        self,
+        names: list[str],
+        owner: str = CONFIG,
+        key: str = "",
+        *,
+        common: bool = True,
+        **more: Any,
+    ) -> None:
         super().__init__(names, **more)
-        self.owner, self.key = owner, key or str(self.name)
+        self.owner, self.key, self.common = owner, key or str(self.name), common
         if more.get("type") is None and not self.is_flag:
             self.type = _Choice(self.owner, self.key)
 
@@ -96,25 +107,89 @@ class SettingOption(click.Option):
         return super().get_help_record(ctx)
 
 
-class SectionedCommand(click.Command):
+def _print_full_help(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if not wanted or ctx.resilient_parsing:
+        return
+    ctx.meta[_FULL] = True
+    click.echo(ctx.get_help(), color=ctx.color)
+    ctx.exit()
+
+
+_FULL = "avsreplay.full_help"  # in the meta of a context: print every option in full
+_CLAUSE = re.compile(r"[.:;] | \(")  # where the first clause of a description ends
+
+
+class Command(click.Command):
     """A command whose help lists the settings of a run, and those of the input, apart from its
     other options.
+
+    The short help has the first clause of each description and the most common settings;
+    ``--help-all`` has everything.
     """
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        if any(map(_is_rare, self.params)):
+            full = click.Option(
+                ["--help-all"],
+                is_flag=True,
+                is_eager=True,
+                expose_value=False,
+                callback=_print_full_help,
+                help="Show every option in full.",
+            )
+            self.params.append(full)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; one that is too much is refused with the option that takes it."""
+        ctx.allow_extra_args = True
+        left = []
+        try:
+            left = super().parse_args(ctx, list(args))
+        except click.MissingParameter:
+            left = self.make_parser(ctx).parse_args(list(args))[1]
+            if not left:
+                raise
+        if left and not ctx.resilient_parsing:
+            what = f"the argument '{left[0]}' is one too many"
+            raise UsageError(what, where=ctx.info_name, hint=self._place_of(left[0], ctx))
+        return left
+
+    def _place_of(self, extra: str, ctx: click.Context) -> str:
+        options = {name for param in self.params for name in param.opts}
+        if "=" in extra and "--set" in options:
+            return f"change a setting with --set {extra}"
+        if "-o" in options and ctx.params.get("output") is None:
+            return f"name the output with -o {extra}"
+        return f"see '{ctx.command_path} --help'"
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, each under the heading of its section."""
-        sections: dict[str, list[tuple[str, str]]] = {}
+        full = ctx.meta.get(_FULL, False)
+        sections: dict[str, list[tuple[str, str]]] = {"Options": [], "Method": [], "Input": []}
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
-            if record is not None:
-                sections.setdefault(_section(param), []).append(record)
+            if record is None or not isinstance(param, click.Option):
+                continue
+            if full or not (_is_rare(param) or param.name == "help_all"):
+                text = record[1] if full else _CLAUSE.split(record[1])[0].removesuffix(".")
+                sections[_section(param)].append((record[0], text))
+        rare = 0 if full else sum(map(_is_rare, self.params))
+        if rare:
+            last = next(title for title in reversed(sections) if sections[title])
+            sections[last].append(("--help-all", f"{rare} more options, and all in full"))
         for title, records in sections.items():
-            with formatter.section(title):
-                formatter.write_dl(records)
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
+def _is_rare(param: click.Parameter) -> bool:
+    return not getattr(param, "common", True)
 
 
 def _section(param: click.Parameter) -> str:
-    if isinstance(param, SettingOption) and param.owner != CONFIG:
+    if isinstance(param, SettingOption) and param.owner == SOURCE:
         return "Input"
     method = isinstance(param, SettingOption) or param.name in METHOD
     return "Method" if method else "Options"
@@ -126,10 +201,11 @@ def setting_option(*names: str, **more: Any) -> Callable[[F], F]:
 
 
 def source_setting(*names: str, **more: Any) -> Callable[[F], F]:
-    """Decorator: an option for one setting of how a source is read."""
+    """Decorator: an option for one setting of how a source is read, by default a rare one."""
+    more.setdefault("common", False)
     if "is_flag" in more:
         more.setdefault("default", None)
-    return setting_option(*names, owner="avsreplay.log.options:SourceOptions", **more)
+    return setting_option(*names, owner=SOURCE, **more)
 
 
 def _variable(name: str) -> str:
@@ -143,7 +219,7 @@ def robot_option(**more: Any) -> Callable[[F], F]:
         "--robot",
         "robot_file",
         type=file,
-        help="TOML file that describes the robot in a table [robot].",
+        help="TOML file with a table [robot].",
         **more,
     )
 
@@ -154,10 +230,11 @@ def run_settings(command: F) -> F:
     """
     options = [
         setting_option(
-            f"--{name}",
+            f"--{name.replace('_', '-')}",
             key=key,
             envvar=_variable(name),
             metavar={"init": "log|truth|auto|POSE", "region": "X,Y,Z"}.get(name),
+            common=name not in RARE,
         )
         for name, key in ASSIGNED.items()
     ]
@@ -167,14 +244,14 @@ def run_settings(command: F) -> F:
             "--no-deskew",
             is_flag=True,
             envvar=_variable("no_deskew"),
-            help="Do not correct scans for the motion of the target while they were taken.",
+            help="Do not move points to one instant: the motion while a scan is taken is ignored.",
         ),
         click.option(
             "--config",
             "config_file",
             type=file,
             envvar=_variable("config"),
-            help="TOML file with settings, in the form that 'avsreplay config' prints.",
+            help="TOML file with settings: the form that 'avsreplay config' prints.",
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
@@ -182,7 +259,7 @@ def run_settings(command: F) -> F:
             "task_file",
             type=file,
             envvar=_variable("task"),
-            help="TOML file that describes what is grasped in a table [task], and perhaps [robot].",
+            help="TOML file with a table [task]: what is grasped, and perhaps a table [robot].",
         ),
         click.option(
             "--set",
@@ -231,8 +308,8 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():
-        value = flags.pop(name)
-        put(name, [] if value is None else [f"{key}={toml_value(value)}"], f"--{name}", value)
+        value, option = flags.pop(name), f"--{name.replace('_', '-')}"
+        put(name, [] if value is None else [f"{key}={toml_value(value)}"], option, value)
     return flags.pop("config_file"), (*by_source[False], *by_source[True])
 
 
@@ -283,7 +360,7 @@ SECTIONS = (
 )
 
 
-@click.command("config", cls=SectionedCommand, epilog=EPILOG)
+@click.command("config", cls=Command, epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path), required=False)
 @run_settings
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")

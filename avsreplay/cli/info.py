@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand, source_setting
+from avsreplay.cli.config import Command, source_setting
 from avsreplay.cli.options import (
     check_outputs,
     pose_options,
@@ -39,7 +39,7 @@ Examples:
   avsreplay info drive.bag --json"""
 
 
-@click.command(name="info", cls=SectionedCommand, epilog=EPILOG)
+@click.command(name="info", cls=Command, epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @source_options
 @pose_options
@@ -353,7 +353,7 @@ Examples:
   avsreplay doctor x.mcap --repair clean.mcap"""
 
 
-@click.command(name="doctor", epilog=DOCTOR_EPILOG)
+@click.command("doctor", cls=Command, epilog=DOCTOR_EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--topic", help="The cloud topic, if there are several.")
 @click.option(

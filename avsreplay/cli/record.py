@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import (
+    HTML,
     PATH,
     check_binary_output,
     check_outputs,
@@ -44,7 +45,7 @@ Examples:
 KINDS = "Kinds of fault with their default strengths (docs/scenario.md describes them):"
 
 
-class RecordCommand(SectionedCommand):
+class RecordCommand(Command):
     """``record``, whose help lists the kinds of fault."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -200,7 +201,7 @@ def _format_of(output: Path, kind: str | None) -> str:
     return kind
 
 
-@click.command("export", epilog=EXPORT_EPILOG)
+@click.command("export", cls=Command, epilog=EXPORT_EPILOG)
 @click.argument("result", type=PATH)
 @click.option(
     "--to",
@@ -270,7 +271,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 
-@click.command("report", epilog=REPORT_EPILOG)
+@click.command("report", cls=Command, epilog=REPORT_EPILOG)
 @click.argument("result", type=PATH)
 @click.option(
     "-o",
@@ -287,6 +288,7 @@ def report_command(result: Path, output: Path | None, title: str | None, overwri
     slider, tables, and the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
+    check_suffix(page, *HTML)
     check_output(page, overwrite=overwrite, inputs=[result])
     click.echo(write_page(result, page, title), err=page == STDOUT)
 

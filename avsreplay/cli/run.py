@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand, run_settings, take_run_settings
+from avsreplay.cli.config import Command, run_settings, take_run_settings
 from avsreplay.cli.options import (
     PATH,
-    StartMode,
     check_outputs,
     given_paths,
     log_file,
     pose_options,
     read_options,
     report_losses,
+    source_options,
 )
-from avsreplay.cli.options import run_source_options as source_options
 from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
@@ -43,11 +42,9 @@ GRADES = ("pass", "check", "any")
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
-  avsreplay run y.mcap --model m.ply --topic /points -o results/ \\
-      --truth-topic /truth/pose --init truth
+  avsreplay run y.mcap --model m.ply -t /points -o results/ --init truth
   avsreplay record scenario.toml -o - | avsreplay run -
-  avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
-  avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json
+  avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02
   avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
@@ -102,16 +99,9 @@ class Requirement(click.ParamType[str | float]):
         return least
 
 
-@click.command("run", cls=SectionedCommand, epilog=EPILOG)
+@click.command("run", cls=Command, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @run_settings
-@click.option(
-    "--start",
-    "starts",
-    type=StartMode(),
-    multiple=True,
-    help="Initialisation (cold, near, paper) or start time [s].",
-)
 @click.option(
     "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
 )
@@ -127,18 +117,16 @@ class Requirement(click.ParamType[str | float]):
     "-o",
     "--output",
     type=PATH,
-    help="Write rows, trajectories, beliefs and settings to this directory.",
+    help="Result directory: rows, trajectories, beliefs and settings.",
 )
 @click.option(
     "--report",
     "page",
     is_flag=True,
-    help="Add the HTML page, report.html, to the result directory.",
+    help="Also write the page report.html.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
-@click.option(
-    "--resume", is_flag=True, help="Continue the interrupted run in the result directory."
-)
+@click.option("--resume", is_flag=True, help="Continue an interrupted run in the directory.")
 @click.option(
     "--follow",
     is_flag=True,
@@ -149,9 +137,11 @@ class Requirement(click.ParamType[str | float]):
     "--require",
     "required",
     type=Requirement(),
+    metavar="GRADE|capture=P",
     multiple=True,
-    help="Exit with code 1 if the verdict is worse, or the capture is less probable (capture=0.9)."
-    " Without it FAIL gives code 1; any accepts every verdict. May be repeated.",
+    help="Exit code 1 if the verdict is worse: pass, check or any, or capture=0.9 for the least"
+    " probability of a capture. Without it FAIL gives code 1; any accepts every verdict. May be"
+    " repeated.",
 )
 @click.option(
     "--tables",
@@ -161,9 +151,10 @@ class Requirement(click.ParamType[str | float]):
     help="Print more tables: verdict, moments, capture, scans, curves, errors, faults, manoeuvres,"
     " parameters, consistency, run.",
 )
+@click.option("-v", "--verbose", is_flag=True, help="Print all tables, as --tables all.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
-@click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
+@click.option("--plain", is_flag=True, help="Leave out curves of errors and flagged scans.")
 @click.option(
     "--rerun",
     "to_rerun",
@@ -171,14 +162,16 @@ class Requirement(click.ParamType[str | float]):
     help="Show the run in Rerun (extra 'rerun').",
 )
 def run_command(log: Path, **flags: Any) -> None:
-    """Replay LOG through registration, filter, fault detector and planner, and print the tables.
+    """Replay LOG: an MCAP file, a ROS bag, a folder of scans, a job file, or - for standard input.
 
-    LOG is an MCAP file, a ROS bag, a folder of scans, or a job file with a log and its options. A
-    log written by 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model
-    FILE' names the options that it needs, and --write stores them as a job file.
-    If LOG is -, an MCAP file is read from standard input, and each scan is replayed as soon as it
-    is complete; --follow does the same with a file that is still being written. The results are
-    those of a replay of the complete log. \f Raises:
+    A log of 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model FILE'
+    names the options that it needs, and --write stores them as a job file.
+
+    \f
+    A log from standard input, or one that --follow reads while it is written, is replayed scan by
+    scan; the results are those of a replay of the complete log.
+
+    Raises:
         UsageError: options contradict each other.
     """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
@@ -239,6 +232,7 @@ class Wanted:
     follow: bool
     as_json: bool
     tables: tuple[str, ...]
+    verbose: bool
     table_every: int | None
     table_all: bool
     plain: bool
@@ -280,9 +274,6 @@ def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
     if job is None:
         return log
     given = {**job.given, "golden": job.golden, "config_file": job.config}
-    start_s = given.pop("start_s", None)
-    if start_s is not None and not any(isinstance(each, float) for each in flags["starts"]):
-        flags["starts"] = (*flags["starts"], start_s)
     for name, value in given.items():
         if flags.get(name) is None:
             flags[name] = value
@@ -307,13 +298,10 @@ def job_of(log: Path, flags: dict[str, Any]) -> Job:
     of_file = tuple(flags.pop("assigned", ()))
     config_file, assignments = take_run_settings(flags)
     assignments = (*of_file, *assignments)
-    starts = flags.pop("starts")
     if flags.pop("paper"):
         from avsreplay.config import PAPER
 
         assignments = PAPER + assignments
-    assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
-    flags["start_s"] = next((start for start in reversed(starts) if isinstance(start, float)), None)
     return Job(
         source=log, options=read_options(flags), config_file=config_file, assignments=assignments
     )
@@ -485,21 +473,32 @@ def _collect(
         return True
 
 
+def _changed(run: Run) -> list[str]:
+    """The settings that differ from their defaults; one that the user has not given says so."""
+    from avsreplay.config import load_config
+    from avsreplay.report.compare import changed_settings
+
+    given = load_config(run.job.config_file, {}, run.job.assignments)
+    stated = set(changed_settings(run.job.options, given))
+    all_of_run = changed_settings(run.job.options, run.config)
+    return [
+        text if text in stated else text.removesuffix(")") + "; by the log)" for text in all_of_run
+    ]
+
+
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
     from avsreplay.cli.main import versions
-    from avsreplay.report.compare import changed_settings
     from avsreplay.report.result import facts_record
     from avsreplay.settings import dump
 
     header = run.source.header
     labels = header.labels if header.labels or header.seed is not None else None
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
-    changed = changed_settings(run.job.options, run.config)
     limits = dump(run.config.faults.resolved(run.surface.extent))
     return {
         **run.facts(),
         "limits": limits,
-        "changed_settings": changed,
+        "changed_settings": _changed(run),
         "facts": facts,
         "versions": versions(),
     }
@@ -511,10 +510,11 @@ def _print(wanted: Wanted, done: _Finished) -> None:
 
         click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
         return
-    from avsreplay.report.summary_tables import print_screen, print_tables
+    from avsreplay.report.summary_tables import TABLES, print_screen, print_tables
     from avsreplay.report.table import make_console
 
-    console, names = make_console(), set(wanted.tables)
+    console = make_console()
+    names = set(TABLES if wanted.verbose else wanted.tables)
     if wanted.table_all or wanted.table_every:
         names.add("scans")
     print_screen(console, done.rows, done.verdict)

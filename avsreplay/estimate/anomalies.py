@@ -388,7 +388,8 @@ class AnomalyTest:
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
         mode = "filter" if track.mode == "filter" else "fit"
-        older = (*track.older, *(f for f in track.fixes if f.t_ns <= t_ns))[-MOST_FIXES:]
+        poses = *track.older, *track.fixes  # a short memory leaves out poses after the change too
+        older = tuple(f for f in poses if f.t_ns <= t_ns)[-MOST_FIXES:]
         anew = anew.changed(fixes=fixes, older=older, prior=prior, prior_ns=t_ns)
         return anew.changed(belief=result.belief, mode=mode, batch=result)
 

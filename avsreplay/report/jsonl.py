@@ -138,7 +138,7 @@ def _records(block: bytes, path: str | Path, first: int) -> Iterator[tuple[str, 
 
 
 def _parse(line: bytes, where: str) -> dict[str, Any]:
-    hint = "name a directory written by run -o, or its rows.jsonl"
+    hint = "name the directory that 'avsreplay run LOG -o DIR' writes"
     if len(line) > _MAX_LINE:
         raise UnreadableInput("a line longer than 1 MiB, not a row", where=where, hint=hint)
     record = parse_json(line, where=where, hint=hint)

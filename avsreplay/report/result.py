@@ -152,6 +152,15 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def result_path(path: Path) -> Path:
+    """Return the directory of a result for any of its files but the rows; other paths as they
+    are.
+    """
+    folder = path.parent
+    inside = path.is_file() and path.name in ("run.json", "beliefs.npz", "view.npz", "result.mcap")
+    return folder if inside and (folder / "rows.jsonl").is_file() else path
+
+
 def load_result(path: str | Path) -> Result:
     """Read a result directory, or a single ``rows.jsonl``, and verify its files against
     ``run.json``.
@@ -167,11 +176,13 @@ def load_result(path: str | Path) -> Result:
         UnreadableInput: a file is missing, damaged, or differs from the size, SHA-256 or number of
             rows in run.json.
     """
-    path = Path(path)
+    path = result_path(Path(path))
     folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
     if folder and not rows_path.is_file():
         raise UnreadableInput(
-            "holds no rows.jsonl", where=str(path), hint="name a directory written by run -o"
+            "holds no rows.jsonl",
+            where=str(path),
+            hint="name the directory that 'avsreplay run LOG -o DIR' writes",
         )
     whole = folder or (
         path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None

@@ -143,7 +143,7 @@ def print_tables(
 
 
 def verdict_table(verdict: RunVerdict) -> Table:
-    """Reasons, first pose, robot and changed settings, as on terminal and page."""
+    """Reasons, first pose, robot and the settings that differ from their defaults."""
     marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
     rows: list[tuple[str | TableCell, ...]] = [
         ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
@@ -153,7 +153,7 @@ def verdict_table(verdict: RunVerdict) -> Table:
         rows.append(("task", verdict.task))
     if verdict.robot:
         rows.append(("robot", verdict.robot))
-    rows += [("changed setting", text) for text in verdict.changed] or [
+    rows += [("setting", text) for text in verdict.changed] or [
         ("settings", "all at their defaults")
     ]
     return Table("Verdict", ("what", "value"), tuple(rows), align="l")
