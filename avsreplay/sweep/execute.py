@@ -25,6 +25,7 @@ import numpy as np
 from avsreplay import __version__, settings, toml_document
 from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
 from avsreplay.files import output_text
+from avsreplay.job_file import JobFile, read_job
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import lost_text
 from avsreplay.plan.arm import with_arm
@@ -68,8 +69,7 @@ def log_of(task: Task, folder: Path) -> Path:
 
 
 def _replayed(task: Task, log: Path) -> RunResult:
-    options = SourceOptions(model=Path(task.model)) if task.log and task.model else SourceOptions()
-    with Run(Job(source=log, options=options, assignments=task.assignments, prefetch=0)) as run:
+    with Run(_job(task, log)) as run:
         length_m = settings.given(run.config.faults.resolved(run.surface.extent).length_m)
         lines: list[tuple[Any, ...]] = []
 
@@ -89,6 +89,18 @@ def _replayed(task: Task, log: Path) -> RunResult:
         if what := lost_text(run.source.losses, run.source.damaged, len(run)):
             return RunResult(task.id, "lossy", what, *found)
         return RunResult(task.id, "ok", None, *found)
+
+
+def _job(task: Task, log: Path) -> Job:
+    """The run of a log, or of a job file, whose golden file is not used."""
+    job = JobFile(log=log, given={}) if (found := read_job(log)) is None else found
+    given = dict(job.given) | ({"model": Path(task.model)} if task.log and task.model else {})
+    return Job(
+        source=job.log,
+        options=SourceOptions(**given),
+        config_file=job.config,
+        assignments=(*job.assignments, *task.assignments),
+    )
 
 
 def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, Any]:
