@@ -214,7 +214,8 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
-        click.echo(done.verdict.line, err=True)
+        if wanted.as_json or not sys.stdout.isatty():  # else it stands above the table already
+            click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
 
