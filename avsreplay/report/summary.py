@@ -202,17 +202,13 @@ class Summary:
             faults=account(marks, labels),
             coasts=tuple(coasts(marks)),
             parameters=parameters(last, truth) if last else (),
-            sigma_hits=last.sigma_hits if last else None,
-            r_floors=last.r_floors if last else None,
+            **{name: getattr(last, name, None) for name in _COUNTED},
             weighed_down=sum(
                 w is not None and w < 1.0
                 for w in compress(taken["cauchy_weight"], map(not_, flagged))
             ),
-            reinitialised=last.reinitialised if last else None,
-            manoeuvres=last.manoeuvres if last else None,
             velocity_changes=VelocityChange.of(taken),
             drift=Drifting.of(last) if last else None,
-            violations=last.violations if last else None,
             nis=_share(figures["nis/healthy"], NIS_BAND),
             nees=_share(figures["nees"], NEES_BAND),
             nees_blocks=_blocks(figures),
@@ -231,6 +227,10 @@ class Summary:
     def longest_coast(self) -> Coast | None:
         """The longest interval without a measurement (the first of equals)."""
         return max(self.coasts, key=lambda c: c.duration_s, default=None)
+
+
+_COUNTED = ("sigma_hits", "r_floors", "reinitialised", "manoeuvres", "violations")
+"""Columns that count since the first scan: those of the last row are those of the run."""
 
 
 def _figures(taken: Columns) -> dict[str, Array]:
