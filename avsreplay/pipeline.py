@@ -8,6 +8,7 @@ fit. Nothing here has access to ground truth.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -235,6 +236,7 @@ class PipelineState:
         origin: where the first pose came from.
         followed: the target, where a region follows it.
         start_ns: instant of the first scan.
+        content: digest of the points or the pose of the last scan that had any.
     """
 
     monitors: MonitorState
@@ -245,6 +247,7 @@ class PipelineState:
     start_ns: int = 0
     failed: tuple[Array, ...] = ()
     followed: Followed | None = None
+    content: bytes = b""
 
     @property
     def captured_ns(self) -> int | None:
@@ -263,17 +266,19 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     Returns:
         The state after the scan and the outcome of the scan.
     """
+    content = _content(scan)
+    repeated = bool(content) and content == state.content
     scan, followed = _in_region(stages, state, scan)
     state, track, acquired = _track(stages, state, scan)
     errors, predicted = track.errors, stages.estimator.predict(track, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+    prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     if acquired is None and not verdict.gamma and _prediction_lost(stages, scan, predicted):
         measurement = _acquire(
             stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired"
         )
-        prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+        prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     track, verdict = stages.estimator.step(
         track, prior, innovation, verdict, state.monitors.convergence.converged
     )
@@ -319,7 +324,15 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     failed = _failed(state, scan) if pose is None else ()
     return (
         PipelineState(
-            monitors, guidance, track, pose, state.origin, state.start_ns, failed, followed
+            monitors,
+            guidance,
+            track,
+            pose,
+            state.origin,
+            state.start_ns,
+            failed,
+            followed,
+            content or state.content,
         ),
         outcome,
     )
@@ -439,6 +452,16 @@ def _effort(state: PipelineState, scan: Scan) -> Effort:
     return effort_for(shown(scan.points), state.failed)
 
 
+def _content(scan: Scan) -> bytes:
+    """Digest of the points or the pose of a scan, empty where it has none."""
+    if scan.pose is not None:
+        T_ac = scan.pose.T_ac
+        return T_ac.q.tobytes() + T_ac.t.tobytes()
+    if not len(scan.points):
+        return b""
+    return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).digest()
+
+
 def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:
     """What the scans without an accepted pose showed whose searches found none, with this scan."""
     seen = shown(scan.points)
@@ -458,7 +481,11 @@ def _measurement(
 
 
 def _judge(
-    stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
+    stages: Stages,
+    scan: Scan,
+    predicted: Prediction,
+    measurement: Measurement,
+    repeated: bool,
 ) -> tuple[Prediction, Innovation | None, Verdict]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured)
     and the verdict.
@@ -471,7 +498,7 @@ def _judge(
     return (
         predicted,
         innovation,
-        stages.faults.judge(scan.status, alignment, innovation, predicted.belief),
+        stages.faults.judge(scan.status, alignment, innovation, predicted.belief, repeated),
     )
 
 

@@ -21,6 +21,10 @@ from avsreplay.rows import Row
 
 _BLOCK = 256  # rows whose values are taken together, so that they are read from the cache
 
+# changes of the velocity from which a motion is not called free: a free target is pushed, or
+# manoeuvres, once or twice in a log; one that is towed, on a cable or in strong drag changes always
+_NOT_FREE = 3
+
 
 def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
     """Append the values of some rows to columns.
@@ -159,7 +163,7 @@ def times(count: int) -> str:
 def events(
     rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None
 ) -> Iterator[str]:
-    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
+    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, errors.
 
     Args:
         rows: all rows of the run.
@@ -169,11 +173,15 @@ def events(
     if manoeuvres:
         clearest = max(manoeuvres, key=lambda m: m.significance)
         count = "" if len(manoeuvres) == 1 else f" {times(len(manoeuvres))}, most significantly"
-        yield f"the target's velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
+        often = len(manoeuvres) >= _NOT_FREE
+        whose = "the target does not move freely: its" if often else "the target's"
+        yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
     if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
+    if frozen := [row.t_s for row in rows if row.reason == "frozen"]:
+        yield f"the sensor repeated a scan {times(len(frozen))}, first at {frozen[0]:.1f} s"
 
 
 @value_class(eq=True)
