@@ -11,9 +11,9 @@ import pytest
 from log_cases import SECOND
 from mcap.writer import Writer
 
-from avsreplay.cli.job import job_text, read_job
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Pose
+from avsreplay.job_file import job_text, read_job
 from avsreplay.log import LogWriter, SourceOptions
 from avsreplay.log.cdr import point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import surface_bytes

@@ -65,6 +65,6 @@ def test_the_tests_and_modules_that_the_documentation_names_exist():
     assert {name for name in named if f"def {name}(" not in code} == set()
     files = set(re.findall(r"`(?:tests/)?(test_\w+\.py|benchmarks/\w+\.py)\b", pages))
     assert {name for name in files if not (ROOT / "tests" / name).exists()} == set()
-    packages = "cli|estimate|log|monitor|plan|reconstruct|register|report|simulate|sweep"
+    packages = "benchmark|cli|estimate|log|monitor|plan|reconstruct|register|report|simulate|sweep"
     modules = set(re.findall(rf"`(?:avsreplay/)?((?:{packages})/[\w/]+\.\w+)`", pages))
     assert {name for name in modules if not (ROOT / "avsreplay" / name).exists()} == set()

@@ -99,7 +99,7 @@ def compare_command(
 
     RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the
     baseline. A folder of several results (one per seed) is compared run by run with the baseline's
-    runs of the same names.
+    runs of the same names. Two files benchmark.json are compared run by run.
 
     Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 %
     bootstrap intervals of the paired difference. A figure of two runs that has no interval is
@@ -112,6 +112,9 @@ def compare_command(
         UnreadableInput: a result or the rules cannot be read.
         CheckFailed: a rule of the gate is broken.
     """  # noqa: D301
+    if all(path.suffix == ".json" for path in results):
+        _compare_benchmarks(results, as_json, as_markdown)
+        return
     if (junit or github) and not gate:
         raise UsageError(
             "--junit and --github need --gate", hint="name the rules with --gate rules.toml"
@@ -146,6 +149,32 @@ def compare_command(
     gates.check_gate(outcomes)
     if gate:
         _check_sources([run for group in groups for run in group.runs])
+
+
+def _compare_benchmarks(paths: Sequence[Path], as_json: bool, as_markdown: bool) -> None:
+    """Compare the first of some results of 'avsreplay benchmark' with each other one."""
+    from avsreplay.benchmark import results
+    from avsreplay.report.table import make_console, markdown, print_line, print_table
+
+    if len(paths) < 2:
+        raise UsageError("a single benchmark.json", where="compare", hint="name two of them")
+    base, *others = map(results.read, paths)
+    for other in others:
+        found, (agreeing, count) = results.compared(base, other)
+        table = results.difference_table(found)
+        sentence = f"{agreeing} of {count} runs agree within {100 * results.AGREE:g} %"
+        if as_json:
+            click.echo(
+                json.dumps(
+                    {"agreeing": agreeing, "runs": count, "rows": [each.record for each in found]}
+                )
+            )
+        elif as_markdown:
+            click.echo(f"{sentence}\n\n{markdown(table)}")
+        else:
+            console = make_console()
+            print_line(console, sentence)
+            print_table(console, table, tight=True)
 
 
 def _check_sources(runs: Sequence[Result]) -> None:

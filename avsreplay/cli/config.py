@@ -319,29 +319,54 @@ Examples:
   avsreplay config tumble.mcap --policy all    with the settings in the log itself
   avsreplay config --json --set plan.a_max_mps2=0.02"""
 
-INTRODUCTION = """# Settings
+INTRODUCTION = """# Which settings are there?
 
-This page is generated from the declarations in the code by `avsreplay config --markdown`.
+Most runs need none: lengths scale with the *extent* of the target, the diagonal of the bounding box
+of its model. These are the ones that people use; all others follow, table by table.
 
-A setting without a default applies as stated in its description. The target's extent is the
-diagonal of the bounding box of its model, so that the defaults suit a target of any size. A value
-outside its range, an unknown key or a wrong type is an error that names the file and the line.
+{frequent}
 
 Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an
-environment variable (`AVSREPLAY_RUN_POLICY`,
-`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
-`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config`
-reads.
+environment variable (`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file,
+or the log's own `[run]` table. `avsreplay config` prints the effective configuration as a file that
+`--config` reads. A value outside its range or an unknown key is an error with file and line.
+`avsreplay config --markdown` makes this page from the declarations in the code.
 """
 
+FREQUENT = {
+    "topic": "choose the clouds of a bag with several",
+    "model": "replay against this CAD file",
+    "model_unit": "state the unit of the model",
+    "crop_range": "remove a wall behind the target",
+    "fixed_frame": "transform the clouds of a moving camera",
+    "truth_topic": "compute errors against true poses",
+    "grasp": "grasp another point than the origin of the model",
+    "n_scans": "replay the first scans only",
+    "init": "begin at a given pose, or search for it",
+    "region": "follow a target that approaches",
+    "register.backend": "use another registration method",
+    "register.gate_m": "use a model that is less accurate than 1 % of its extent",
+    "estimator.start": "begin without, or with a given, state of motion",
+    "estimator.force_noise_mps15": "state that forces of known size act",
+    "faults.policy": "use the fault rule as printed in the paper",
+    "faults.rms_max_m": "accept noisier scans",
+    "task.position_m": "state how precise a capture must be",
+    "robot.accel_max_mps2": "state what the robot can do",
+    "limits.final_deg": "approach through a corridor",
+    "limits.clearance_m": "keep clear of the target",
+}  # key of a setting of a run or of reading a log: what it is used for
+
 SECTIONS = (
-    ("Run", "Keys of `--config` and `--set`.", "avsreplay.config:RunConfig"),
+    (
+        "Run",
+        "Keys of `--config` and `--set`. `avsreplay plan` takes those of `[limits]` as options.",
+        "avsreplay.config:RunConfig",
+    ),
     (
         "Reading a log",
-        "Options of `avsreplay run`, `info` and `record`.",
+        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`.",
         "avsreplay.log.options:SourceOptions",
     ),
-    ("Constraints of a plan", "Options of `avsreplay plan`.", "avsreplay.plan.limits:Limits"),
     (
         "Scenario",
         "A scenario file, see [Scenarios](scenario.md).",
@@ -399,39 +424,67 @@ def _own_table(log: Path) -> Mapping[str, Any]:
 
 def reference_page() -> str:
     """The text of docs/settings.md."""
-    return "\n".join([INTRODUCTION, *_page()]).rstrip("\n") + "\n"
+    found = {entry.key: entry for _, _, owner in SECTIONS[:2] for entry in _entries(owner)}
+    lines = ["| to | setting | default |", "|---|---|---|"]
+    lines += [
+        f"| {purpose} | `{key}` | {_default(found[key])} |" for key, purpose in FREQUENT.items()
+    ]
+    introduction = INTRODUCTION.replace("{frequent}", "\n".join(lines))
+    return "\n".join([introduction, *_page()]).rstrip("\n") + "\n"
 
 
-def _page() -> Iterator[str]:
+def _entries(owner: str) -> list[Entry]:
     import importlib
 
     from avsreplay.settings import entries
 
+    module, _, name = owner.partition(":")
+    return list(entries(getattr(importlib.import_module(module), name)))
+
+
+def _page() -> Iterator[str]:
     for title, introduction, owner in SECTIONS:
-        module, _, name = owner.partition(":")
         yield f"## {title}\n\n{introduction}\n"
         tables: dict[str, list[Entry]] = {}
-        for entry in entries(getattr(importlib.import_module(module), name)):
+        for entry in _entries(owner):
             tables.setdefault(entry.key.rpartition(".")[0], []).append(entry)
         for table, rows in tables.items():
             if table:
                 yield f"### [{table}]\n"
-            yield "| setting | default | unit | range | meaning |\n|---|---|---|---|---|"
+            yield "| setting | default, range | meaning |\n|---|---|---|"
             yield "\n".join(map(_row, rows)) + "\n"
 
 
 def _row(entry: Entry) -> str:
+    value = ", ".join(part for part in (_default(entry), _range(entry)) if part)
+    cells = (f"`{entry.key}`", value, entry.declared.doc)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _default(entry: Entry) -> str:
     from dataclasses import MISSING
 
     from avsreplay.toml_document import toml_value
 
     declared = entry.declared
     if entry.default is MISSING:
-        default = "required"
-    elif entry.default is None:
-        default = declared.automatic or "off"
-    else:
-        default = "`{}`" if entry.default == {} else f"`{toml_value(entry.default)}`"
-    limits = ", ".join(f"`{choice}`" for choice in entry.choices) or declared.range
-    cells = (f"`{entry.key}`", default, declared.unit, limits, declared.doc)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        return "required"
+    if entry.default is not None:
+        return "`{}`" if entry.default == {} else f"`{toml_value(entry.default)}`"
+    if declared.of_extent is not None:
+        return f"{declared.of_extent:g} extent" + ("/s" if declared.unit == "m/s" else "")
+    return declared.unset or "off"
+
+
+def _range(entry: Entry) -> str:
+    """The range in short, with the unit: "0 to 1", ">0 m"; names where these are the values."""
+    if entry.choices:
+        return "of " + "/".join(f"`{choice}`" for choice in entry.choices)
+    declared = entry.declared
+    lower = f">{declared.above:g}" if declared.above is not None else ""
+    lower = f"≥{declared.low:g}" if declared.low is not None else lower
+    upper = f"<{declared.below:g}" if declared.below is not None else ""
+    upper = f"≤{declared.high:g}" if declared.high is not None else upper
+    return " ".join(
+        part for part in (", ".join(filter(None, (lower, upper))), declared.unit) if part
+    )

@@ -107,9 +107,9 @@ def _write_job(
     path: Path, source: Path, reading: dict[str, Any], advice: list[Advice], words: list[str]
 ) -> None:
     """Write the options of the command, and those that were advised with their reasons."""
-    from avsreplay.cli.job import job_text
     from avsreplay.cli.trial import advised_words, job_with
     from avsreplay.files import output_text
+    from avsreplay.job_file import job_text
 
     job, before = job_with(source, reading, words), job_with(source, reading, [])
     reasons = dict[str, str]()

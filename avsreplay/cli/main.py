@@ -45,6 +45,7 @@ SUMMARIES = {
     "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
     "compare": "Compare saved results; gate one against a baseline.",
     "sweep": "Run a campaign of many runs and summarise it.",
+    "benchmark": "Run a suite of captures for every back end and estimator.",
     "config": "Print the effective settings of a run.",
     "completion": "Print the completion script of a shell.",
 }

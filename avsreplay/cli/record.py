@@ -25,7 +25,7 @@ from avsreplay.cli.options import (
     source_options,
     tracked,
 )
-from avsreplay.errors import DataLost, UnreadableInput, UsageError
+from avsreplay.errors import DataLost, UsageError
 from avsreplay.files import STDOUT, check_output
 from avsreplay.report import export
 
@@ -311,12 +311,6 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
     from avsreplay.report.page import build_page
 
     found = read_result(result)
-    if not found.rows:
-        raise UnreadableInput(
-            "holds no row",
-            where=str(result),
-            hint="name the result of a run with at least one scan",
-        )
     page = build_page(
         found.rows,
         found.summary,

@@ -103,7 +103,7 @@ class Requirement(click.ParamType[str | float]):
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
+    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/equations.md)."
 )
 @source_options
 @pose_options
@@ -214,7 +214,8 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
-        click.echo(done.verdict.line, err=True)
+        if wanted.as_json or not sys.stdout.isatty():  # else it stands above the table already
+            click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
 
@@ -266,9 +267,7 @@ def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
     """Return the log of a job file and put its options into ``flags`` where none is given; any
     other log is returned as it is.
     """
-    if log.suffix != ".toml" or not log.is_file():
-        return log
-    from avsreplay.cli.job import read_job
+    from avsreplay.job_file import read_job
 
     job = read_job(log)
     if job is None:

@@ -80,6 +80,8 @@ KINDS = {  # colour and pattern of each place
         "approach_on_prediction",
     ),
 }
+FIRST = ("position", "nis", "capture")  # charts that stand beside the states; others are folded
+SAME = 1e-3  # largest difference of two lines, over the range of the first, that are drawn as one
 _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
@@ -128,9 +130,19 @@ def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def _line(
-    name: str, label: str, colour: int, *, dash: bool = False, points: bool = False
+    name: str,
+    label: str,
+    colour: int,
+    *,
+    dash: bool = False,
+    points: bool = False,
+    measured: bool = False,
 ) -> dict[str, Any]:
-    return {"column": name, "label": label, "colour": colour, "dash": dash, "points": points}
+    """One line of a chart; ``measured``: it is of the measurement alone, so that the axis follows
+    the scans that were used, and rejected values beyond it are marked at the edge.
+    """
+    marks = {"dash": dash, "points": points, "measured": measured}
+    return {"column": name, "label": label, "colour": colour, **marks}
 
 
 def _chart(
@@ -152,6 +164,7 @@ def _chart(
     """
     return {
         "key": key,
+        "first": key in FIRST,
         "title": title,
         "unit": unit,
         "log": log,
@@ -162,7 +175,10 @@ def _chart(
 
 
 def charts(
-    columns: Columns, truth: State | None = None, limits: Mapping[str, float] | None = None
+    columns: Columns,
+    truth: State | None = None,
+    limits: Mapping[str, float] | None = None,
+    used: NDArray[np.bool_] | None = None,
 ) -> list[Chart]:
     """The charts that have data, in reading order.
 
@@ -170,6 +186,7 @@ def charts(
         columns: from ``derived``.
         truth: true parameters, drawn as horizontal lines.
         limits: limits of the fault detector: ``rms_max_m``, ``alpha_max_m`` and ``length_m`` [m].
+        used: (n,) whether each scan was used; None if all were.
     """
     whole = [
         *_error_charts(),
@@ -179,7 +196,10 @@ def charts(
     ]
     kept = []
     for chart in whole:
-        chart["series"] = [s for s in chart["series"] if s["column"] in columns]
+        chart["series"] = distinct(
+            [(s, columns[s["column"]]) for s in chart["series"] if s["column"] in columns],
+            logarithmic=bool(chart["log"]),
+        )
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
         if chart["key"] in ("position", "attitude") and not any(
             "_err_" in s["column"] for s in chart["series"]
@@ -188,8 +208,38 @@ def charts(
                 "error", "uncertainty"
             )  # no truth: the predicted 1 sigma alone
         if chart["series"]:
-            kept.append(_scaled(chart, columns))
+            kept.append(_scaled(chart, columns, used))
     return kept
+
+
+def distinct(
+    lines: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], *, logarithmic: bool
+) -> list[dict[str, Any]]:
+    """Return the lines that differ from every earlier one; the label of a line names those that
+    are equal to it.
+
+    Args:
+        lines: each with its values (n,).
+        logarithmic: whether the axis is.
+    """
+    kept: list[tuple[dict[str, Any], NDArray[np.float64]]] = []
+    for line, column in lines:
+        heights = np.log10(np.where(column > 0.0, column, np.nan)) if logarithmic else column
+        equal = next((k for k, (_, other) in enumerate(kept) if _equal(other, heights)), None)
+        if equal is None:
+            kept.append((line, heights))
+        else:
+            first, other = kept[equal]
+            kept[equal] = ({**first, "label": f"{first['label']} = {line['label']}"}, other)
+    return [line for line, _ in kept]
+
+
+def _equal(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    known = np.isfinite(first)
+    if first.shape != second.shape or not known.any() or (known != np.isfinite(second)).any():
+        return False
+    span = float(np.ptp(first[known]))
+    return float(np.abs(first - second)[known].max()) <= SAME * span
 
 
 def flight_charts(columns: Columns) -> list[Chart]:
@@ -213,17 +263,20 @@ def flight_charts(columns: Columns) -> list[Chart]:
         _chart("margin", "Margin of the constraints", "m", lines, levels=[(0.0, "limit", 3)]),
     ]
     return [
-        _scaled(chart, columns)
+        _scaled(chart, columns) | {"first": True}
         for chart in whole
         if any(s["column"] in columns for s in chart["series"])
     ]
 
 
-def _scaled(chart: Chart, columns: Columns) -> Chart:
+def _scaled(chart: Chart, columns: Columns, used: NDArray[np.bool_] | None = None) -> Chart:
     """The chart with its axis; typical values in metres below 1 m are drawn in millimetres,
     as in the tables.
     """
-    sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]
+    sizes = [
+        np.abs(_on_axis(columns[s["column"]], used if s["measured"] else None))
+        for s in chart["series"]
+    ]
     typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)
     if chart["log"] is None:
         chart = chart | {"log": 0.0 < WIDE * typical < largest}
@@ -233,15 +286,22 @@ def _scaled(chart: Chart, columns: Columns) -> Chart:
     return chart | {"unit": "mm", "factor": 1000.0, "levels": levels}
 
 
+def _on_axis(column: NDArray[np.float64], used: NDArray[np.bool_] | None) -> NDArray[np.float64]:
+    """The values that an axis follows: those of used scans, all where none of them has one."""
+    if used is None or not np.isfinite(column[used]).any():
+        return column
+    return column[used]
+
+
 def _error_charts() -> list[Chart]:
     position = [
         _line("pos_err_m", "estimate", 0),
-        _line("reg_pos_err_m", "registration", 1, points=True),
+        _line("reg_pos_err_m", "registration", 1, points=True, measured=True),
         _line("pos_1s_m", "predicted 1 sigma", 2, dash=True),
     ]
     attitude = [
         _line("rot_err_deg", "estimate", 0),
-        _line("reg_rot_err_deg", "registration", 1, points=True),
+        _line("reg_rot_err_deg", "registration", 1, points=True, measured=True),
         _line("rot_1s_deg", "predicted 1 sigma", 2, dash=True),
     ]
     return [
@@ -259,14 +319,19 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
     nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
     return [
         _chart(
-            "fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit, log=None
+            "fit",
+            "Fit error",
+            "m",
+            [_line("rms_m", "rms over inliers", 0, measured=True)],
+            levels=fit,
+            log=None,
         ),
         _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
         _chart(
             "nis",
             "Innovation squared (NIS)",
             "",
-            [_line("nis", "NIS", 0, points=True)],
+            [_line("nis", "NIS", 0, points=True, measured=True)],
             levels=nis,
             log=True,
         ),
@@ -274,7 +339,7 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
             "innovation",
             "Position innovation",
             "m",
-            [_line("innov_m", "length", 0)],
+            [_line("innov_m", "length", 0, measured=True)],
             levels=jump,
             log=True,
         ),
@@ -282,7 +347,7 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
             "turn",
             "Attitude innovation",
             "deg",
-            [_line("innov_deg", "angle", 0)],
+            [_line("innov_deg", "angle", 0, measured=True)],
             levels=turn,
             log=True,
         ),
@@ -354,12 +419,18 @@ def _plan_charts() -> list[Chart]:
     return [
         _chart("gramian", "Gramian condition, log10", "", condition),
         _chart("rank", "Gramian rank of 20", "", [_line("ogm_rank", "rank", 0)]),
-        _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)], log=None),
+        _chart(
+            "noise",
+            "Adapted noise, position",
+            "m",
+            [_line("r_pos_m", "1 sigma", 0, measured=True)],
+            log=None,
+        ),
         _chart(
             "noise_turn",
             "Adapted noise, attitude",
             "deg",
-            [_line("r_rot_deg", "1 sigma", 0)],
+            [_line("r_rot_deg", "1 sigma", 0, measured=True)],
             log=None,
         ),
         _chart(

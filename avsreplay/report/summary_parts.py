@@ -211,6 +211,11 @@ class Statistics:
         )
         return cls(n, rmse, mean, median(array), std, float(array.min()), float(array.max()))
 
+    @property
+    def sse(self) -> float:
+        """Sum of the squares."""
+        return self.count * self.rmse**2
+
 
 def median(values: ArrayLike) -> float:
     """The middle value, or the mean of the two middle values; ``values`` (n,) must not be empty."""
