@@ -410,7 +410,7 @@ def _continued(
         "miss": miss,
         "contact": None if setup.contact is None else hits,
         "limit": limit,
-        "change": "" if found["chance"] is Chance.LIKELY else _change(cause),
+        "change": "" if found["chance"] is Chance.LIKELY else _change(limit if hits else cause),
     }
 
 

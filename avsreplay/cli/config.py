@@ -141,7 +141,7 @@ class Command(click.Command):
             self.params.append(full)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments; one that is too much is refused with the option that takes it."""
+        """Parse the arguments; one that is too much is an error that names the option for it."""
         ctx.allow_extra_args = True
         left = []
         try:

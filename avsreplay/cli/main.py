@@ -147,7 +147,7 @@ class _Commands(click.Group):
 
 
 def _command_for(path: Path) -> str:
-    """The command that a user who only names a file or folder probably wants."""
+    """The command that is suggested where only a file or folder is named."""
     return "report" if (path / "rows.jsonl").is_file() else "run"
 
 

@@ -218,6 +218,8 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
+        if not wanted.required:
+            _check_required(["check"], done.verdict, where="tracking")
 
 
 @value_class(kw_only=True, eq=True)
@@ -543,25 +545,26 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
     if "interrupted_after" in done.record:
         raise KeyboardInterrupt
-    _check_required(wanted.required, done.verdict)
+    if wanted.required:
+        _check_required(wanted.required, done.verdict)
 
 
-def _check_required(required: Sequence[str | float], verdict: RunVerdict) -> None:
-    """Raise CheckFailed for a verdict that is worse than required; without a requirement on the
-    grade FAIL is worse.
+def _check_required(required: Sequence[str | float], verdict: RunVerdict, where: str = "") -> None:
+    """Raise CheckFailed for a verdict that is worse than required; where no grade is required, FAIL
+    is worse.
     """
     capture = verdict.capture
     probability = (None if capture is None else capture.probability) or 0.0
     for least in required:
         if isinstance(least, float) and (probability < least or not (capture and capture.succeeds)):
-            where = f"--require capture={least:g}"
-            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+            at = f"--require capture={least:g}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=at)
     order = ["pass", "check", "fail"]
     grades = [least for least in required if isinstance(least, str)] or ["check"]
     for grade in grades:
         if grade != "any" and order.index(verdict.grade.value.lower()) > order.index(grade):
-            where = f"--require {grade}" if required else "tracking"
-            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+            at = where or f"--require {grade}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=at)
 
 
 def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:

@@ -87,8 +87,8 @@ def advised_words(found: Sequence[Advice]) -> dict[str, str]:
     """Return the options of findings that can be added as they are, each with its reason.
 
     Args:
-        found: the findings; an option with a placeholder, an alternative, or of a finding that asks
-            for nothing (but true poses) is left out.
+        found: the findings; an option with a placeholder, an alternative, or of a finding that
+            requires nothing (but true poses) is left out.
     """
     out = dict[str, str]()
     for each in found:

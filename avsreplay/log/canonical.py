@@ -4,7 +4,7 @@ A decoder returns the fields of a cloud as they are declared (``raw_cloud``). Wh
 inferred here from a sample of the clouds of a log, once: byte order, unit of the coordinates, times
 of the points, and the codes of missing returns. Each inference has its evidence, which ``info``,
 ``doctor`` and ``run`` print, and an option that overrides it; what the values do not decide is
-refused. What comes after this layer need not test the values of a scan again.
+an error. What comes after this layer need not test the values of a scan again.
 """
 
 from __future__ import annotations
