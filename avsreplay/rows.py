@@ -381,6 +381,9 @@ _GUESS_WORDS = {
     "given": "A pose given by an option.",
     "acquired": "A search without a guess.",
     "predicted": "The prediction of the filter.",
+    "tracked": (
+        "The prediction of the tracker, where the motion of a free body contradicts the last poses."
+    ),
     "last": "The pose of the last healthy scan.",
     "measured": "None was needed, because the log holds poses.",
 }
@@ -389,6 +392,7 @@ _ESTIMATOR_WORDS = {
     "start": "The first poses of a cold start.",
     "fit": "A maximum-likelihood fit to all poses.",
     "filter": "The Kalman filter.",
+    "kinematic": "The tracker, where the motion of a free body contradicts the poses.",
 }
 _REFERENCE_WORDS = {
     "truth": "True poses of the log or of a file.",
