@@ -288,8 +288,8 @@ def report_command(result: Path, output: Path | None, title: str | None, overwri
     slider, tables, and the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
-    check_suffix(page, *HTML)
     check_output(page, overwrite=overwrite, inputs=[result])
+    check_suffix(page, *HTML)
     click.echo(write_page(result, page, title), err=page == STDOUT)
 
 

@@ -221,11 +221,11 @@ def _change(
     paired: bool,
 ) -> Change | None:
     values = [(base[name], other[name]) for base, other in figures]
-    if all(base is None and other is None for base, other in values):
-        return None
     base, other = (_mean([pair[side] for pair in values]) for side in (0, 1))
-    lost = sum(a is not None and b is None for a, b in values)
-    new = sum(a is None and b is not None for a, b in values)
+    if base is None and other is None:
+        return None
+    missing = [(a is None, b is None) for a, b in values]
+    lost, new = missing.count((False, True)), missing.count((True, False))
     if lost or new:
         word = _word_of_loss(name, lost - new) if paired else "changed"
         return Change(name, base, other, None, None, word, "lost" if lost else "new")

@@ -101,14 +101,27 @@ def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
     before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
     if row.fault:
         return f"injected: {plain(row.fault)}"
-    moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
-    manoeuvre = "manoeuvre of the target" + (
-        "" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s"
-    )
+    manoeuvre = _manoeuvre(before, end)
     if row.gamma == 0:
-        return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
-    if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
-        return manoeuvre if moved else "the estimate was reinitialised"
+        return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if manoeuvre else "")
+    if manoeuvre:
+        return manoeuvre
+    return _cause_in_estimate(rows, k, before)
+
+
+def _manoeuvre(before: Row | None, end: Row) -> str:
+    """The manoeuvre that was found between two rows, in words; "" without one."""
+    if before is None or (end.manoeuvres or 0) <= (before.manoeuvres or 0):
+        return ""
+    when = "" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s"
+    return f"manoeuvre of the target{when}"
+
+
+def _cause_in_estimate(rows: Sequence[Row], k: int, before: Row | None) -> str:
+    """Why the estimate of a used scan has a large error; ``before`` is the last used row."""
+    row = rows[k]
+    if before is not None and (row.reinitialised or 0) > (before.reinitialised or 0):
+        return "the estimate was reinitialised"
     if k and rows[k - 1].gamma == 0:
         return "first used scan after rejected scans"
     if row.guess == "acquired":

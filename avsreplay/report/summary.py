@@ -266,17 +266,13 @@ class SummaryFold:
             faults=account(marks, self._labels),
             coasts=tuple(coasts(marks)),
             parameters=parameters(last, truth or self._truth) if last else (),
-            sigma_hits=last.sigma_hits if last else None,
-            r_floors=last.r_floors if last else None,
+            **{name: getattr(last, name, None) for name in _COUNTED},
             weighed_down=sum(
                 w is not None and w < 1.0
                 for w in compress(taken["cauchy_weight"], map(not_, flagged))
             ),
-            reinitialised=last.reinitialised if last else None,
-            manoeuvres=last.manoeuvres if last else None,
             velocity_changes=VelocityChange.of(taken),
             drift=Drifting.of(last) if last else None,
-            violations=last.violations if last else None,
             nis=_share(figures["nis/healthy"], NIS_BAND),
             nees=_share(figures["nees"], NEES_BAND),
             nees_blocks=_blocks(figures),
@@ -290,6 +286,10 @@ class SummaryFold:
             capture=Capture.of(taken),
             counts=self._counts,
         )
+
+
+_COUNTED = ("sigma_hits", "r_floors", "reinitialised", "manoeuvres", "violations")
+"""Columns that count since the first scan: those of the last row are those of the run."""
 
 
 def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:

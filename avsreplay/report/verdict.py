@@ -204,25 +204,19 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
-    position, turn = median_of(values(rows, "pos_err_m")), median_of(values(rows, "rot_err_deg"))
-    share = position / extent_m if position is not None and extent_m else 0.0
-    if share > ERROR_CHECK or (turn or 0.0) > TURN_CHECK:
-        yield from _frame(
-            rows,
-            extent_m,
-            Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK,
-        )
-    if position is not None and extent_m and position > ERROR_CHECK * extent_m:
-        grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
-        share = 100 * position / extent_m
-        yield Concern(
-            grade,
-            f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the"
-            " model",
-        )
-    if turn is not None and turn > TURN_CHECK:
-        grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
-        yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
+    position = median_of(values(rows, "pos_err_m")) or 0.0
+    turn = median_of(values(rows, "rot_err_deg")) or 0.0
+    share = position / extent_m if extent_m else 0.0
+    of_position = _graded(share, ERROR_CHECK, ERROR_FAIL)
+    of_turn = _graded(turn, TURN_CHECK, TURN_FAIL)
+    grades = [grade for grade in (of_position, of_turn) if grade]
+    if grades:
+        yield from _frame(rows, extent_m, Grade.FAIL if Grade.FAIL in grades else Grade.CHECK)
+    if of_position:
+        size = f"{position:.3g} m, {100 * share:.1f} % of the model"
+        yield Concern(of_position, f"the median position error of all scans is {size}")
+    if of_turn:
+        yield Concern(of_turn, f"the median attitude error of all scans is {turn:.3g} deg")
     fit = median_of(values([row for row in rows if row.gamma == 1], "rms_m"))
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
@@ -231,6 +225,13 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
             " extent"
         )
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
+
+
+def _graded(size: float, check: float, fail: float) -> Grade | None:
+    """The grade of a size by its two limits; None where it is within both."""
+    if size <= check:
+        return None
+    return Grade.FAIL if size > fail else Grade.CHECK
 
 
 def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterator[Concern]:
@@ -317,7 +318,20 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
 
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
-    """Consistency and reinitialisation."""
+    """Consistency, changes of the motion and new starts of the estimate, what it determines."""
+    yield from _consistency(rows, summary)
+    yield from _new_starts(rows, summary)
+    if (used := [row.free_directions for row in rows if row.gamma == 1]) and all(used):
+        yield Concern(
+            Grade.CHECK,
+            f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
+        )
+    if summary.assessment is None:  # else it states whether the estimate suffices
+        yield from _convergence(rows, summary)
+
+
+def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Errors and innovations against their covariances."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
             low = (
@@ -342,6 +356,10 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             f" at {begin:.1f} s"
         )
         yield Concern(Grade.CHECK, text)
+
+
+def _new_starts(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Where the estimate began again, changed its motion, or its pose was searched again."""
     if summary.reinitialised:
         when = next(row.t_s for row in rows if row.reinitialised)
         text = (
@@ -364,13 +382,6 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
         )
         yield Concern(Grade.CHECK, text)
-    if (used := [row.free_directions for row in rows if row.gamma == 1]) and all(used):
-        yield Concern(
-            Grade.CHECK,
-            f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
-        )
-    if summary.assessment is None:  # else it states whether the estimate suffices
-        yield from _convergence(rows, summary)
 
 
 def _convergence(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
