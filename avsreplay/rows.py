@@ -362,6 +362,7 @@ _STATUS_WORDS = {
 _REASON_WORDS = {
     "ok": "The scan is used.",
     "no_scan": "The scan is empty or damaged.",
+    "frozen": "The sensor repeats the scan before, although the target moves.",
     "not_aligned": "The registration found no overlap, failed, or is ambiguous.",
     "not_converged": "The registration did not converge.",
     "few_inliers": "Too few points, or too small a share of them, are close to the model.",

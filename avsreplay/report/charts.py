@@ -51,7 +51,15 @@ _WINDOW = 10
 WIDE = 20.0  # largest over typical value from which an axis is logarithmic
 KINDS = {  # colour and pattern of each place
     "flagged": (
-        *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
+        *(
+            "not_aligned",
+            "fit_error",
+            "no_scan",
+            "frozen",
+            "pose_jump",
+            "few_inliers",
+            "not_converged",
+        ),
         "halves_differ",
         *("doubtful", "sensor_bias", "clock"),
     ),
