@@ -17,6 +17,7 @@ from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.parts import OWN
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan._cone import Winding, winding
 from avsreplay.plan.arm import with_arm
@@ -30,6 +31,7 @@ from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.settings import SettingError
 from avsreplay.task import Patch, Task, patches, target_at, task_of
+from avsreplay.tracker import Tracker
 
 INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
@@ -89,7 +91,14 @@ def stages(
         reacquire=config.reacquire,
         initialise=_initialise(config, header, truth_of),
         region=Region(np.array(config.region_start()), low, high) if config.region else None,
+        tracker=_tracker(config, 0.5 * (low + high), surface.extent),
     )
+
+
+def _tracker(config: RunConfig, middle: Array, extent_m: float) -> Tracker | None:
+    """The tracker of a model; None with the method of the paper and with a plug-in."""
+    own = config.estimator.method == OWN and config.estimator.start is not Start.PAPER
+    return Tracker(middle, extent_m) if own and config.estimator.robust else None
 
 
 def _tolerance(task: Task) -> tuple[float, float, float]:

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from avsreplay.cli.record import report_command
-from avsreplay.errors import AvsError
+from avsreplay.errors import AvsError, UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
@@ -261,7 +261,7 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     empty = CliRunner().invoke(
         report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")]
     )
-    assert "has no rows" in str(empty.exception)
+    assert isinstance(empty.exception, UnreadableInput)
     missing = CliRunner().invoke(
         report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")]
     )

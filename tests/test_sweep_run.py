@@ -440,17 +440,16 @@ def test_dask_listens_on_the_loopback_only():
 
 
 @pytest.mark.slow
-def test_whole_flights_of_a_campaign_end_as_those_of_the_plan_command(tmp_path):
+def test_whole_flights_of_a_campaign_are_counted(tmp_path):
     """Without errors of the thrust every flight captures, with three times the largest thrust none
     does.
     """
     import pyarrow.parquet as pq
 
-    from avsreplay.cli.plan import plan_command
-    from avsreplay.cli.run import run_command
-
-    log, names = FIXTURES / "tumble.mcap", ("count", "captured", "outside", "aborted", "touched")
+    log = FIXTURES / "tumble.mcap"
     grid = '[[grid]]\nkey = "run.robot.thrust_noise"\nvalues = [0.0, 3.0]\n'
+    # the log is short
+    grid += '[[grid]]\nkey = "run.convergence.criterion"\nvalues = ["covariance"]\n'
     sure = '[[success]]\nname = "sure"\nmetric = "flights.captured_share"\nmin = 0.9\n'
     text = f'logs = ["{log.as_posix()}"]\nscans = false\nflights = 3\n{grid}{sure}'
     (tmp_path / "flights.toml").write_text(text)
@@ -463,11 +462,3 @@ def test_whole_flights_of_a_campaign_end_as_those_of_the_plan_command(tmp_path):
     assert [cell["rates"]["flights captured"]["successes"] for cell in cells] == [3, 0]
     assert [cell["rates"]["flights captured"]["count"] for cell in cells] == [3, 3]
     assert [cell["rates"]["sure"]["successes"] for cell in cells] == [1, 0]
-    saved, options = (
-        str(tmp_path / "saved"),
-        ["--samples", "1", "--every", "99", "--flights", "3", "--json"],
-    )
-    CliRunner().invoke(run_command, [str(log), "-o", saved], catch_exceptions=False)
-    planned = CliRunner().invoke(plan_command, [saved, *options], catch_exceptions=False)
-    flown = json.loads(planned.stdout)["flights"]
-    assert [flown[name] for name in names] == [table[f"flights.{name}"][0] for name in names]
