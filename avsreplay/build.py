@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -14,11 +13,11 @@ from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.plugged import estimator_of
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
-from avsreplay.plan._cone import Winding, winding
+from avsreplay.plan._cone import Body
 from avsreplay.plan.arm import with_arm
 from avsreplay.plan.guidance import Guidance
 from avsreplay.plan.limits import TargetGeometry, hull_vertices
@@ -27,11 +26,8 @@ from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.region import Region
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.settings import SettingError
 from avsreplay.task import Task, patches, target_at, task_of
-
-INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
 
 def stages(
@@ -129,34 +125,13 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
         axis_c: outward axis of the fixture in {C}.
     """
     return TargetGeometry(
-        np.array(axis_c), hull_vertices(surface.vertices), _signed_distance(surface)
+        np.array(axis_c),
+        hull_vertices(surface.vertices),
+        Body(
+            np.ascontiguousarray(surface.vertices, float),
+            np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
+        ),
     )
-
-
-def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]:
-    """Closest points (n, 3) and signed distances (n,) of points (n, 3) in {C}.
-
-    A point is inside where the winding number of the faces is above one half: also where closed
-    parts overlap and the nearest face is inside another part. An open sheet has no inside.
-    """
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-
-    @cache
-    def indexed() -> tuple[SurfaceIndex, Winding]:
-        return SurfaceIndex.build(surface, surface.extent), winding(
-            surface.vertices, np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3)
-        )
-
-    def closest(y: Array) -> tuple[Array, Array]:
-        index, turns = indexed()
-        found = index.closest(y)
-        distance = np.sqrt(found.d2)
-        within = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
-        inside = turns.inside(np.ascontiguousarray(y[within]), distance[within], INSIDE)
-        distance[within[inside]] *= -1.0
-        return found.foot, distance
-
-    return closest
 
 
 def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
