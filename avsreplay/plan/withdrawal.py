@@ -30,8 +30,6 @@ from avsreplay.geometry import Array
 from avsreplay.plan import _cone
 from avsreplay.plan.limits import (
     SampledScene,
-    corridor_margin,
-    required_clearance,
 )
 from avsreplay.plan.path import MOTION_FACTOR, BurnPath, RobotPath, StepPath
 from avsreplay.plan.robot import Limits
@@ -40,11 +38,13 @@ COAST_S = 30.0  # time after a cut of the thrust over which the coasting robot i
 ENOUGH_OF_EXTENT = 0.025  # margin that counts as enough: no larger one is looked for or stated
 RESOLUTION_OF_EXTENT = 5e-4  # uncertainty of a certified margin, and reserve of plans for it
 RANGES = 48  # ranges of start instants of a path whose thrust is not constant over intervals
+DENSER = 1.7  # power of the share of a manoeuvre: instants are denser at the begin
 COMPARED = 24  # instants at which margins of an escape are evaluated for the planner
 HALVINGS = 16  # largest number of halvings of a range of start instants
 COAST_HALVINGS = 6  # the same for coasting, whose margin is only stated
 MOST_RANGES = 4000  # of start instants; more are bounded without being halved
 KEPT_SHARE = 0.4  # of the distance to the surface that a withdrawal from the corridor keeps
+PLANNED_SHARE = 0.5  # the share at which plans aim
 STARTS = 32  # instants of a path from which withdrawals are tried in every iteration
 FIELDS = ("t", "half", "r", "v", "push", "span", "other", "most")  # of ``Manoeuvres``, in the
 # order of the extension
@@ -116,12 +116,24 @@ class Certificate:
     margins_m: Array
     safe_s: float
 
+    @property
+    def escapes(self) -> Array:
+        """Start instants [s], ascending, and directions in {A} of the manoeuvres (m, 4)."""
+        push = self.worst.push
+        d = push / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), 1e-12)
+        return np.column_stack([self.worst.t, d])[np.argsort(self.worst.t, kind="stable")]
+
 
 class Space:
     """The target after an instant as a withdrawal sees it."""
 
     def __init__(
-        self, sampled: SampledScene, limits: Limits, a_max: float, extent_m: float
+        self,
+        sampled: SampledScene,
+        limits: Limits,
+        a_max: float,
+        extent_m: float,
+        planned: bool = False,
     ) -> None:
         """Create it.
 
@@ -130,11 +142,15 @@ class Space:
             limits: Resolved limits: clearance, corridor and sigmas.
             a_max: Acceleration that the robot has in every direction [m/s2].
             extent_m: Diagonal of the target's bounding box [m].
+            planned: Require of withdrawals what plans aim at: more than what is stated, by the
+                shortage that a plan may have.
         """
         self.sampled, self.a_max = sampled, a_max
-        self.limits = replace(limits, clearance_m=limits.kept_m or None)
         self.enough_m = ENOUGH_OF_EXTENT * extent_m
         self.resolution_m = RESOLUTION_OF_EXTENT * extent_m
+        kept = limits.kept_m + (self.resolution_m if planned else 0.0)
+        self.limits = replace(limits, clearance_m=kept or None)
+        self.kept_share = PLANNED_SHARE if planned else KEPT_SHARE
         scene = sampled.scene
         self.centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
         self.radius_m = scene.radius_m
@@ -162,7 +178,7 @@ class Space:
             rates=(slope, *self._rates()),
             a_max=self.a_max,
             coast_s=COAST_S,
-            kept_share=KEPT_SHARE,
+            kept_share=self.kept_share,
         )
         if (table := self.sampled.sigma_table) is not None:
             grid, position, attitude = table
@@ -200,26 +216,7 @@ class Space:
 
     def gradient(self, y: Array, times: Array, most: Array) -> Array:
         """Return the gradients (n, 3) in {C} of the margin at points (n, 3) in {C}."""
-        scene = self.sampled.scene
-        size = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
-        out = y - self.centre_c
-        if scene.surface is not None:
-            foot, gap = scene.surface(y)
-            away = (y - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
-            out = np.where(np.isfinite(gap)[:, None], away, out)
-        else:
-            gap = np.linalg.norm(out, axis=1) - self.radius_m
-        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-        side, end = corridor_margin(scene, self.limits, y)
-        required = required_clearance(self.limits, size[:, 0], self.sampled.sigma(times))
-        inside = np.minimum(side, end) > gap - np.minimum(required, most)
-        if scene.axis_c is None or not inside.any():
-            return out
-        along = (y @ scene.axis_c)[:, None] * scene.axis_c
-        lateral = (y - along) / np.maximum(np.linalg.norm(y - along, axis=1, keepdims=True), 1e-9)
-        wall = math.tan(math.radians(self.limits.final_deg or 0.0)) * scene.axis_c - lateral
-        corridor = np.where((side < end)[:, None], wall, -y / size)
-        return np.where(inside[:, None], corridor, out)
+        return self._kernel.gradient(y, times, most)
 
     def relative(self, times: Array, r: Array, v: Array) -> tuple[Array, Array]:
         """Return position and velocity (n, 3) in {A} relative to the centre of mass."""
@@ -267,25 +264,14 @@ class Space:
         """Return the manoeuvres, each ended where the robot recedes outside the sphere."""
         return replace(m, span=self.kernel(_last_s(m)).ended(m.table))
 
-    def at_instants(
-        self, m: Manoeuvres, tau: Array, apart: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Return the smallest margins (m,) at times (m, n) of manoeuvres, and their times; only
-        those far from the times ``apart`` (m,) where given.
+    def margins(self, m: Manoeuvres, below_m: float) -> tuple[Array, Array]:
+        """Return margins (m, n) at n instants of manoeuvres, denser at the begin, and the times
+        after it (m, n); a margin above ``below_m`` may be a lower bound [m].
         """
-        none = np.column_stack([np.zeros(len(m.t)), np.full(len(m.t), -1.0)])
-        if apart is not None:
-            none = np.column_stack([apart, 2.0 * m.span / COMPARED])
-        margins, at = self.kernel(_last_s(m)).at_instants(m.table, tau, none).T
-        return margins, at
-
-    def compared(self, m: Manoeuvres) -> tuple[Array, Array]:
-        """Return about the smallest margin (m,) of each manoeuvre after its begin, at most
-        ``enough_m``, and its time.
-        """
-        share = np.linspace(0.0, 1.0, COMPARED + 1)[1:] ** 1.7
-        least, at = self.at_instants(m, m.span[:, None] * share)
-        return np.minimum(least, self.enough_m), at
+        share = np.linspace(0.0, 1.0, COMPARED + 1) ** DENSER
+        tau = m.span[:, None] * share
+        found: Array = self.kernel(_last_s(m)).margins(m.table, tau, below_m)
+        return found, tau
 
     def directions(
         self, t: Array, r: Array, v: Array, before: Array, wanted_m: float = math.inf
@@ -302,7 +288,9 @@ class Space:
             wanted_m: Margin from which no better direction is looked for [m].
         """
         span = self.kernel(float(t.max())).span(t, r, v)
-        return self.kernel(float((t + span).max())).search(t, r, v, before, wanted_m)[0]
+        kernel = self.kernel(float((t + span).max()))
+        found: Array = kernel.search(t, r, v, before, wanted_m)[0]
+        return found
 
 
 def _triple(x: Array) -> tuple[float, float, float]:
@@ -344,16 +332,13 @@ def certified(
         d = tried.d[np.abs(share[:, None] - tried.share).argmin(axis=1)]
     done = list[_Done]()
     goal = space.enough_m - space.resolution_m if least_m is None else least_m
-    wanted = goal + 4.0 * space.resolution_m
     for halving in range(HALVINGS):
         t, half = 0.5 * (low + high), 0.5 * (high - low)
-        r, v = path.at(t)
-        m = space.escapes(t, half, (r, v, u), space.directions(t, r, v, d, wanted))
-        m = _bounded(m, path)
-        lower, upper, at = space.least(m, goal)
+        m, lower, upper, at = _chosen(space, path, t, half, u, d, goal)
         worst = float(upper.min())
         if least_m is None and worst - space.resolution_m < goal:
-            goal = worst - space.resolution_m
+            # whether the margin is negative is decided first
+            goal = 0.0 if 0.0 < worst < space.resolution_m else worst - space.resolution_m
             lower, upper, at = space.least(m, goal)
         last = halving == HALVINGS - 1 or len(t) > MOST_RANGES or worst < goal
         kept = (lower >= goal) | last
@@ -362,6 +347,32 @@ def certified(
             break
         low, high, u, d = _halved(low, high, u, m.push / space.a_max, ~kept)
     return _certificate(space, done, worst < goal)
+
+
+def _chosen(
+    space: Space, path: RobotPath, t: Array, half: Array, u: Array, d: Array, goal: float
+) -> tuple[Manoeuvres, Array, Array, Array]:
+    """Escapes for ranges of start instants with the bounds of ``Space.least``, in the directions d
+    (m, 3); where one does not reach the goal all directions are compared.
+    """
+    r, v = path.at(t)
+
+    def bounded(d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
+        m = _bounded(space.escapes(t, half, (r, v, u), d), path)
+        return m, *space.least(m, goal)
+
+    unknown = np.isnan(d[:, 0])
+    if unknown.any():
+        d = d.copy()
+        d[unknown] = space.directions(t[unknown], r[unknown], v[unknown], d[unknown])
+    found = bounded(d)
+    poor = found[2] < goal
+    if not poor.any():
+        return found
+    other = d.copy()
+    other[poor] = space.directions(t[poor], r[poor], v[poor], np.full((poor.sum(), 3), math.nan))
+    again = bounded(other)
+    return bounded(np.where((again[2] > found[2])[:, None], other, d))
 
 
 def coasting(space: Space, path: RobotPath, begin_s: float) -> Certificate:
@@ -459,22 +470,21 @@ class Tried:
         share = 1.0 - (1.0 - np.arange(STARTS) / STARTS) ** 1.7
         return cls(share, np.full((STARTS, 3), math.nan))
 
-    def table(self, begin_s: float, end_s: float) -> Array:
-        """Return the start instants [s] and directions in time order (m, 4).
-
-        Args:
-            begin_s: Begin of the flight [s after the instant of planning].
-            end_s: Its end [s].
-        """
-        t = begin_s + (end_s - begin_s) * self.share
-        return np.column_stack([t, self.d])[np.argsort(t, kind="stable")]
-
     @classmethod
     def of(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
         """Return the instants of a table; the first ones where there is none."""
         if table is None:
             return cls.first()
         return cls((table[:, 0] - begin_s) / max(end_s - begin_s, 1e-9), table[:, 1:])
+
+    @classmethod
+    def near(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
+        """Return the first instants with the directions of the nearest instants of a table."""
+        first = cls.first()
+        if table is None:
+            return first
+        t = begin_s + (end_s - begin_s) * first.share
+        return cls(first.share, table[np.abs(t[:, None] - table[:, 0]).argmin(axis=1), 1:])
 
     def also(self, share: Array, d: Array, short_m: float) -> Tried:
         """Return these instants and others (n,) with their directions (n, 3), where the margin was
@@ -493,10 +503,9 @@ def sampled(
     begin_s: float,
     since_s: float = 0.0,
     improve: bool = True,
+    below_m: float = 0.0,
 ) -> tuple[Certificate, Tried]:
-    """Return the withdrawals from instants of a path, with their smallest margins at instants only.
-
-    Each escape is listed with its worst moment and with the worst one far from it.
+    """Return the withdrawals from instants of a path, with their margins at instants only.
 
     Args:
         space: The target.
@@ -505,6 +514,7 @@ def sampled(
         begin_s: Begin of the thrust [s after the instant of planning].
         since_s: Time between the begin of the path and the instant of planning [s].
         improve: Search better directions where the margin is negative; else only at new instants.
+        below_m: Margins below this are listed, and the smallest one of every withdrawal [m].
     """
     t = begin_s + (path.t_go_s - since_s - begin_s) * tried.share
     r, v = path.at(since_s + t)
@@ -514,15 +524,9 @@ def sampled(
     if improve:
         d = space.directions(t, r, v, d, 0.0)
     m = space.escapes(t, np.zeros(len(t)), (r, v, np.zeros_like(r)), d)
-    at = space.compared(m)[1]
-    near = m.span[:, None] * np.linspace(-1.0, 1.0, 9) / COMPARED
-    tau = np.c_[np.zeros(len(t)), np.clip(at[:, None] + near, 0.0, m.span[:, None])]
-    margins, at = space.at_instants(m, tau)
-    coarse = m.span[:, None] * np.linspace(0.0, 1.0, COMPARED + 1)
-    others, other_at = space.at_instants(m, coarse, apart=at)
-    found = Certificate(
-        float(margins.min()), joined([m, m]), np.r_[at, other_at], np.r_[margins, others], math.inf
-    )
+    margins, tau = space.margins(m, below_m)
+    k, i = np.nonzero((margins < below_m) | (margins == margins.min(axis=1)[:, None]))
+    found = Certificate(float(margins.min()), m.of(k), tau[k, i], margins[k, i], math.inf)
     return found, replace(tried, d=m.push / space.a_max)
 
 
@@ -603,7 +607,7 @@ def _largest(space: Space, paths: list[BurnPath]) -> Withdrawal:
     owner = np.repeat(np.arange(len(every)), [len(m.t) for m in every])
     m = joined(every)
     rough = np.full(len(paths), space.enough_m)
-    np.minimum.at(rough, owner, space.compared(m)[0])
+    np.minimum.at(rough, owner, space.margins(m, space.enough_m)[0].min(axis=1))
     goal = float(rough.max()) - space.resolution_m
     lower = np.full(len(paths), goal)
     np.minimum.at(lower, owner, space.least(m, goal)[0])

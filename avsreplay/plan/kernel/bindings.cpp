@@ -214,6 +214,16 @@ nb::object most(const Space& space, const Values& times, const Points& r) {
   });
 }
 
+// Gradients (n, 3) in {C} of the margin at points (n, 3) in {C}.
+nb::object gradient(const Space& space, const Points& y, const Values& times, const Values& most) {
+  const size_t n = y.shape(0);
+  if (times.shape(0) != n || most.shape(0) != n) throw nb::value_error("points of different numbers");
+  return filled(n, 3, [&](double* out) {
+    for (size_t i = 0; i < n; ++i)
+      reinterpret_cast<Vector3*>(out)[i] = space.gradient(vectors(y)[i], times.data()[i], most.data()[i]);
+  });
+}
+
 // Longest durations (n,) of escapes from states (n, 3), (n, 3) at times (n,).
 nb::object span(const Space& space, const Values& times, const Points& r, const Points& v) {
   const size_t n = r.shape(0);
@@ -231,18 +241,12 @@ nb::object ended(const Space& space, const Many& m) {
   });
 }
 
-// Smallest margins at instants tau (n, k) of manoeuvres, and their times (n, 2); only at instants farther than the second
-// value from the first one of ``apart`` (n, 2).
-nb::object at_instants(const Space& space, const Many& m, const In<double, -1, -1>& tau, const In<double, -1, 2>& apart) {
+// Margins at instants tau (n, k) of manoeuvres; those above ``below`` may be lower bounds.
+nb::object margins(const Space& space, const Many& m, const In<double, -1, -1>& tau, double below) {
   const size_t n = m.shape(0), k = tau.shape(1);
-  if (tau.shape(0) != n || apart.shape(0) != n) throw nb::value_error("manoeuvres of different numbers");
-  return filled(n, 2, [&](double* out) {
-    for (size_t i = 0; i < n; ++i) {
-      const double* from = apart.data() + 2 * i;
-      const Least found = space.at_instants(manoeuvres(m)[i], tau.data() + i * k, k, from[0], from[1]);
-      out[2 * i] = found.upper;
-      out[2 * i + 1] = found.at;
-    }
+  if (tau.shape(0) != n) throw nb::value_error("manoeuvres of different numbers");
+  return filled(n, k, [&](double* out) {
+    for (size_t i = 0; i < n; ++i) space.margins(manoeuvres(m)[i], tau.data() + i * k, k, below, out + i * k);
   });
 }
 
@@ -293,9 +297,10 @@ NB_MODULE(_cone, m) {
       .def("set_motion", &set_motion)
       .def("set_sigma", &set_sigma)
       .def("most", &most)
+      .def("gradient", &gradient)
       .def("span", &span)
       .def("ended", &ended)
-      .def("at_instants", &at_instants)
+      .def("margins", &margins)
       .def("least", &least)
       .def("search", &search);
 }

@@ -61,6 +61,14 @@ class Body {
     if (foot) *foot = *foot - origin_;
     return found;
   }
+  // Signed distance of q, or a lower bound of it that is at least ``enough``.
+  double at_least(const Vector3& q, double enough, Near& last) const {
+    if (last.known) {
+      const double bound = last.distance - norm(q + origin_ - last.at);
+      if (bound >= enough) return bound;
+    }
+    return signed_distance(q, last);
+  }
 
  private:
   std::shared_ptr<const FaceTree> tree_;

@@ -15,7 +15,10 @@ constexpr int INTERVALS = 6;    // intervals of a manoeuvre at the begin
 constexpr int HALVINGS = 15;    // largest number of halvings of one of them
 constexpr int SIDES = 6;        // directions around another one
 constexpr std::array<double, 3> TILTS{20 * RADIAN, 40 * RADIAN, 60 * RADIAN};   // of directions around the fixture's axis
-constexpr std::array<double, 3> REFINED{10 * RADIAN, 5 * RADIAN, 2 * RADIAN};   // that improve a direction, one after the other
+constexpr int REFINED = 3;             // halvings of the time beside the smallest margin of those instants
+constexpr int TURNS = 8;               // largest number of turns that improve a direction
+constexpr double LARGEST_TURN = 0.5;   // of a direction [rad]
+constexpr double SMALLEST_SHARE = 0.02; // of a turn that is tried
 constexpr double MOTION_FACTOR = 1.5;  // see path.py
 
 Vector3 unit(const Vector3& a) { return (1 / std::max(norm(a), 1e-9)) * a; }
@@ -113,11 +116,12 @@ double Space::corridor(const Vector3& y) const {
   return std::min(of_.tangent * along + of_.mouth - across, of_.reach - norm(y));
 }
 
-Margin Space::margin(const Vector3& y, double time, double most, Near& last) const {
-  const double required = std::min(this->required(norm(y), time), most);
+Margin Space::margin(const Vector3& y, double time, double most, Near& last, double below) const {
+  const double required = std::min(this->required(norm(y), time), most), inside = corridor(y);
   double gap = norm(y - of_.centre) - of_.radius;
-  if (body_ && (gap - required < of_.enough || of_.radius == 0)) gap = body_->signed_distance(y, last);
-  return {std::max(gap - required, corridor(y)), required};
+  const bool unknown = body_ && (gap - required < std::min(of_.enough, below) || of_.radius == 0) && inside < below;
+  if (unknown) gap = body_->at_least(y, below + required, last);
+  return {std::max(gap - required, inside), required};
 }
 
 double Space::most(double time, const Vector3& r, Near& last) const {
@@ -161,16 +165,12 @@ double Space::ended(const Manoeuvre& m) const {
   return m.span;
 }
 
-Least Space::at_instants(const Manoeuvre& m, const double* tau, size_t n, double from, double apart) const {
+void Space::margins(const Manoeuvre& m, const double* tau, size_t n, double below, double* out) const {
   Near last;
-  Least found{-INFINITE, INFINITE, n ? tau[0] : 0};
   for (size_t i = 0; i < n; ++i) {
-    if (std::abs(tau[i] - from) < apart) continue;
     const double time = m.t + tau[i];
-    const double value = margin(local(time, position(m, tau[i])), time, m.most, last).value;
-    if (value < found.upper) found = {-INFINITE, value, tau[i]};
+    out[i] = margin(local(time, position(m, tau[i])), time, m.most, last, below).value;
   }
-  return found;
 }
 
 Space::Node Space::node(const Manoeuvre& m, double tau, Near& last) const {
@@ -227,33 +227,77 @@ Least Space::least(const Manoeuvre& m, double target) const {
   return found;
 }
 
-// About the smallest margin of a manoeuvre after its begin, at most ``enough``; at most ``floor`` where it is not larger.
-double Space::compared(const Manoeuvre& m, double floor) const {
+// About the smallest margin of a manoeuvre after its begin, at most ``enough``, and its time; at most ``floor`` where it
+// is not larger.
+Least Space::compared(const Manoeuvre& m, double floor) const {
   static const std::array<double, COMPARED> shares = [] {
     std::array<double, COMPARED> out{};
     for (size_t i = 0; i < COMPARED; ++i) out[i] = std::pow(static_cast<double>(i + 1) / COMPARED, DENSER);
     return out;
   }();
   Near last;
-  double least = of_.enough;
-  for (double share : shares) {
-    const double tau = m.span * share, time = m.t + tau;
-    least = std::min(least, margin(local(time, position(m, tau)), time, m.most, last).value);
-    if (least <= floor) break;
-  }
-  return least;
+  Least found{-INFINITE, of_.enough, m.span};
+  size_t least = 0;
+  const auto see = [&](double tau) {
+    const double time = m.t + tau;
+    const double value = margin(local(time, position(m, tau)), time, m.most, last, found.upper).value;
+    const bool smaller = value < found.upper;
+    if (smaller) found = {-INFINITE, value, tau};
+    return smaller;
+  };
+  for (size_t i = 0; i < COMPARED && found.upper > floor; ++i)
+    if (see(m.span * shares[i])) least = i;
+  // between the instants beside the smallest margin
+  double step = 0.5 * m.span * (shares[std::min<size_t>(least + 1, COMPARED - 1)] - shares[least]);
+  for (int i = 0; i < REFINED && found.upper > floor && found.upper < of_.enough; ++i, step *= 0.5)
+    for (double side : {-step, step}) see(std::clamp(found.at + side, 0.0, m.span));
+  return found;
 }
 
-void Space::improve(Manoeuvre& m, double wanted, Vector3& d, double& value) const {
-  for (double angle : REFINED) {
-    if (value >= wanted) return;
-    for (const Vector3& other : tilted(Vector3(d), angle)) {
-      m.push = of_.a_max * other;
-      const double found = compared(m, value);
-      if (found > value) {
-        value = found;
-        d = other;
-      }
+// Gradient in {A} of the margin at an instant of a manoeuvre.
+Vector3 Space::gradient(const Manoeuvre& m, double tau) const {
+  Frame frame;
+  motion(m.t + tau, frame, false);
+  const Vector3 y = transposed(frame.R, position(m, tau) - frame.rho);
+  return times(frame.R, gradient(y, m.t + tau, m.most));
+}
+
+Vector3 Space::gradient(const Vector3& y, double time, double most) const {
+  const double required = std::min(this->required(norm(y), time), most);
+  Vector3 away = y - of_.centre;
+  double gap = norm(away) - of_.radius;
+  if (body_ && (gap - required < of_.enough || of_.radius == 0)) {
+    Near last;
+    Vector3 foot;
+    gap = body_->signed_distance(y, last, &foot);
+    away = gap < 0 ? foot - y : y - foot;
+  }
+  if (corridor(y) <= gap - required) return unit(away);
+  const double along = dot(y, of_.axis), across = norm(y - along * of_.axis);
+  if (of_.tangent * along + of_.mouth - across > of_.reach - norm(y)) return -1.0 * unit(y);
+  return of_.tangent * of_.axis - unit(y - along * of_.axis);
+}
+
+// Turn the direction so that the margin at the worst instant grows to what is wanted, or by a part of that turn; several
+// times, as then another instant is the worst.
+void Space::improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const {
+  double share = 1;
+  for (int turn = 0; turn < TURNS && best.upper < wanted && share > SMALLEST_SHARE; ++turn) {
+    m.push = of_.a_max * d;
+    const Vector3 slope = gradient(m, best.at), across = slope - dot(slope, d) * d;
+    // the position at the instant changes by a tau^2 / 2 times the change of the direction
+    const double rate = 0.5 * of_.a_max * best.at * best.at * dot(across, across);
+    if (!(rate > 0)) return;
+    const double size = std::min((wanted - best.upper) / rate, LARGEST_TURN / norm(across));
+    const Vector3 other = unit(d + (share * size) * across);
+    m.push = of_.a_max * other;
+    const Least found = compared(m, best.upper);
+    if (found.upper > best.upper) {
+      best = found;
+      d = other;
+      share = std::min(2 * share, 1.0);
+    } else {
+      share *= 0.3;
     }
   }
 }
@@ -262,30 +306,28 @@ double Space::search(double time, const Vector3& r, const Vector3& v, double wan
   Near last;
   Manoeuvre m{time, 0, r, v, {}, span(time, r, v), 0, most(time, r, last)};
   wanted = std::min(wanted, of_.enough);
-  double value = -INFINITE;
-  if (!std::isnan(d[0])) {
-    m.push = of_.a_max * d;
-    value = compared(m, -INFINITE);
-    improve(m, wanted, d, value);
-  }
-  if (value >= 0) return value;
   Vector3 q, w;
   relative(time, r, v, q, w);
   Frame frame;
   motion(time, frame, false);
   const Vector3 outward = unit(q), along = std::isnan(of_.tangent) ? outward : times(frame.R, of_.axis);
-  bool better = false;
-  for (const Vector3& other : directions(outward, along)) {
-    m.push = of_.a_max * other;
-    const double found = compared(m, value);
-    if (found > value) {
-      value = found;
-      d = other;
-      better = true;
+  Least best{-INFINITE, -INFINITE, 0};
+  const auto compare = [&](const std::vector<Vector3>& every) {
+    bool better = false;
+    for (const Vector3& other : every) {
+      m.push = of_.a_max * other;
+      const Least found = compared(m, best.upper);
+      if (found.upper > best.upper) {
+        best = found;
+        d = other;
+        better = true;
+      }
     }
-  }
-  if (better) improve(m, wanted, d, value);
-  return value;
+    if (better) improve(m, wanted, d, best);
+  };
+  if (!std::isnan(d[0])) compare({Vector3(d)});
+  if (best.upper < std::min(wanted, 0.0)) compare(directions(outward, along));
+  return best.upper;
 }
 
 }  // namespace avs

@@ -45,15 +45,19 @@ class Space {
   // Predicted 1 sigma of position and attitude (n,) at equally spaced instants from 0 to ``end``.
   void set_sigma(double end, const double* position, const double* attitude, size_t n);
 
-  Margin margin(const Vector3& y, double time, double most, Near& last) const;
+  // Margin of a point, and the required distance. A margin of ``below`` or more may be replaced by a lower bound that is
+  // no smaller than that.
+  Margin margin(const Vector3& y, double time, double most, Near& last, double below = HUGE_VAL) const;
+  // Gradient in {C} of the margin at a point.
+  Vector3 gradient(const Vector3& y, double time, double most) const;
   // Largest distance to the surface that is required of manoeuvres from a point.
   double most(double time, const Vector3& r, Near& last) const;
   // Duration of an escape until the robot recedes outside the sphere; ``m.span`` is the longest one.
   double ended(const Manoeuvre& m) const;
   // Longest duration of an escape from a state.
   double span(double time, const Vector3& r, const Vector3& v) const;
-  // Smallest margin at instants tau (n,) of a manoeuvre and its time; only at those farther than ``apart`` from ``from``.
-  Least at_instants(const Manoeuvre& m, const double* tau, size_t n, double from, double apart) const;
+  // Margins at instants tau (n,) of a manoeuvre; those above ``below`` may be lower bounds.
+  void margins(const Manoeuvre& m, const double* tau, size_t n, double below, double* out) const;
   // Bounds of the smallest margin of a manoeuvre; where ``target`` is proven nothing is refined.
   Least least(const Manoeuvre& m, double target) const;
   // Improve the direction d of an escape until its margin, which is returned, is ``wanted``. Without a known direction
@@ -75,8 +79,9 @@ class Space {
   void relative(double time, const Vector3& r, const Vector3& v, Vector3& q, Vector3& w) const;
   Node node(const Manoeuvre& m, double tau, Near& last) const;
   bool recedes(const Manoeuvre& m, double tau) const;
-  double compared(const Manoeuvre& m, double floor) const;
-  void improve(Manoeuvre& m, double wanted, Vector3& d, double& value) const;
+  Least compared(const Manoeuvre& m, double floor) const;
+  Vector3 gradient(const Manoeuvre& m, double tau) const;
+  void improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const;
 
   const Body* body_;
   SpaceParams of_;
