@@ -440,7 +440,8 @@ def _withdrawal_rows(
     reserve = least_m + max(case.reserve_m + reserve_m, space.resolution_m)
     near = np.flatnonzero(found.margins_m < max(FAR * case.buffer_m, reserve))
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
-    late = np.round((found.at[near] / found.worst.span[near]) ** (1.0 / DENSER) * COMPARED)
+    after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
+    late = np.round(after ** (1.0 / DENSER) * COMPARED)
     order = np.lexsort((found.margins_m[near], late, part))
     key = ((COMPARED + 1.0) * part + late)[order]
     k = near[order][np.r_[True, np.diff(key) > 0.0]] if len(order) else near

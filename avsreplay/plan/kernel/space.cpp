@@ -9,8 +9,8 @@ namespace {
 
 constexpr double INFINITE = std::numeric_limits<double>::infinity();
 constexpr double RADIAN = 3.14159265358979323846 / 180;
-constexpr int COMPARED = 24;    // instants at which the directions of an escape are compared
-constexpr double DENSER = 1.7;  // power of the share of its duration: they are denser at the begin
+constexpr int COMPARED = 32;    // instants at which the directions of an escape are compared
+constexpr double DENSER = 1.3;  // power of the share of its duration: they are denser at the begin
 constexpr int INTERVALS = 6;    // intervals of a manoeuvre at the begin
 constexpr int HALVINGS = 15;    // largest number of halvings of one of them
 constexpr int SIDES = 6;        // directions around another one
