@@ -16,6 +16,7 @@ from avsreplay.estimate.plugged import estimator_of
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.parts import OWN
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan._cone import Body
 from avsreplay.plan.arm import with_arm
@@ -27,7 +28,8 @@ from avsreplay.region import Region
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
 from avsreplay.settings import SettingError
-from avsreplay.task import Task, patches, target_at, task_of
+from avsreplay.task import Patch, Task, patches, target_at, task_of
+from avsreplay.tracker import Tracker
 
 
 def stages(
@@ -85,7 +87,14 @@ def stages(
         reacquire=config.reacquire,
         initialise=_initialise(config, header, truth_of),
         region=Region(np.array(config.region_start()), low, high) if config.region else None,
+        tracker=_tracker(config, 0.5 * (low + high), surface.extent),
     )
+
+
+def _tracker(config: RunConfig, middle: Array, extent_m: float) -> Tracker | None:
+    """The tracker of a model; None with the method of the paper and with a plug-in."""
+    own = config.estimator.method == OWN and config.estimator.start is not Start.PAPER
+    return Tracker(middle, extent_m) if own and config.estimator.robust else None
 
 
 def _tolerance(task: Task) -> tuple[float, float, float]:
@@ -134,19 +143,55 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
     )
 
 
+<<<<<<< HEAD
 def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
+=======
+def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]:
+    """Closest points (n, 3) and signed distances (n,) of points (n, 3) in {C}.
+
+    A point is inside where the winding number of the faces is above one half: also where closed
+    parts overlap and the nearest face is inside another part. An open sheet has no inside.
+    """
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+
+    @cache
+    def indexed() -> tuple[SurfaceIndex, Winding]:
+        return SurfaceIndex.build(surface, surface.extent), winding(
+            surface.vertices, np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3)
+        )
+
+    def closest(y: Array) -> tuple[Array, Array]:
+        index, turns = indexed()
+        found = index.closest(y)
+        distance = np.sqrt(found.d2)
+        within = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
+        inside = turns.inside(np.ascontiguousarray(y[within]), distance[within], INSIDE)
+        distance[within[inside]] *= -1.0
+        return found.foot, distance
+
+    return closest
+
+
+def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
+    """Return flat patches of a model that a straight approach reaches, the largest first.
+
+    Args:
+        surface: model of the target in {C}.
+    """
+    return patches(surface, _signed_distance(surface))
+
+
+def grasp_advice(task: Task, surface: Surface) -> str:
+>>>>>>> main
     """Return in words which grasp points could be used in place of one that cannot.
 
     Args:
         task: compared with the model.
         surface: model of the target.
-        axis_c: outward axis of the fixture in {C}.
     """
     if not task.problem:
         return ""
-    closest = target_geometry(surface, axis_c).surface
-    assert closest is not None
-    found = patches(surface, closest)
+    found = grasp_patches(surface)
     if not found:
         return "name one with task.grasp_m and task.axis"
     return f"patches that can be reached: {', '.join(patch.option for patch in found)}"

@@ -1,19 +1,45 @@
 """Parts that plug in: classes that this package or another one provides under a name.
 
 A part is a class with the attributes ``name``, ``about`` and ``parameters``, its parameter class
-(``settings.Settings``). Back ends of registration and kinds of fault are parts. A package registers
-a part in the entry-point group of its kind. A field that is declared with ``setting(Tables,
-parts=GROUP)`` contains one table of parameters for each of them: ``[register.NAME]``.
+(``settings.Settings``). Back ends of registration, estimators and kinds of fault are parts. A
+package registers a part in the entry-point group of its kind. A field that is declared with
+``setting(Tables, parts=GROUP)`` contains one table of parameters for each of them:
+``[register.NAME]``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from typing import Any
 
 from avsreplay.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltIn:
+    """A part that the program itself builds, with the settings of its stage as its parameters.
+
+    Attributes:
+        name: of the part.
+        about: what it is, in one line.
+        parameters: None: it has no table of its own.
+    """
+
+    name: str
+    about: str
+    parameters: None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LawResult:
+    """Result of one law of a contract: its name, whether it holds and the figures in one line."""
+
+    law: str
+    held: bool
+    detail: str
 
 
 class Parts:
@@ -77,3 +103,13 @@ def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
 
 BACKENDS = Parts("avsreplay.backends", "registration back end", "--backend")
 FAULTS = Parts("avsreplay.faults", "kind of fault", "kind")
+OWN, PRINTED = "own", "paper"  # the estimators that are no plug-ins
+ESTIMATORS = Parts(
+    "avsreplay.estimators",
+    "estimator",
+    "--estimator",
+    (
+        BuiltIn(OWN, "batch fit and noise-adaptive constrained filter, with tests of hypotheses"),
+        BuiltIn(PRINTED, "the noise-adaptive constrained filter as printed in the paper"),
+    ),
+)

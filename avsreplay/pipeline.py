@@ -8,6 +8,7 @@ fit. Nothing here has access to ground truth.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -22,6 +23,7 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import Prediction, Track, in_doubt, with_change
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.estimate.kinematic import Motion, kinematic_track
 from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
@@ -41,14 +43,26 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.plan.rendezvous import rendezvous
-from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
+from avsreplay.records import (
+    Alignment,
+    Belief,
+    Forecast,
+    Innovation,
+    Reason,
+    Scan,
+    Verdict,
+)
 from avsreplay.region import Followed, Region
 from avsreplay.register.backend import measured_alignment
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import Effort, effort_for, shown
+from avsreplay.tracker import Kinematics, Tracker
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
+# Scans in a row that the estimate of the free body uses, after which the target counts as free
+# again. With fewer it is left and returned to more often.
+FREE_AGAIN = 10
 
 
 @value_class
@@ -206,6 +220,8 @@ class Stages:
         deskew: move points with times of their own to the scan's instant by the predicted motion.
         reacquire: register without a guess where the prediction is too uncertain to be one.
         region: what follows the target and removes the points around it; None: all are used.
+        tracker: what judges a pose by those before it where the target does not move freely; None
+            with the method of the paper and with an estimator that is a plug-in.
         initialise: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
     """
 
@@ -221,6 +237,27 @@ class Stages:
     reacquire: bool
     initialise: Callable[[Scan], tuple[Pose | None, str]]
     region: Region | None = None
+    tracker: Tracker | None = None
+
+
+@value_class
+class Following:
+    """What is known of the target whatever moves it.
+
+    Attributes:
+        kinematics: the track of its poses; None before one.
+        contradicted: the estimate of the free body did not use the last pose, and the track
+            confirms it.
+        driven: that estimate has found no explanation for a pose that the track confirms.
+        used: scans in a row that it has used since.
+        shown: while the target is driven, the estimate that is published in place of that one.
+    """
+
+    kinematics: Kinematics | None = None
+    contradicted: bool = False
+    driven: bool = False
+    used: int = 0
+    shown: Track | None = None
 
 
 @value_class
@@ -235,6 +272,8 @@ class PipelineState:
         origin: where the first pose came from.
         followed: the target, where a region follows it.
         start_ns: instant of the first scan.
+        following: the target whatever moves it.
+        content: digest of the points or the pose of the last scan that had any.
     """
 
     monitors: MonitorState
@@ -245,6 +284,8 @@ class PipelineState:
     start_ns: int = 0
     failed: tuple[Array, ...] = ()
     followed: Followed | None = None
+    following: Following = Following()
+    content: str = ""
 
     @property
     def captured_ns(self) -> int | None:
@@ -263,24 +304,33 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     Returns:
         The state after the scan and the outcome of the scan.
     """
+    content = _content(scan)
+    repeated = bool(content) and content == state.content
     scan, followed = _in_region(stages, state, scan)
     state, track, acquired = _track(stages, state, scan)
     errors, predicted = track.errors, stages.estimator.predict(track, scan.t_ns)
-    measurement = acquired or _register(stages, state, scan, predicted)
+    tracked = _tracked(stages, state, scan.t_ns)
+    measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
-    if acquired is None and not verdict.gamma and _prediction_lost(stages, scan, predicted):
+    prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
+    lost = tracked is None and _prediction_lost(stages, scan, predicted)
+    if acquired is None and not verdict.gamma and lost:
         measurement = _acquire(
             stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired"
         )
-        prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+        prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     track, verdict = stages.estimator.step(
         track, prior, innovation, verdict, state.monitors.convergence.converged
     )
+    following, verdict = _followed_on(stages, state, scan, measurement, track, verdict)
     gamma, used = verdict.gamma, measurement.alignment if verdict.gamma else None
     track = track.changed(
         errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor)
     )
+    free = track
+    if following.shown is not None:
+        track = following.shown
+        prior, innovation = _seen(stages, state, scan, measurement) or (prior, innovation)
     belief = stages.estimator.published(track)
     planned = _planned_time(stages, state.guidance, belief)
     seen = innovation, gamma, track, belief, planned, stages.grasp_c
@@ -319,10 +369,77 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     failed = _failed(state, scan) if pose is None else ()
     return (
         PipelineState(
-            monitors, guidance, track, pose, state.origin, state.start_ns, failed, followed
+            monitors,
+            guidance,
+            free,
+            pose,
+            state.origin,
+            state.start_ns,
+            failed,
+            followed,
+            following,
+            content or state.content,
         ),
         outcome,
     )
+
+
+def _tracked(stages: Stages, state: PipelineState, t_ns: int) -> Motion | None:
+    """The motion that the tracker predicts, where the estimate of the free body contradicts the
+    last poses; else None.
+    """
+    following = state.following
+    if stages.tracker is None or not (following.contradicted or following.driven):
+        return None
+    return stages.tracker.predicted(following.kinematics, t_ns)
+
+
+def _followed_on(
+    stages: Stages,
+    state: PipelineState,
+    scan: Scan,
+    measurement: Measurement,
+    track: Track,
+    verdict: Verdict,
+) -> tuple[Following, Verdict]:
+    """What is known of the target whatever moves it after a scan, and the final verdict.
+
+    A pose that the track confirms is used also where the estimate of the free body finds no
+    explanation for it, and from then on where that one is in doubt.
+    """
+    tracker, before = stages.tracker, state.following
+    if tracker is None:
+        return before, verdict
+    kinematics, confirmed = tracker.after(before.kinematics, scan.t_ns, measurement.alignment)
+    if verdict.gamma:
+        kinematics = tracker.used(kinematics, scan.t_ns)
+    contradicted = confirmed and verdict.reason in (Reason.POSE_JUMP, Reason.DOUBTFUL)
+    unexplained = contradicted and verdict.reason is Reason.POSE_JUMP
+    used = 0 if contradicted else before.used + verdict.gamma
+    driven = unexplained or (before.driven and used < FREE_AGAIN)
+    shown = None
+    if driven and kinematics is not None:
+        if contradicted:
+            verdict = Verdict(1, Reason.OK)
+        known = kinematics.t_ns == scan.t_ns or tracker.predicted(kinematics, scan.t_ns) is not None
+        if known:
+            motion = tracker.motion(kinematics, scan.t_ns)
+            of = stages.estimator.frame, stages.estimator.params
+            shown = kinematic_track(*of, track, scan.t_ns, motion)
+    return Following(kinematics, contradicted, driven, used, shown), verdict
+
+
+def _seen(
+    stages: Stages, state: PipelineState, scan: Scan, measurement: Measurement
+) -> tuple[Prediction, Innovation] | None:
+    """Prior and innovation of a pose by the kinematic estimate of the last scan, None without
+    one.
+    """
+    before = state.following.shown
+    if before is None or not measurement.alignment.measured:
+        return None
+    prior = stages.estimator.predict(before, scan.t_ns)
+    return prior, stages.estimator.innovate(prior, measurement.alignment)
 
 
 def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
@@ -369,8 +486,9 @@ def _in_region(stages: Stages, state: PipelineState, scan: Scan) -> tuple[Scan, 
     """The scan with the points in the region of the target, and where the target is followed to."""
     if stages.region is None or scan.pose is not None or not len(scan.points):
         return scan, state.followed
-    pose = None
-    if state.track is not None and state.last_pose is not None:
+    tracked = _tracked(stages, state, scan.t_ns)
+    pose = None if tracked is None else tracked.T_ac
+    if pose is None and state.track is not None and state.last_pose is not None:
         predicted = stages.estimator.predict(state.track, scan.t_ns)
         if not _prediction_lost(stages, scan, predicted):
             pose = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
@@ -401,9 +519,15 @@ def _track(
 
 
 def _register(
-    stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction
+    stages: Stages,
+    state: PipelineState,
+    scan: Scan,
+    predicted: Prediction,
+    tracked: Motion | None,
 ) -> Measurement:
-    """Register the scan from the configured guess; a measured pose is taken as it is."""
+    """Register the scan from the configured guess, or from that of the tracker where there is one;
+    a measured pose is taken as it is.
+    """
     if scan.pose is not None:
         return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
@@ -415,6 +539,8 @@ def _register(
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
+    elif tracked is not None:
+        guess, origin = tracked.T_ac, "tracked"
     effort, carried = _effort(state, scan), points is not scan.points
     unknown = (
         None
@@ -439,6 +565,16 @@ def _effort(state: PipelineState, scan: Scan) -> Effort:
     return effort_for(shown(scan.points), state.failed)
 
 
+def _content(scan: Scan) -> str:
+    """Digest of the points or the pose of a scan, empty where it has none."""
+    if scan.pose is not None:
+        T_ac = scan.pose.T_ac
+        return T_ac.q.tobytes().hex() + T_ac.t.tobytes().hex()
+    if not len(scan.points):
+        return ""
+    return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).hexdigest()
+
+
 def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:
     """What the scans without an accepted pose showed whose searches found none, with this scan."""
     seen = shown(scan.points)
@@ -458,7 +594,11 @@ def _measurement(
 
 
 def _judge(
-    stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
+    stages: Stages,
+    scan: Scan,
+    predicted: Prediction,
+    measurement: Measurement,
+    repeated: bool,
 ) -> tuple[Prediction, Innovation | None, Verdict]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured)
     and the verdict.
@@ -471,7 +611,7 @@ def _judge(
     return (
         predicted,
         innovation,
-        stages.faults.judge(scan.status, alignment, innovation, predicted.belief),
+        stages.faults.judge(scan.status, alignment, innovation, predicted.belief, repeated),
     )
 
 

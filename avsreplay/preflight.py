@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from avsreplay.build import grasp_patches, task_and_target
+from avsreplay.config import RunConfig
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
@@ -39,7 +41,7 @@ def preflight(
         surface: model of the target, None if there is none.
         registrar: of the model; with it the share of points on the model is measured where the
             first pose is known.
-        search: look for the model in some of the scans.
+        search: look for the model in some of the scans, and propose grasp points.
 
     Returns:
         The findings in the order of the checks.
@@ -47,12 +49,13 @@ def preflight(
     info, scans = source.info(), _sampled(source)
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
     general += _meaning(source)
+    grasp = _grasp_patches(surface) if search else _grasp_point(surface)
     if source.options.poses:
-        return [*_poses(source, surface), *_grasp_point(surface), *general]
+        return [*_poses(source, surface), *grasp, *general]
     found = [
         *_contents(source, scans, surface, registrar, search),
         *_faces(surface),
-        *_grasp_point(surface),
+        *grasp,
         *general,
     ]
     share = None if registrar is None else _share_on_model(source, registrar)
@@ -92,6 +95,21 @@ def _grasp_point(surface: Surface | None) -> list[Advice]:
         return []
     text = f"the grasp point, the origin of the model, is {distance:.3g} m outside of the model"
     return [Advice("check", "grasp point", text, "--grasp X,Y,Z")]
+
+
+def _grasp_patches(surface: Surface | None) -> list[Advice]:
+    """Whether a gripper can grasp at the grasp point, the origin of {C}, and flat patches of the
+    surface that can be used in its place.
+    """
+    if surface is None or not surface.sha256:
+        return []
+    patches = grasp_patches(surface)
+    task, _ = task_and_target(RunConfig(), surface)
+    found = []
+    if task.problem:
+        option = patches[0].option if patches else "--grasp X,Y,Z"
+        found.append(Advice("check", "grasp point", task.problem, option))
+    return found + [Advice("ok", f"patch {each.name}", each.text, each.option) for each in patches]
 
 
 def _sampled(source: Source) -> list[Scan]:

@@ -1,8 +1,8 @@
 """What the reading of one input may use: one object that is passed to every reader.
 
 Bytes, records, depth of nesting and work of parsing are counted, never time, so that the same file
-is accepted or refused on every machine. A reader asks before it allocates: what the file declares
-is compared with what its bytes can hold and with what is left of the budget.
+is accepted or rejected on every machine. Before a reader allocates, what the file declares is
+compared with what its bytes can hold and with what is left of the budget.
 """
 
 from __future__ import annotations

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from types import MappingProxyType
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -359,6 +362,7 @@ _STATUS_WORDS = {
 _REASON_WORDS = {
     "ok": "The scan is used.",
     "no_scan": "The scan is empty or damaged.",
+    "frozen": "The sensor repeats the scan before, although the target moves.",
     "not_aligned": "The registration found no overlap, failed, or is ambiguous.",
     "not_converged": "The registration did not converge.",
     "few_inliers": "Too few points, or too small a share of them, are close to the model.",
@@ -380,6 +384,9 @@ _GUESS_WORDS = {
     "given": "A pose given by an option.",
     "acquired": "A search without a guess.",
     "predicted": "The prediction of the filter.",
+    "tracked": (
+        "The prediction of the tracker, where the motion of a free body contradicts the last poses."
+    ),
     "last": "The pose of the last healthy scan.",
     "measured": "None was needed, because the log holds poses.",
 }
@@ -388,6 +395,7 @@ _ESTIMATOR_WORDS = {
     "start": "The first poses of a cold start.",
     "fit": "A maximum-likelihood fit to all poses.",
     "filter": "The Kalman filter.",
+    "kinematic": "The tracker, where the motion of a free body contradicts the poses.",
 }
 _REFERENCE_WORDS = {
     "truth": "True poses of the log or of a file.",
@@ -1042,3 +1050,16 @@ def columns() -> tuple[Column, ...]:
     return tuple(
         dataclasses.replace(f.metadata["column"], name=f.name) for f in dataclasses.fields(Row)
     )
+
+
+@cache
+def field_types() -> Mapping[str, tuple[type, bool]]:
+    """Column name -> (str, int, float or bool; whether it may be null)."""
+    hints = typing.get_type_hints(Row)
+    names = (field.name for field in dataclasses.fields(Row))
+    return MappingProxyType({name: _split(hints[name]) for name in names})
+
+
+def _split(hint: Any) -> tuple[type, bool]:
+    args = typing.get_args(hint)
+    return (next(a for a in args if a is not type(None)), True) if args else (hint, False)

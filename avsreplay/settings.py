@@ -237,14 +237,14 @@ class Tables:
         """
         return cast(S, dict(self.given).get(name) or kind())
 
-    def including(self, name: str, values: Settings) -> Tables:
-        """Return the tables that change something, and that of a further part.
+    def with_part(self, name: str, kind: type[Settings]) -> Tables:
+        """Return the tables that change something, and that of a part, given or default.
 
         Args:
             name: Its name.
-            values: Its parameters.
+            kind: Its parameter class.
         """
-        return Tables(tuple(sorted({**dict(self._changed()), name: values}.items())))
+        return Tables(tuple(sorted({**dict(self._changed()), name: self.of(name, kind)}.items())))
 
 
 def declared_of(field: dataclasses.Field[Any]) -> Setting:

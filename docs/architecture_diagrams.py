@@ -1,5 +1,5 @@
-"""Draws the diagrams in architecture.md from the source code: python docs/architecture_diagrams.py
-[--check]
+"""Draws the diagrams in developer/architecture.md from the source code:
+``python docs/architecture_diagrams.py [--check]``.
 
 The package diagram shows every import between the layers of the import contract in pyproject.toml,
 without the edges that follow from others. The second diagram lists the calls to the stages in
@@ -14,7 +14,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "architecture.md"
+PAGE = ROOT / "docs" / "developer" / "architecture.md"
 
 
 def layers() -> list[list[str]]:
@@ -126,6 +126,6 @@ if __name__ == "__main__":
         sys.exit(
             0
             if page() == PAGE.read_text(encoding="utf-8")
-            else "docs/architecture.md is not current"
+            else "docs/developer/architecture.md is not current"
         )
     PAGE.write_text(page(), encoding="utf-8")

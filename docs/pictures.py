@@ -1,21 +1,27 @@
-"""Makes the pictures of the documentation from the tool's own output: ``python docs/pictures.py
-[LOG [FULL]]``.
+"""Makes all pictures of the documentation from the tool's own output: ``python docs/pictures.py
+[--only NAME]``.
 
-Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of
-the fixtures; with FULL, a recording of the built-in scenario, it also makes the plots of the
-results page. The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390
-pixels, a comparison, and an animation.
+Needs Chromium with its driver, Pillow and selenium (``apt-get install chromium chromium-driver``,
+``pip install '.[test]'``). The runs are those of the pages that show them: the built-in scenario
+(first result, results, report, planning, faults), the bag of the tutorial (your own log), and two
+runs of the fixture (continuous integration).
 """
 
 from __future__ import annotations
 
+import argparse
+import io
+import json
 import os
 import pty
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 from rich.console import Console
@@ -23,25 +29,21 @@ from rich.text import Text
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
-MOST_BYTES = 1_500_000
-COLOURS = 128
-FLAGS = (
-    *(
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--use-gl=swiftshader",
-        "--enable-unsafe-swiftshader",
-    ),
-    *("--hide-scrollbars", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--virtual-time-budget=8000"),
+MOST_BYTES = 2_000_000  # of all pictures
+COLOURS = 128  # of the palette of a picture
+LINES = 24  # of the first screen
+DEMO_WIDTH = 760  # pixels of the animation
+DEMO_STEPS = 24  # scans of the flight that it shows
+COMMAND = "avsreplay run tumble.mcap -o results/ --report"
+OWN = (
+    "own.bag --model target.stl --model-unit mm --crop-range 1.45,7.44 --fixed-frame map"
+    " --truth-topic /mocap/pose"
 )
 
 
-def terminal(columns: int, *words: str, cwd: Path) -> Text:
-    """What a command prints on a terminal of this width, with its colours."""
+def terminal(columns: int, command: str, cwd: Path) -> Text:
+    """What a command prints on standard output of a terminal of this width, with its colours."""
     reader, writer = pty.openpty()
-    os.set_blocking(reader, True)
     env = {
         **os.environ,
         "COLUMNS": str(columns),
@@ -50,7 +52,7 @@ def terminal(columns: int, *words: str, cwd: Path) -> Text:
         "COLORTERM": "truecolor",
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", "avsreplay", *words],
+        [sys.executable, "-m", *command.split()],
         cwd=cwd,
         env=env,
         stdout=writer,
@@ -68,110 +70,172 @@ def terminal(columns: int, *words: str, cwd: Path) -> Text:
     return Text.from_ansi(b"".join(parts).decode("utf-8", "replace").replace("\r\n", "\n"))
 
 
-def screen(text: Text, columns: int, lines: int, to: Path, folder: Path, command: str) -> None:
-    """A picture of the first lines of a terminal."""
-    console = Console(
-        record=True, width=columns, file=(folder / "unused").open("w"), force_terminal=True
-    )
-    console.print(Text(f"$ {command}", style="bold"))
-    for line in text.split("\n")[:lines]:
-        console.print(line, no_wrap=True, crop=True)
-    page = folder / "terminal.html"
-    style = (
-        "<style>body{background:#14181d!important;color:#e6e6e6!important;margin:14px}"
-        "pre{font-size:14px}</style>"
-    )
-    page.write_text(
-        console.export_html(inline_styles=True).replace("</head>", style + "</head>"),
-        encoding="utf-8",
-    )
-    shot(page, to, round(8.45 * columns) + 30, round(16.05 * (lines + 1)) + 30)
+class Browser:
+    """A headless Chromium, and pictures of what it shows."""
 
+    def __init__(self, driver: Any, folder: Path) -> None:
+        self.driver, self.folder = driver, folder
 
-def shot(page: Path, to: Path, width: int, height: int) -> None:
-    """A screenshot of a page."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or "chromium"
-    with tempfile.TemporaryDirectory() as profile:
-        size = (f"--window-size={max(width, 500)},{height}", f"--user-data-dir={profile}")
-        command = [chromium, *FLAGS, *size, f"--screenshot={to}", page.resolve().as_uri()]
-        subprocess.run(command, check=True, capture_output=True, timeout=180)
-    image = Image.open(to).convert("RGB").crop((0, 0, width, height))
-    image.quantize(COLOURS, dither=Image.Dither.NONE).save(to, optimize=True)
+    def open(self, page: Path, width: int, height: int) -> None:
+        """Show a page in a window of this size [CSS pixels]."""
+        size = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": 1,
+            "mobile": width < 500,
+        }
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        self.driver.get(page.resolve().as_uri())
 
+    def shot(self) -> Image.Image:
+        """What the window shows."""
+        return Image.open(io.BytesIO(self.driver.get_screenshot_as_png())).convert("RGB")
 
-def phone(page: Path, to: Path, folder: Path) -> None:
-    """A screenshot at 390 pixels: Chromium's window is at least 500 wide, so the page is
-    shown in a frame.
-    """
-    frame = folder / "phone.html"
-    inner = (
-        f'<iframe src="{page.resolve().as_uri()}"'
-        ' style="width:390px;height:1500px;border:0"></iframe>'
-    )
-    frame.write_text(f'<body style="margin:0">{inner}</body>', encoding="utf-8")
-    shot(frame, to, 390, 1500)
+    def part(self, selector: str) -> Image.Image:
+        """The first element that a selector finds."""
+        found = self.driver.find_elements("css selector", selector)
+        if not found:
+            sys.exit(f"the page has no {selector}")
+        return Image.open(io.BytesIO(found[0].screenshot_as_png)).convert("RGB")
 
-
-def plots(page: Path, to: Path, folder: Path) -> None:
-    """The first charts of a page, without anything else."""
-    hidden = "header, #lead, #controls, #scene, .tables, footer { display: none !important }"
-    style = f"<style>{hidden} main {{ display: block !important }}</style></head>"
-    bare = folder / "plots.html"
-    bare.write_text(page.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
-    shot(bare, to, 900, 1170)
-
-
-def animation(frames: list[Path], to: Path) -> None:
-    """The pictures one after another at one size."""
-    images = []
-    for path in frames:
-        image = Image.open(path).convert("RGB")
-        image = image.resize(
-            (720, round(image.height * 720 / image.width)), Image.Resampling.LANCZOS
+    def choose(self, row: int) -> None:
+        """Move the page of a run to a scan."""
+        self.driver.execute_script("location.hash = 'row=' + arguments[0]", row)
+        self.driver.execute_async_script(
+            "const done = arguments[0];"
+            " requestAnimationFrame(() => requestAnimationFrame(() => done()))"
         )
-        canvas = Image.new("RGB", (720, 540), (20, 24, 29))
-        canvas.paste(image.crop((0, 0, 720, 540)), (0, 0))
-        images.append(canvas.quantize(COLOURS, dither=Image.Dither.NONE))
-    images[0].save(
-        to,
+
+    def screen(self, columns: int, typed: str, printed: Text | None = None) -> Image.Image:
+        """The first lines of a terminal: the typed command, then what it prints."""
+        console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
+        console.print(Text(f"$ {typed}", style="bold"))
+        for line in printed.split("\n")[:LINES] if printed else ():
+            console.print(line, no_wrap=True, crop=True)
+        style = (
+            "<style>body{background:#14181d!important;color:#e6e6e6!important;margin:14px}"
+            "pre{font-size:14px}</style></head>"
+        )
+        page = self.folder / "terminal.html"
+        text = console.export_html(inline_styles=True).replace("</head>", style)
+        page.write_text(text, encoding="utf-8")
+        self.open(page, round(8.45 * columns) + 30, round(16.05 * (LINES + 1)) + 30)
+        return self.shot()
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Browser]:
+    """Start and end the browser."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium") or "chromium"
+    for flag in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--hide-scrollbars",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ):
+        options.add_argument(flag)
+    service = webdriver.ChromeService(shutil.which("chromedriver"))
+    driver = webdriver.Chrome(options=options, service=service)
+    driver.set_script_timeout(300)
+    try:
+        yield Browser(driver, folder)
+    finally:
+        driver.quit()
+
+
+def save(image: Image.Image, name: str) -> None:
+    """Write a picture with a small palette."""
+    image.quantize(COLOURS, dither=Image.Dither.NONE).save(IMAGES / name, optimize=True)
+
+
+def demo(show: Browser, printed: Text, page: Path, scans: int) -> None:
+    """The animation: a command as it is typed, its first screen, then the flight on the page."""
+    lengths = [*range(0, len(COMMAND), 4), len(COMMAND)]
+    frames = [(show.screen(80, COMMAND[:length] + "▏"), 90) for length in lengths]
+    frames += [(show.screen(80, COMMAND), 700), (show.screen(80, COMMAND, printed), 4500)]
+    show.open(page, 1000, 700)
+    for k in range(DEMO_STEPS):
+        show.choose(1 + round((scans - 2) * k / (DEMO_STEPS - 1)))
+        show.driver.execute_script("document.querySelector('#controls').scrollIntoView()")
+        frames.append((show.shot(), 180))
+    frames[-1] = (frames[-1][0], 2500)
+    height = max(round(i.height * DEMO_WIDTH / i.width) for i, _ in frames)
+    drawn = []
+    for image, _ in frames:
+        size = (DEMO_WIDTH, round(image.height * DEMO_WIDTH / image.width))
+        canvas = Image.new("RGB", (DEMO_WIDTH, height), (20, 24, 29))
+        canvas.paste(image.resize(size, Image.Resampling.LANCZOS), (0, 0))
+        drawn.append(canvas.quantize(COLOURS, dither=Image.Dither.NONE))
+    drawn[0].save(
+        IMAGES / "demo.gif",
         save_all=True,
-        append_images=images[1:],
-        duration=[1800, 3500, 4500],
+        append_images=drawn[1:],
+        duration=[time for _, time in frames],
         loop=0,
         optimize=True,
     )
 
 
-def main(log: Path, full: Path | None = None) -> None:
-    """Make all pictures; ``full`` is the recording of the built-in scenario, for the page of
-    results.
-    """
+def built_in(show: Browser, folder: Path) -> None:
+    """Pictures of the built-in scenario."""
+    terminal(80, "avsreplay record -o tumble.mcap", folder)
+    printed = terminal(80, COMMAND, folder)
+    page = folder / "results" / "report.html"
+    rows = (folder / "results" / "rows.jsonl").read_text(encoding="utf-8").splitlines()
+    closed = [k for k, row in enumerate(rows) if json.loads(row)["capture_miss_m"] is not None]
+    scans = closed[0] + 5 if closed else len(rows)
+    save(show.screen(80, COMMAND, printed), "verdict-80.png")
+    show.open(page, 390, 1500)
+    save(show.shot(), "page-390.png")
+    show.open(page, 1400, 1200)
+    show.choose(scans - 40)
+    save(show.shot(), "page.png")
+    save(show.part(".approach"), "approach.png")
+    show.open(page, 900, 1170)
+    show.driver.execute_script(
+        "document.querySelectorAll('header, #lead, #controls, #scene, .tables, footer')"
+        ".forEach((each) => each.remove()); scrollTo(0, 0)"
+    )
+    save(show.shot(), "results.png")
+    demo(show, printed, page, scans)
+
+
+def own_log(show: Browser, folder: Path) -> None:
+    """The page of the run of the tutorial."""
+    bag = [sys.executable, str(ROOT / "docs" / "examples" / "own_bag.py"), str(folder)]
+    subprocess.run(bag, check=True)
+    terminal(80, f"avsreplay run {OWN} -o own --report", folder)
+    show.open(folder / "own" / "report.html", 1400, 1000)
+    save(show.shot(), "own-log.png")
+
+
+def comparison(show: Browser, folder: Path) -> None:
+    """The page of a comparison."""
+    log = str(ROOT / "fixtures" / "tumble.mcap")
+    terminal(80, f"avsreplay run {log} -o baseline", folder)
+    terminal(80, f"avsreplay run {log} -o candidate --set estimator.adapt=off", folder)
+    terminal(80, "avsreplay compare baseline candidate -o compare.html", folder)
+    show.open(folder / "compare.html", 1400, 1000)
+    save(show.shot(), "comparison.png")
+
+
+PARTS = {"built-in": built_in, "own-log": own_log, "comparison": comparison}
+
+
+def main() -> None:
+    """Make the pictures, or those of one part."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=PARTS, help="the pictures of one run")
+    only = parser.parse_args().only
     IMAGES.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        shutil.copy(log, folder / "tumble.mcap")
-        command = "avsreplay run tumble.mcap -o results/ --report"
-        narrow = terminal(80, "run", "tumble.mcap", "-o", "results", "--report", cwd=folder)
-        wide = terminal(160, "run", "tumble.mcap", cwd=folder)
-        screen(narrow, 80, 34, IMAGES / "verdict-80.png", folder, command)
-        screen(wide, 160, 34, IMAGES / "verdict-160.png", folder, "avsreplay run tumble.mcap")
-        screen(Text(""), 80, 34, folder / "typed.png", folder, command)
-        page = folder / "results" / "report.html"
-        shot(page, IMAGES / "page.png", 1400, 1300)
-        phone(page, IMAGES / "page-390.png", folder)
-        if full is not None:
-            shutil.copy(full, folder / "full.mcap")
-            terminal(80, "run", "full.mcap", "-o", "full", "--report", cwd=folder)
-            plots(folder / "full" / "report.html", IMAGES / "results.png", folder)
-        terminal(
-            80, "run", "tumble.mcap", "-o", "other", "--set", "estimator.adapt=off", cwd=folder
-        )
-        terminal(80, "compare", "results", "other", "-o", "compare.html", cwd=folder)
-        shot(folder / "compare.html", IMAGES / "comparison.png", 1400, 1000)
-        animation(
-            [folder / "typed.png", IMAGES / "verdict-80.png", IMAGES / "page.png"],
-            IMAGES / "demo.gif",
-        )
+    with tempfile.TemporaryDirectory() as name, browser(Path(name)) as show:
+        for part in [only] if only else PARTS:
+            PARTS[part](show, Path(name))
     total = sum(path.stat().st_size for path in IMAGES.iterdir())
     print(f"{IMAGES}: {total / 1e6:.2f} MB")
     if total > MOST_BYTES:
@@ -179,5 +243,4 @@ def main(log: Path, full: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    given = [Path(word) for word in sys.argv[1:3]]
-    main(*(given or [ROOT / "fixtures" / "tumble.mcap"]))
+    main()

@@ -25,7 +25,7 @@ HISTORY = re.compile(
 # Verbs of people in place of what a computation does.
 PERSON = re.compile(
     r"\b(?:speaks|believe[sd]?|trust(?:s|ed)|knows|hopeless|remembers?|forgets?|wants|ask(?:s|ed)"
-    r"|refuse[sd]?)\b"
+    r"|refuse[sd]?)\b(?!\s*:|``)"
 )
 IMPORTS = "from importlinter.cli import lint_imports_command as check; check()"
 

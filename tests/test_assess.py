@@ -213,14 +213,26 @@ def test_a_run_without_a_capture_is_no_pass(fixtures_folder, more, chance, code)
     assert verdict["grade"] != "PASS"
 
 
-def test_the_first_screen_has_the_answer_and_the_four_quantities_in_80_columns(make_rows):
-    rows = make_rows(600)
-    verdict = verdict_of(rows, Summary.fold(rows))
+@pytest.mark.parametrize("columns", [80, 160])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"pos_err_m": None, "rot_err_deg": None, "reference": None},
+        {"reference": "fit"},
+        {"gamma": 0, "reason": "not_aligned", "converged": False},
+        {"action": "abort", "pos_err_m": 5.0, "rot_err_deg": 170.0, "nees": 1e4, "violations": 7},
+    ],
+)
+def test_the_first_screen_has_the_answer_and_the_four_quantities(make_rows, columns, changes):
+    rows = make_rows(600, **changes)
+    checks = [{"grade": "fail", "text": f"the {name} of the model is wrong"} for name in "abcd"]
+    verdict = verdict_of(rows, Summary.fold(rows), {"preflight": checks if changes else []})
     stream = io.StringIO()
-    print_screen(make_console(stream), rows, verdict)
+    print_screen(make_console(stream, width=columns), rows, verdict)
     lines = stream.getvalue().splitlines()
-    assert len(lines) <= 26
-    assert max(map(len, lines)) <= 80
+    assert len(lines) <= 23  # and the prompt
+    assert max(map(len, lines)) <= columns
     assert lines[0].startswith(verdict.line[:40])
     shown = " ".join(lines)
     for head in ("position", "attitude", "gamma", "log10 cond.", "capture [s]"):

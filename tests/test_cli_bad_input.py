@@ -147,7 +147,7 @@ def test_without_arguments_the_help_is_printed(cli):
 
 
 def test_a_log_or_a_folder_without_rows_is_no_result(cli, log, tmp_path):
-    check_one_line(cli("plan", log), 3, "name a directory written by run -o, or its rows.jsonl")
+    check_one_line(cli("plan", log), 3, "avsreplay run LOG -o DIR")
     check_one_line(cli("plan", tmp_path), 3, "holds no rows.jsonl")
 
 

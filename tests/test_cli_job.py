@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_cases import SECOND
+from mcap.writer import Writer
 
-from avsreplay.cli.job import job_text, read_job
 from avsreplay.errors import UsageError
+from avsreplay.geometry import Pose
+from avsreplay.job_file import job_text, read_job
 from avsreplay.log import LogWriter, SourceOptions
+from avsreplay.log.cdr import point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import surface_bytes
 from avsreplay.log.options import Unit
 from avsreplay.records import LogHeader, Scan
@@ -97,3 +100,45 @@ def test_info_tries_its_advice_and_run_replays_the_job(cli, millimetres, tmp_pat
     assert len(rows) == 2
     assert not any(row["gamma"] for row in rows)
     assert cli("info", log, "--model", model, "--write", job).code == 2, "the file exists"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", ["lidar", "map"])
+def test_a_fixed_frame_is_advised_only_where_the_true_poses_are_in_it(cli, tmp_path, frame) -> None:  # type: ignore[no-untyped-def]
+    """The sensor stands in ``map``, as a recording of /tf states; the truth is in either frame."""
+    surface, seen_at, in_map = boxes(), example_pose(), Pose(np.eye(4)[3], [1.0, -2.0, 0.5])
+    (tmp_path / "model.ply").write_bytes(surface_bytes(surface))
+    truth = seen_at if frame == "lidar" else in_map @ seen_at
+    with (tmp_path / "scans.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        channels = {
+            topic: writer.register_channel(
+                topic, "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind))
+            )
+            for topic, kind in (
+                ("/points", "sensor_msgs/msg/PointCloud2"),
+                ("/true", "geometry_msgs/msg/PoseStamped"),
+                ("/tf", "tf2_msgs/msg/TFMessage"),
+            )
+        }
+        for k in range(4):
+            rng, t_ns = np.random.Generator(np.random.PCG64(k)), SECOND * (k + 1)
+            points = seen_at.apply(view(surface, 1500, seen_at.inverse().t))
+            points += rng.normal(scale=0.002, size=points.shape)
+            for topic, message in (
+                ("/tf", transform(t_ns, "map", "lidar", in_map)),
+                ("/true", pose_stamped(t_ns, frame, truth)),
+                ("/points", point_cloud2(t_ns, "lidar", points, None)),
+            ):
+                writer.add_message(channels[topic], t_ns, message, t_ns)
+        writer.finish()
+    options = ("--model", tmp_path / "model.ply", "--truth-topic", "/true")
+    done = cli(
+        "info", tmp_path / "scans.mcap", *options, "--write", tmp_path / "job.toml", "--json"
+    )
+    assert done.code == 0, done.err
+    advised = tomllib.loads((tmp_path / "job.toml").read_text())["input"].get("fixed_frame")
+    assert advised == (None if frame == "lidar" else "map")
+    replay = [check for check in json.loads(done.out)["checks"] if check["about"] == "replay"]
+    assert [check["grade"] for check in replay] == ["ok"]

@@ -4,6 +4,7 @@ builds.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -38,8 +39,6 @@ SHORT = {
     "AVSREPLAY_SWEEP_LIMIT": "2",
 }  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
-    # of the README
-    "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",
     "avsreplay run long.mcap": (
         "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption"
     ),
@@ -50,9 +49,6 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay sweep docs/campaigns/blackouts.toml --run": (
         "test_sweep_run.py::test_the_worst_run_is_made_again"
     ),
-    "avsreplay sweep docs/campaigns/faults.toml": (
-        "test_sweep_statistics.py::test_the_campaign_of_faults_has_every"
-    ),
     "avsreplay run $D/stanford-dragon": "test_real.py::test_the_folder_itself_runs",
     "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
     "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
@@ -60,6 +56,12 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay model $D/stanford-bunny": "test_reconstruct.py::test_scans_of_the_bunny_that",
     "avsreplay run milk": "test_real.py::test_a_carton_in_a_depth_scene",
     "avsreplay run $D/ros1-bags": "test_real.py::test_raw_packets_are_named",
+    "avsreplay benchmark --quick -o quick/": (
+        "test_benchmark_run.py::test_one_table_shows_each_entry_and_the_scenario_without_data"
+    ),
+    "pip install docs/examples/own_entry": (
+        "test_docs.py::test_the_entry_of_the_tutorial_has_60_lines_and_gets_rows_in_the_table"
+    ),
     "pip install docs/examples/own_backend": (
         "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract"
     ),
@@ -138,14 +140,6 @@ def _scenarios(folder):
         shutil.copy(folder / "tumble.mcap", folder / name)
 
 
-def _real(folder):
-    data = ROOT.parent / "shared" / "data"
-    if not data.is_dir():
-        pytest.skip("../shared/data is not here")
-    (folder / "stanford-dragon").symlink_to(data / "stanford-dragon")
-    (folder / "tumble.mcap").unlink()
-
-
 def _campaigns(folder):
     shutil.copytree(ROOT / "docs" / "campaigns", folder / "docs" / "campaigns")
 
@@ -167,7 +161,7 @@ NEEDS = {
     "docs/poses.md": (_poses, _own_bag),
     "docs/report.md": (_scenarios,),
     "docs/scenario.md": (_scenarios,),
-    "docs/results.md": (_real,),
+    "docs/results.md": (_without_log,),
     "docs/sweep.md": (_campaigns,),
 }
 
@@ -217,8 +211,28 @@ def test_marked_blocks_run_in_order(page, folder):
         kind, _, rest = (block["mark"] or "").partition(":")
         if kind == "file":
             (folder / rest.strip()).write_text(block["text"], encoding="utf-8")
-        elif kind == "run":
+        elif kind == "run" and not _tool(block):
             _run(block, folder)
+
+
+def _tool(block):
+    """The program or module of others that a block needs, "" for none: ``run: needs NAME``."""
+    return (block["mark"] or "").partition("needs ")[2]
+
+
+RECIPES = ROOT / "docs" / "recipes.md"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "block", [b for b in _blocks(RECIPES) if _tool(b)], ids=lambda block: _tool(block)
+)
+def test_a_recipe_runs_with_its_tool(block, folder):
+    tool = _tool(block)
+    if not shutil.which(tool) and importlib.util.find_spec(tool) is None:
+        pytest.skip(f"{tool} is not installed")
+    _run(_blocks(RECIPES)[0], folder)
+    _run(block, folder)
 
 
 def _commands(block):
@@ -316,6 +330,29 @@ def _checks(tmp_path, example, command, name):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
+def test_the_entry_of_the_tutorial_has_60_lines_and_gets_rows_in_the_table(tmp_path):
+    package = ROOT / "docs" / "examples" / "own_entry"
+    texts = [path.read_text(encoding="utf-8") for path in sorted(package.iterdir())]
+    assert sum(bool(line.strip()) for text in texts for line in text.splitlines()) <= 60
+    _checks(tmp_path, "own_entry", "backends", "mine")
+    words = "benchmark --quick -o out --backend mine,horn --estimator smooth,own --workers 0"
+    done = subprocess.run(
+        [sys.executable, "-m", "avsreplay", *words.split(), "--only=clean-fast", "--n-scans=12"],
+        env={**_environment(), "PYTHONPATH": str(tmp_path / "site")},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "out" / "benchmark.json").read_text(encoding="utf-8"))
+    used = {run["entry"]: run["used"] for run in found["runs"]}
+    assert set(used) == {"mine+smooth", "mine+own", "horn+smooth", "horn+own"}
+    assert min(used.values()) > 6
+
+
 def _command_lines(page):
     for block in _blocks(page):
         if block["language"] in ("sh", "bash", "console", "yaml"):
@@ -397,7 +434,7 @@ def test_the_glossary_explains_terms_that_occur_and_names_sections_that_exist():
         for cell in re.findall(r"^\| ([^|]+) \| .*[.?] \|$", terms, flags=re.M)
         for term in cell.split(", ")
     ]
-    assert len(named) > 40
+    assert len(named) > 20
     assert [term for term in named if term.lower() not in text] == []
     equations = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
     sections = set(re.findall(r"\| (\d) \|$", symbols, flags=re.M))

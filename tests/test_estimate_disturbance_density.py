@@ -14,8 +14,8 @@ from avsreplay.estimate.disturbance_density import (
     Marginal,
     Present,
     Residuals,
-    _divided,
     density_in_use,
+    divided,
     marginal,
     probability_beside,
 )
@@ -39,7 +39,7 @@ def drawn(density: float, rng: np.random.Generator) -> tuple[Marginal, Residuals
         density * rng.normal(size=3 * len(MIDDLE)),
     )
     e = -(INITIAL @ y + EFFECTS @ u) + rng.normal(size=len(V))
-    data = Residuals(e, INITIAL, INFO, np.zeros(6))
+    data = Residuals(e, INITIAL, np.sqrt(INFO), np.zeros(6))
     return marginal(V, EFFECTS, data), data, PRESENT.by_initial @ y + PRESENT.by_impulses @ u
 
 
@@ -49,7 +49,7 @@ def velocity(data: Residuals, density: float) -> tuple[np.ndarray, np.ndarray]:
     """
     J = np.hstack([data.J, density * EFFECTS])
     info = np.zeros((J.shape[1], J.shape[1]))
-    info[:6, :6], info[6:, 6:] = data.info, np.eye(J.shape[1] - 6)
+    info[:6, :6], info[6:, 6:] = INFO, np.eye(J.shape[1] - 6)
     C = np.linalg.inv(J.T @ J + info)
     reach = np.hstack([PRESENT.by_initial, density * PRESENT.by_impulses])
     return -reach @ C @ J.T @ data.e, reach @ C @ reach.T
@@ -156,8 +156,31 @@ def test_a_disturbance_explains_at_most_all_residuals_however_large_its_effects_
     rng = np.random.Generator(np.random.PCG64(42))
     e, J = rng.normal(size=144), rng.normal(size=(144, 20))
     effects = rng.normal(size=(144, 69)) + size * J @ rng.normal(size=(20, 69))
-    found = marginal(np.eye(144), effects, Residuals(e, J, 1e-12 * np.eye(20), np.zeros(20)))
+    found = marginal(np.eye(144), effects, Residuals(e, J, 1e-6 * np.eye(20), np.zeros(20)))
     assert found.log_odds.max() <= 0.5 * float(e @ e)
+
+
+def test_a_further_disturbance_as_an_unknown_is_a_part_of_the_covariance() -> None:
+    rng = np.random.Generator(np.random.PCG64(8))
+    _, data, _ = drawn(1e-3, rng)
+    other, nothing = 0.3 * rng.normal(size=(len(V), 9)), np.zeros((len(V), 0))
+    found = marginal(V, nothing, data.extended(other, np.zeros(9))).none
+    prior = INITIAL @ np.linalg.inv(INFO) @ INITIAL.T
+    with_it, without = (log_likelihood(V + prior + S, data.e) for S in (other @ other.T, 0.0 * V))
+    assert found - marginal(V, nothing, data).none == pytest.approx(with_it - without, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e6, 1e12, 1e20])
+def test_a_further_disturbance_of_any_size_leaves_a_likelihood(size: float) -> None:
+    """Over a long log a random torque turns the body by more than any pose error squared in double
+    precision.
+    """
+    rng = np.random.Generator(np.random.PCG64(9))
+    found, data, _ = drawn(1e-3, rng)
+    beside = marginal(V, EFFECTS, data.extended(size * rng.normal(size=(len(V), 9)), np.zeros(9)))
+    assert np.isfinite(beside.none)
+    assert np.isfinite(density_in_use(beside, PRESENT))
+    assert beside.likeliest[0] == pytest.approx(found.likeliest[0], rel=0.5)
 
 
 def test_torque_and_force_come_together() -> None:
@@ -172,4 +195,4 @@ def test_a_triangular_system_is_solved_by_halves(n: int) -> None:
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, n)), rng.normal(size=(n, 5))
     L = np.linalg.cholesky(A @ A.T + np.eye(n))
-    assert np.abs(_divided(L, B) - np.linalg.solve(L, B)).max() < 1e-12
+    assert np.abs(divided(L, B) - np.linalg.solve(L, B)).max() < 1e-12

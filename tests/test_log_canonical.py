@@ -297,20 +297,23 @@ def test_points_without_a_valid_instant_are_left_out() -> None:
         canonical(late, meaning)
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", ">f8"])
 def test_bytes_in_the_other_order_than_declared_are_found(kind: str) -> None:
     sample, plain = list[TimedCloud](), list[NDArray[np.float64]]()
     for one in log(Sensor(), "t", "ns", "u4", "stamp"):
         fields = {n: v.astype(kind) if n in "xyz" else v for n, v in one.raw.fields.items()}
         raw = RawCloud(one.raw.stamp_ns, "", fields, one.raw.shape)
         plain.append(canonical(raw, Meaning()).points.astype(np.float64))
+        adjacent = np.stack([fields[axis] for axis in "xyz"], axis=1).astype(kind).byteswap()
         wrong = {n: v.byteswap() for n, v in fields.items()}
+        wrong |= {axis: adjacent[:, k] for k, axis in enumerate("xyz")}
         sample.append(replace(one, raw=replace(raw, fields=wrong)))
     meaning = meaning_of(sample, 0.1)
     assert meaning.swapped
     for one, want in zip(sample, plain, strict=True):
         found = canonical(one.raw, meaning)
         np.testing.assert_array_equal(found.points, want)
+        assert memoryview(found.points).format in ("f", "d"), "as compiled code expects it"
         assert found.times_s is not None
     stated = meaning_of(sample, 0.1, byte_order=ByteOrder.DECLARED)
     assert not stated.swapped

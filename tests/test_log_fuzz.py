@@ -1,7 +1,7 @@
 """The short fuzz campaign: mutated bytes give scans or a one-line error, within limits of time and
 memory.
 
-The long one is ``python tests/benchmarks/fuzz_logs.py``; docs/reliability-tests.md has its figures.
+The long one is ``python tests/benchmarks/fuzz_logs.py``; docs/reliability.md has its figures.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ def test_any_settings_class_can_have_tables_of_parts():
     assert made.own.of("cart", Wheel).radius_m == 0.5
     assert Vehicle().own.of("cart", Wheel) == Wheel()
     assert [e.key for e in settings.entries(Vehicle)] == ["speed_mps", "cart.radius_m"]
-    assert Tables().including("cart", Wheel(0.5)) == made.own
+    assert Tables((("cart", Wheel(0.5)),)) == made.own.with_part("cart", Wheel) == made.own
     assert np.isclose(made.own.of("cart", Wheel).resolved(3.0).radius_m, 0.5)
     with pytest.raises(UsageError, match=r"v.toml:2: cart.radius_m is -1.0"):
         build(Vehicle, parse("[cart]\nradius_m = -1.0\n", "v.toml"))

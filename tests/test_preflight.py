@@ -18,15 +18,19 @@ from rosbags.rosbag1 import Writer
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 import avsreplay.model_size
+from avsreplay.build import task_and_target
+from avsreplay.config import RunConfig
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
 from avsreplay.log.canonical import Meaning
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
+from avsreplay.model_size import compare_sizes
 from avsreplay.preflight import preflight
-from avsreplay.records import Scan, ScanStatus
-from avsreplay.register.contract import view
+from avsreplay.records import Scan, ScanStatus, Surface
+from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.sampling import diameter
+from avsreplay.task import TaskParams
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
 
@@ -470,7 +474,7 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
     assert "mirror" not in done.err
     right = cli("run", log, "--model", model_in_mm, "--model-unit", "mm", "--n-scans", 5)
     assert "model-unit" not in right.err.splitlines()[0]
-    assert "5 healthy" in right.out
+    assert "TRACKING PASS." in right.out
 
 
 def test_a_mirrored_model_is_named_with_the_option_that_repairs_it(cli, fixtures_folder, tmp_path):
@@ -537,6 +541,25 @@ def test_an_origin_far_outside_of_the_model_is_reported_as_the_grasp_point(
     assert [a.option for a in advice] == ["--grasp X,Y,Z"] * reported
 
 
+@pytest.mark.parametrize("usable", [True, False])
+def test_patches_that_a_gripper_reaches_are_proposed(usable):
+    mesh = trimesh.creation.box([1.0, 0.6, 0.4])
+    at = np.array([0.0, 0.0, -0.2] if usable else [0.1, 0.0, 0.0])  # of the origin, along +z
+    body = Surface(mesh.vertices + at, mesh.faces.astype(np.int32), "box", "a")
+    found = preflight(Log([]), body, search=True)
+    at_origin = [a for a in found if a.about == "grasp point"]
+    offered = [a for a in found if a.about.startswith("patch")]
+    assert [a.option for a in at_origin] == ([] if usable else ["--set task.patch=flat-1"])
+    assert len(offered) == 3
+    for advice in offered:
+        name = advice.option.removeprefix("--set task.patch=")
+        config = RunConfig(task=TaskParams(patch=name))
+        task, target = task_and_target(config, body)
+        assert not task.problem
+        away = target.surface(np.linspace(0.01, 1.0, 20)[:, None] * task.axis_c)[1]
+        assert (away > 0.0).all()  # the approach does not meet the body
+
+
 def test_points_far_from_the_origin_of_their_frame_are_named(surface):
     far = Log([np.zeros((0, 3))] * 3)
     far.scan_at = lambda seq: Scan(seq, seq, np.zeros((0, 3)), ScanStatus.EMPTY, dropped_points=900)
@@ -578,3 +601,21 @@ def test_scans_in_millimetres_are_named_with_the_option_and_the_crop_in_metres(s
     assert max(abs(float(v)) for v in crop.split(",")) < 100.0
     both = preflight(Log(clouds), scaled(surface, 1000.0))
     assert _found(both, "unit").option == "--model-unit mm --scan-unit mm"
+
+
+@pytest.mark.parametrize("approaches", [True, False])
+def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
+    """The target stands on a floor; in the first scan it has too few points for a group."""
+    surface, pose = boxes(), example_pose()
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    seen = pose.apply(view(surface, 600, pose.inverse().t)) - pose.t
+    x, y = np.meshgrid(np.linspace(-6, 6, 40), np.linspace(-6, 6, 40))
+    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -2.0)], axis=1) * size
+    clouds = []
+    for k in range(5):
+        at = np.array([(30.0 - 6.0 * k if approaches else 6.0) * size, 0.0, 0.0])
+        clouds.append(np.concatenate([seen[:: 120 if k == 0 else 1] + at, floor + at]))
+    (advice,) = compare_sizes(clouds, surface, None, SourceOptions())
+    assert advice.about == "background"
+    wanted = ("--region",) if approaches else ("--crop-box", "--crop-range")
+    assert advice.option.split()[0] in wanted

@@ -33,7 +33,8 @@ def view() -> View:
 
 
 def test_the_path_is_shown_in_the_frame_of_the_fixture() -> None:
-    (part,) = flown_parts(rows(), view())
+    ((first, part),) = flown_parts(rows(), view())
+    assert rows()[first].t_ns == view().paths[0].t_ns
     assert part[0] == pytest.approx([0.0, -4.0, 0.0], abs=1e-6)  # x of {A} is -y of {C}
     assert part[-1] == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
     assert len(part) == 11
@@ -41,7 +42,8 @@ def test_the_path_is_shown_in_the_frame_of_the_fixture() -> None:
 
 def test_a_path_that_is_not_followed_is_left_out() -> None:
     held = [replace(row, action="hold") if 5 <= k < 8 else row for k, row in enumerate(rows())]
-    before, after = flown_parts(held, view())
+    (_, before), (first, after) = flown_parts(held, view())
+    assert first == 8
     assert before[-1][1] == pytest.approx(-3.2, abs=1e-6)
     assert after[0][1] == pytest.approx(-1.6, abs=1e-6)
     assert flown_parts(rows("hold"), view()) == []
@@ -51,7 +53,7 @@ def test_the_next_path_replaces_the_former() -> None:
     made = rows()
     made[4] = replace(made[4], t_go_s=5.0)
     later = PathView(4 * 10**9, np.tile(np.float32([2.0, 0.0, 5.0]), (41, 1)), None)
-    (part,) = flown_parts(made, replace(view(), paths=(*view().paths, later)))
+    ((_, part),) = flown_parts(made, replace(view(), paths=(*view().paths, later)))
     assert part[1][1] == pytest.approx(-3.6, abs=1e-6)
     assert part[2:, 1] == pytest.approx(np.full(len(part) - 2, -2.0), abs=1e-6)
 

@@ -22,6 +22,7 @@ from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
 from avsreplay.report import jsonl
 from avsreplay.report.export import (
+    FREQUENT,
     columns_page,
     dump_document,
     row_poses,
@@ -34,9 +35,9 @@ from avsreplay.report.export import (
     write_parquet,
     write_tum,
 )
-from avsreplay.report.jsonl import dump_row, field_types, parse_row, read_rows, write_rows
+from avsreplay.report.jsonl import dump_row, parse_row, read_rows, write_rows
 from avsreplay.report.summary import Summary
-from avsreplay.rows import Row, columns
+from avsreplay.rows import Row, columns, field_types
 
 ROOT = Path(__file__).parent.parent
 
@@ -252,6 +253,7 @@ def test_the_document_of_no_rows_is_json_too():
 def test_the_column_list_of_the_docs_is_current():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
     assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
+    assert {name for names in FREQUENT.values() for name in names} <= {c.name for c in columns()}
 
 
 def test_every_column_and_every_word_of_a_column_is_described():

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from avsreplay.cli.record import report_command
-from avsreplay.errors import AvsError
+from avsreplay.errors import AvsError, UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
@@ -261,7 +261,7 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     empty = CliRunner().invoke(
         report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")]
     )
-    assert "holds no row" in str(empty.exception)
+    assert isinstance(empty.exception, UnreadableInput)
     missing = CliRunner().invoke(
         report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")]
     )
@@ -304,6 +304,35 @@ def test_one_large_value_does_not_hide_the_others(make_rows):
     assert (found["fit"]["unit"], found["fit"]["log"]) == ("mm", True)
     assert found["position"]["unit"] == "mm"
     assert not {c["key"]: c for c in charts(derived(make_rows(40)))}["fit"]["log"]
+
+
+def test_rejected_values_do_not_decide_the_axis_of_a_measurement(make_rows):
+    rows = [dataclasses.replace(r, rms_m=4.0, gamma=0) if r.seq == 30 else r for r in make_rows(40)]
+    used = np.array([row.gamma == 1 for row in rows])
+    found = {c["key"]: c for c in charts(derived(rows), used=used)}
+    assert not found["fit"]["log"]
+    assert found["fit"]["series"][0]["measured"]
+    np.testing.assert_array_equal(_floats(_data(_page(rows))["runs"][0]["used"], "u1"), used)
+
+
+def test_equal_lines_are_drawn_once_and_say_so(make_rows):
+    rows = make_rows(40)
+    columns = derived(rows)
+    columns["earliest_capture_s"] = columns["capture_time_s"] + 1e-9
+    (line,) = {c["key"]: c for c in charts(columns)}["capture"]["series"]
+    assert line["label"] == "planned = certified lower bound"
+    columns["earliest_capture_s"] = columns["capture_time_s"] - 1.0
+    assert len({c["key"]: c for c in charts(columns)}["capture"]["series"]) == 2
+
+
+def test_the_answer_stands_before_everything_that_is_folded(make_rows):
+    page = _page(make_rows(40))
+    first = [c["key"] for c in _data(page)["charts"] if c["first"]]
+    assert first == ["position", "nis", "capture"]  # beside the states
+    order = ['id="verdict"', 'id="scene"', 'id="charts"', 'id="more"', "Faults and manoeuvres"]
+    places = [page.index(text) for text in order]
+    assert places == sorted(places)
+    assert page.index("<details") > page.index('id="charts"')
 
 
 def test_a_kind_has_the_same_colour_and_pattern_on_every_page(make_rows):
@@ -449,6 +478,8 @@ def opened(browser, tmp_path, make_rows):
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
         browser.get(path.as_uri())
+        browser.execute_script("for (const d of document.querySelectorAll('details')) d.open = 1")
+        _settled(browser)
         return browser
 
     return go
@@ -476,7 +507,9 @@ def _slide(browser, k):
 
 
 def _pin(browser, chart="position"):
-    script = "return document.querySelector(arguments[0]).getBoundingClientRect().left"
+    """Place of the marker of the chosen scan in the plot of a chart [px]."""
+    script = """const pin = document.querySelector(arguments[0]);
+    return pin.getBoundingClientRect().left - pin.parentElement.getBoundingClientRect().left"""
     return browser.execute_script(script, f"#chart-{chart} .pin")
 
 
@@ -791,20 +824,17 @@ def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
 
 
 @pytest.mark.slow
-def test_on_a_narrow_screen_a_wide_table_scrolls_and_keeps_the_names_of_its_rows(opened):
+def test_on_a_narrow_screen_no_table_is_cut_and_each_value_has_its_head(opened):
     browser = opened(width=390)
     script = """const boxes = [...document.querySelectorAll('.scroll')];
-    const box = boxes.find((b) => b.scrollWidth > b.clientWidth + 40);
-    box.scrollLeft = 1e6;
-    const at = box.getBoundingClientRect(), row = box.querySelector('tbody tr');
-    const head = row.firstElementChild.getBoundingClientRect();
-    const last = row.lastElementChild.getBoundingClientRect();
-    return [head.left - at.left, at.right - last.right, getComputedStyle(box).backgroundImage,
+    const cell = document.querySelector('.many td:not(:empty)');
+    return [Math.max(...boxes.map((b) => b.scrollWidth - b.clientWidth)),
+            getComputedStyle(cell, '::before').content, cell.dataset.head,
             document.documentElement.scrollWidth];"""
-    name, end, shadow, width = browser.execute_script(script)
-    assert -10 <= name <= 10  # the first column stays at the left edge
-    assert end >= 0  # the last column can be reached
-    assert shadow.count("gradient") == 2  # a shadow shows that there is more
+    hidden, said, head, width = browser.execute_script(script)
+    assert hidden <= 0
+    assert head
+    assert head in said
     assert width <= 390
 
 

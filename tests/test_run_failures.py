@@ -65,9 +65,8 @@ def test_a_back_end_that_returns_its_guess_is_no_sensor(monkeypatch):
     with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
         rows = list(run.rows())
     message = "back end 'horn' returned its guess unchanged, although the residuals require a step"
-    assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [
-        ("failed", 0, message)
-    ] * 3
+    assert not any(row.gamma for row in rows[1:])
+    assert (rows[1].status, rows[1].message) == ("failed", message)
     verdict = verdict_of(rows, Summary.fold(rows))
     assert verdict.grade is Grade.FAIL
     assert any(message in reason.text for reason in verdict.reasons)

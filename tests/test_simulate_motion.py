@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from avsreplay import geometry
 from avsreplay.simulate.inertia import principal, with_axes
-from avsreplay.simulate.motion import Motion, MotionParams
+from avsreplay.simulate.motion import Load, Motion, MotionParams, Push
 
 SPAN = 120.0
 PARAMS = MotionParams(
@@ -170,6 +170,43 @@ def test_disturbed_motion_is_continuous_and_repeats():
     for edge in (1.0, 2.0, 13.0):
         for before, after in zip(one.states([edge - 1e-9]), one.states([edge + 1e-9]), strict=True):
             assert_allclose(before, after, atol=1e-8)
+
+
+def test_a_push_changes_rate_and_velocity_at_its_instant_and_nothing_else():
+    push = Push(at_s=7.0, velocity_mps=(0.01, 0.0, -0.02), rate_radps=(0.0, 0.03, 0.0))
+    pushed = Motion(BODY, replace(PARAMS, push=(push,)), 20.0, rng())
+    free = Motion(BODY, PARAMS, 20.0, rng())
+    early, at = np.linspace(0.0, 6.999, 20), [7.0]
+    for one, other in zip(pushed.states(early), free.states(early), strict=True):
+        assert_allclose(one, other, atol=1e-12)
+    changes = [a - b for a, b in zip(pushed.states(at), free.states(at), strict=True)]
+    for change, wanted in zip(changes, (0.0, push.rate_radps, 0.0, push.velocity_mps), strict=True):
+        assert_allclose(change[0], np.broadcast_to(wanted, change[0].shape), atol=1e-12)
+    q, w, centre, velocity = pushed.states(at)
+    later = replace(
+        PARAMS,
+        attitude_xyzw=tuple(q[0]),
+        rate_radps=tuple(w[0]),
+        position_m=tuple(centre[0]),
+        velocity_mps=tuple(velocity[0]),
+    )
+    rest = Motion(BODY, later, 13.0, rng())
+    for one, other in zip(pushed.states([19.0]), rest.states([12.0]), strict=True):
+        assert_allclose(one, other, atol=1e-10)
+
+
+def test_a_load_accelerates_between_its_begin_and_its_end():
+    """The force as in free fall; the torque by the change of the angular momentum."""
+    force, torque = (0.0, 2e-3, 0.0), (1e-4, 0.0, 5e-5)
+    load = Load(start_s=4.0, duration_s=6.0, force_mps2=force, torque_radps2=torque)
+    still = MotionParams(rate_radps=(0.0, 0.0, 0.0), load=(load,))
+    q, w, centre, velocity = Motion(BODY, still, 20.0, rng()).states([4.0, 4.1, 10.0, 15.0])
+    assert_allclose(velocity, np.outer([0.0, 0.1, 6.0, 6.0], force), atol=1e-12)
+    assert_allclose((centre - centre[0])[2], 18.0 * np.array(force), atol=1e-12)
+    trace = np.trace(BODY.inertia_c)
+    assert_allclose(w[1] @ BODY.inertia_c, 0.1 * trace * np.array(torque), rtol=1e-4, atol=1e-9)
+    momentum = np.einsum("nij,nj->ni", geometry.matrix(q), w @ BODY.inertia_c)
+    assert_allclose(momentum[2], momentum[3], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from avsreplay.simulate.scenario import StartParams, belief, load_scenario, scen
 from avsreplay.simulate.simulation import EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
 
-CAMPAIGN_KINDS = {  # what docs/faults-results.md has figures of
+CAMPAIGN_KINDS = {  # what docs/results.md has figures of
     *("occlusion", "partial_occlusion", "dropped", "empty", "clutter", "range_bias"),
     *("noise_burst", "frozen", "stamp_jump"),
 }

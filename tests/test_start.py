@@ -31,7 +31,7 @@ def test_a_log_begins_without_any_guess(cli, fixtures_folder):
 
 @pytest.mark.parametrize("mode", ["near", "cold", "paper"])
 def test_each_start_tracks_the_pose(mode, cli, fixtures_folder):
-    found = rows(cli, fixtures_folder / "tumble.mcap", "--start", mode, "--n-scans", 15)
+    found = rows(cli, fixtures_folder / "tumble.mcap", "--start-mode", mode, "--n-scans", 15)
     assert found[0]["estimator"] == {"near": "near", "cold": "start", "paper": "filter"}[mode]
     assert rms(found[5:], "pos_err_m") < 0.01
 
@@ -41,7 +41,7 @@ def test_near_without_a_belief_in_the_log_is_refused(cli, shared_data, tmp_path)
     out = tmp_path / "d.mcap"
     model = folder / "dragon_vrip_res3.ply"
     assert cli("record", folder, "-o", out, "--model", model, "--n-scans", 2).code == 0
-    done = cli("run", out, "--start", "near")
+    done = cli("run", out, "--start-mode", "near")
     assert done.code == 2
     assert "near start" in done.err
 
@@ -71,7 +71,7 @@ def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path, hz, scan
     )
     scenario.write_text(text + "rays = [60, 60]\n", encoding="utf-8")
     assert cli("record", scenario, "-o", log).code == 0
-    found = rows(cli, log, "--start", "cold")
+    found = rows(cli, log, "--start-mode", "cold")
     assert {"fit"} <= {row["estimator"] for row in found}
     assert found[-1]["violations"] == 0
 

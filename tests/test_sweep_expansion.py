@@ -180,6 +180,22 @@ def test_logs_are_an_axis(tmp_path):
     assert len(before & after) == 2  # another content is another run
 
 
+@pytest.mark.parametrize("changed", ["job.toml", "m.ply", "bag/a.db3"])
+def test_a_job_file_stands_for_all_that_it_names(tmp_path, changed):
+    (tmp_path / "bag").mkdir()
+    files = {"bag/a.db3": "a", "m.ply": "m", "job.toml": 'log = "bag"\n[input]\nmodel = "m.ply"\n'}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+
+    def ids() -> list[str]:
+        return [p.task.id for p in plan_of(tmp_path, 'logs = ["job.toml"]\n').points()]
+
+    before = ids()
+    assert before == ids()
+    (tmp_path / changed).write_text(files[changed] + " ")
+    assert before != ids()
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -1,13 +1,14 @@
 """The page of a campaign: self-contained, well-formed, with figures at their values."""
 
 import dataclasses
+import itertools
 import re
 from html.parser import HTMLParser
 
 import pytest
 
 from avsreplay.report.episodes import Peak
-from avsreplay.sweep.page import build_sweep_page, words
+from avsreplay.sweep.page import build_sweep_page, round_ticks, words
 from avsreplay.sweep.statistics import (
     FaultKind,
     ScoreHistogram,
@@ -85,13 +86,27 @@ def test_text_from_the_campaign_is_escaped(summary):
 
 
 def test_figures_are_placed_at_their_values(summary):
-    page = build_sweep_page(summary)
+    page = next(re.finditer(r"<svg.*?</svg>", build_sweep_page(summary), re.S))[0]
     (dot, *_) = re.findall(r'class="dot" cx="([\d.]+)"', page)
-    ends = re.findall(r'<text x="([\d.]+)" y="52" text-anchor="middle">([\d.]+)<', page)
+    ends = re.findall(r'<text x="([\d.]+)" y="[\d.]+" text-anchor="middle">([\d.]+)<', page)
     (x0, low), (x1, high) = ends[0], ends[-1]
     expected = float(x0) + (2.5 - float(low)) / (float(high) - float(low)) * (float(x1) - float(x0))
     assert abs(float(dot) - expected) < 0.2
     assert "median 2.5" in page
+    assert ">0: name=&lt;b&gt;plain&lt;/b&gt;<" in page  # the line is called by what was varied
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 4.38), (0.0, 8.76), (-0.3, 17.0), (2e-7, 3e-7), (5.0, 5.0), (0.0, 0.0)]
+)
+def test_the_ticks_of_an_axis_are_round_and_enclose_the_values(low, high):
+    ticks = round_ticks(low, high)
+    steps = {round((b - a) / (ticks[1] - ticks[0]), 6) for a, b in itertools.pairwise(ticks)}
+    assert steps == {1.0}
+    assert 2 <= len(ticks) <= 7
+    assert ticks[0] <= low
+    assert ticks[-1] >= high
+    assert all(len(f"{tick:.10g}".lstrip("-0.").split("e")[0].rstrip("0")) <= 4 for tick in ticks)
 
 
 def test_the_curve_rises_and_stays_in_its_frame(summary):

@@ -221,9 +221,10 @@ def test_a_kind_without_scans_has_a_row():
 
 
 def test_the_order_of_the_runs_does_not_matter():
-    lines = episode_lines(EPISODES)
-    for turned in itertools.permutations(lines):
-        assert kinds_of_fault(turned, [account()]) == kinds_of_fault(lines, [account()])
+    lines, expected = episode_lines(EPISODES), kinds_of_fault(episode_lines(EPISODES), [account()])
+    rng = np.random.default_rng(0)
+    for order in (rng.permutation(len(lines)) for _ in range(20)):
+        assert kinds_of_fault([lines[k] for k in order], [account()]) == expected
 
 
 def test_without_labels_nothing_is_called_a_false_alarm():

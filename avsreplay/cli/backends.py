@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import Command
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from avsreplay.geometry import Pose
+    from avsreplay.parts import LawResult
     from avsreplay.records import Alignment, Surface
     from avsreplay.register.backend import Availability
-    from avsreplay.register.contract import LawResult
     from avsreplay.register.registrar import Registrar
 
     TrueScan = tuple[NDArray[Any], Pose | None]
@@ -38,7 +40,7 @@ same libraries, or how far a pose can differ: libraries that stop by their own
 rules may take another number of iterations. See docs/ci.md."""
 
 
-@click.command("backends", epilog=EPILOG)
+@click.command("backends", cls=Command, epilog=EPILOG)
 @click.option(
     "--check",
     "name",
@@ -59,7 +61,7 @@ def _list(as_json: bool) -> None:
 
     states = available()
     if as_json:
-        _print_json([dataclasses.asdict(state) for state in states])
+        print_json([dataclasses.asdict(state) for state in states])
     else:
         heads = (
             "name",
@@ -84,14 +86,28 @@ def _state_row(state: Availability) -> tuple[str, ...]:
 
 
 def _check(name: str, as_json: bool) -> None:
-    from avsreplay.errors import CheckFailed
     from avsreplay.register.contract import check
 
-    findings = check(name)
+    report_laws("backend", name, check(name), as_json)
+
+
+def report_laws(kind: str, name: str, findings: Sequence[LawResult], as_json: bool) -> None:
+    """Print the laws of a contract and what was found of a part.
+
+    Args:
+        kind: of the part, the key of its name in JSON.
+        name: of the part.
+        findings: of the laws.
+        as_json: print JSON.
+
+    Raises:
+        CheckFailed: a law does not hold.
+    """
+    from avsreplay.errors import CheckFailed
+
     if as_json:
-        _print_json(
-            {"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]}
-        )
+        laws = [dataclasses.asdict(finding) for finding in findings]
+        print_json({kind: name, "findings": laws})
     else:
         print_plain_table(
             f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings)
@@ -107,7 +123,12 @@ def _finding_row(finding: LawResult) -> tuple[str, ...]:
     return finding.law, "yes" if finding.held else "NO", finding.detail
 
 
-def _print_json(value: Any) -> None:
+def print_json(value: Any) -> None:
+    """Print one JSON document.
+
+    Args:
+        value: of plain JSON values.
+    """
     click.echo(json.dumps(value, indent=2))
 
 
@@ -187,7 +208,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but data was lost."""
 
 
-@click.command("bench", epilog=BENCH_EPILOG)
+@click.command("bench", cls=Command, epilog=BENCH_EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option(
     "--backends",

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, check_outputs, read_result
+from avsreplay.cli.config import Command
+from avsreplay.cli.options import HTML, PATH, check_outputs, check_suffix, read_result
 from avsreplay.errors import DataLost, UsageError, value_class
 from avsreplay.files import output_text
 from avsreplay.report import gate as gates
@@ -52,7 +53,7 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     ctx.exit()
 
 
-@click.command("compare", epilog=EPILOG)
+@click.command("compare", cls=Command, epilog=EPILOG)
 @click.argument("results", nargs=-1, required=True, type=PATH)
 @click.option(
     "--gate",
@@ -98,7 +99,7 @@ def compare_command(
 
     RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the
     baseline. A folder of several results (one per seed) is compared run by run with the baseline's
-    runs of the same names.
+    runs of the same names. Two files benchmark.json are compared run by run.
 
     Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 %
     bootstrap intervals of the paired difference. A figure of two runs that has no interval is
@@ -111,12 +112,17 @@ def compare_command(
         UnreadableInput: a result or the rules cannot be read.
         CheckFailed: a rule of the gate is broken.
     """  # noqa: D301
+    if all(path.suffix == ".json" for path in results):
+        _compare_benchmarks(results, as_json, as_markdown)
+        return
     if (junit or github) and not gate:
         raise UsageError(
             "--junit and --github need --gate", hint="name the rules with --gate rules.toml"
         )
     check_outputs("junit")
     check_outputs("output", overwrite=overwrite)
+    if output:
+        check_suffix(output, *HTML)
     rules = gates.load_rules(gate) if gate else ()
     groups = _with_distinct_names([_group(path) for path in results])
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]
@@ -128,21 +134,57 @@ def compare_command(
         click.echo("\n".join(_markdown(groups, conclusions, outcomes)))
     else:
         _print(groups, conclusions, outcomes, show_all=show_all)
-    if junit:
-        with output_text(junit) as stream:
-            stream.write(gates.junit(outcomes))
-    if output:
-        from avsreplay.report.page import build_comparison
-
-        with output_text(output) as stream:
-            stream.write(
-                build_comparison([group.runs[0] for group in groups], conclusions, outcomes)
-            )
+    _write(junit, output, groups, conclusions, outcomes)
     for line in gates.github_lines(outcomes) if github else ():
         click.echo(line, err=as_json or as_markdown)
     gates.check_gate(outcomes)
     if gate:
         _check_sources([run for group in groups for run in group.runs])
+
+
+def _compare_benchmarks(paths: Sequence[Path], as_json: bool, as_markdown: bool) -> None:
+    """Compare the first of some results of 'avsreplay benchmark' with each other one."""
+    from avsreplay.benchmark import results
+    from avsreplay.report.table import make_console, markdown, print_line, print_table
+
+    if len(paths) < 2:
+        raise UsageError("a single benchmark.json", where="compare", hint="name two of them")
+    base, *others = map(results.read, paths)
+    for other in others:
+        found, (agreeing, count) = results.compared(base, other)
+        table = results.difference_table(found)
+        sentence = f"{agreeing} of {count} runs agree within {100 * results.AGREE:g} %"
+        if as_json:
+            click.echo(
+                json.dumps(
+                    {"agreeing": agreeing, "runs": count, "rows": [each.record for each in found]}
+                )
+            )
+        elif as_markdown:
+            click.echo(f"{sentence}\n\n{markdown(table)}")
+        else:
+            console = make_console()
+            print_line(console, sentence)
+            print_table(console, table, tight=True)
+
+
+def _write(
+    junit: Path | None,
+    page: Path | None,
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
+) -> None:
+    """Write the files that are wanted: the outcomes of the rules, and the page."""
+    if junit:
+        with output_text(junit) as stream:
+            stream.write(gates.junit(outcomes))
+    if page:
+        from avsreplay.report.page import build_comparison
+
+        first = [group.runs[0] for group in groups]
+        with output_text(page) as stream:
+            stream.write(build_comparison(first, conclusions, outcomes))
 
 
 def _check_sources(runs: Sequence[Result]) -> None:

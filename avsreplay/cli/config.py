@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,23 +13,21 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from avsreplay.errors import UsageError
+
 if TYPE_CHECKING:
     from avsreplay.settings import Entry
 
 F = TypeVar("F", bound=Callable[..., Any])
 CONFIG = "avsreplay.config:RunConfig"
-METHOD = {
-    "no_deskew",
-    "config_file",
-    "robot_file",
-    "assignments",
-    "starts",
-    "paper",
-    "init",
-}  # names of parameters
+SOURCE = "avsreplay.log.options:SourceOptions"
+# names of parameters that are settings of a run, besides those that have an option of their own
+METHOD = {"no_deskew", "config_file", "robot_file", "task_file", "assignments", "paper", "init"}
+RARE = ("policy", "guess", "reference")  # of ASSIGNED: not in the short help
 ASSIGNED = {
     "backend": "register.backend",
     "estimator": "estimator.method",
+    "start_mode": "estimator.start",
     "policy": "faults.policy",
     "guess": "guess",
     "init": "init",
@@ -75,13 +74,25 @@ class _Choice(click.ParamType[str]):
 
 
 class SettingOption(click.Option):
-    """An option for one setting. ``owner`` is ``module:class``; ``key`` is the parameter's
-    name where not given.
+    """An option for one setting.
+
+    Attributes:
+        owner: class that declares the setting, as ``module:class``.
+        key: its dotted key; the parameter's name where not given.
+        common: whether the short help of a command lists it.
     """
 
-    def __init__(self, names: list[str], owner: str = CONFIG, key: str = "", **more: Any) -> None:
+    def __init__(
+        self,
+        names: list[str],
+        owner: str = CONFIG,
+        key: str = "",
+        *,
+        common: bool = True,
+        **more: Any,
+    ) -> None:
         super().__init__(names, **more)
-        self.owner, self.key = owner, key or str(self.name)
+        self.owner, self.key, self.common = owner, key or str(self.name), common
         if more.get("type") is None and not self.is_flag:
             self.type = _Choice(self.owner, self.key)
 
@@ -96,25 +107,89 @@ class SettingOption(click.Option):
         return super().get_help_record(ctx)
 
 
-class SectionedCommand(click.Command):
+def _print_full_help(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if not wanted or ctx.resilient_parsing:
+        return
+    ctx.meta[_FULL] = True
+    click.echo(ctx.get_help(), color=ctx.color)
+    ctx.exit()
+
+
+_FULL = "avsreplay.full_help"  # in the meta of a context: print every option in full
+_CLAUSE = re.compile(r"[.:;] | \(")  # where the first clause of a description ends
+
+
+class Command(click.Command):
     """A command whose help lists the settings of a run, and those of the input, apart from its
     other options.
+
+    The short help has the first clause of each description and the most common settings;
+    ``--help-all`` has everything.
     """
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        if any(map(_is_rare, self.params)):
+            full = click.Option(
+                ["--help-all"],
+                is_flag=True,
+                is_eager=True,
+                expose_value=False,
+                callback=_print_full_help,
+                help="Show every option in full.",
+            )
+            self.params.append(full)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; one that is too much is an error that names the option for it."""
+        ctx.allow_extra_args = True
+        left = []
+        try:
+            left = super().parse_args(ctx, list(args))
+        except click.MissingParameter:
+            left = self.make_parser(ctx).parse_args(list(args))[1]
+            if not left:
+                raise
+        if left and not ctx.resilient_parsing:
+            what = f"the argument '{left[0]}' is one too many"
+            raise UsageError(what, where=ctx.info_name, hint=self._place_of(left[0], ctx))
+        return left
+
+    def _place_of(self, extra: str, ctx: click.Context) -> str:
+        options = {name for param in self.params for name in param.opts}
+        if "=" in extra and "--set" in options:
+            return f"change a setting with --set {extra}"
+        if "-o" in options and ctx.params.get("output") is None:
+            return f"name the output with -o {extra}"
+        return f"see '{ctx.command_path} --help'"
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, each under the heading of its section."""
-        sections: dict[str, list[tuple[str, str]]] = {}
+        full = ctx.meta.get(_FULL, False)
+        sections: dict[str, list[tuple[str, str]]] = {"Options": [], "Method": [], "Input": []}
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
-            if record is not None:
-                sections.setdefault(_section(param), []).append(record)
+            if record is None or not isinstance(param, click.Option):
+                continue
+            if full or not (_is_rare(param) or param.name == "help_all"):
+                text = record[1] if full else _CLAUSE.split(record[1])[0].removesuffix(".")
+                sections[_section(param)].append((record[0], text))
+        rare = 0 if full else sum(map(_is_rare, self.params))
+        if rare:
+            last = next(title for title in reversed(sections) if sections[title])
+            sections[last].append(("--help-all", f"{rare} more options, and all in full"))
         for title, records in sections.items():
-            with formatter.section(title):
-                formatter.write_dl(records)
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
+def _is_rare(param: click.Parameter) -> bool:
+    return not getattr(param, "common", True)
 
 
 def _section(param: click.Parameter) -> str:
-    if isinstance(param, SettingOption) and param.owner != CONFIG:
+    if isinstance(param, SettingOption) and param.owner == SOURCE:
         return "Input"
     method = isinstance(param, SettingOption) or param.name in METHOD
     return "Method" if method else "Options"
@@ -126,10 +201,11 @@ def setting_option(*names: str, **more: Any) -> Callable[[F], F]:
 
 
 def source_setting(*names: str, **more: Any) -> Callable[[F], F]:
-    """Decorator: an option for one setting of how a source is read."""
+    """Decorator: an option for one setting of how a source is read, by default a rare one."""
+    more.setdefault("common", False)
     if "is_flag" in more:
         more.setdefault("default", None)
-    return setting_option(*names, owner="avsreplay.log.options:SourceOptions", **more)
+    return setting_option(*names, owner=SOURCE, **more)
 
 
 def _variable(name: str) -> str:
@@ -143,7 +219,7 @@ def robot_option(**more: Any) -> Callable[[F], F]:
         "--robot",
         "robot_file",
         type=file,
-        help="TOML file that describes the robot in a table [robot].",
+        help="TOML file with a table [robot].",
         **more,
     )
 
@@ -154,10 +230,11 @@ def run_settings(command: F) -> F:
     """
     options = [
         setting_option(
-            f"--{name}",
+            f"--{name.replace('_', '-')}",
             key=key,
             envvar=_variable(name),
             metavar={"init": "log|truth|auto|POSE", "region": "X,Y,Z"}.get(name),
+            common=name not in RARE,
         )
         for name, key in ASSIGNED.items()
     ]
@@ -167,14 +244,14 @@ def run_settings(command: F) -> F:
             "--no-deskew",
             is_flag=True,
             envvar=_variable("no_deskew"),
-            help="Do not correct scans for the motion of the target while they were taken.",
+            help="Do not move points to one instant: the motion while a scan is taken is ignored.",
         ),
         click.option(
             "--config",
             "config_file",
             type=file,
             envvar=_variable("config"),
-            help="TOML file with settings, in the form that 'avsreplay config' prints.",
+            help="TOML file with settings: the form that 'avsreplay config' prints.",
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
@@ -182,7 +259,7 @@ def run_settings(command: F) -> F:
             "task_file",
             type=file,
             envvar=_variable("task"),
-            help="TOML file that describes what is grasped in a table [task], and perhaps [robot].",
+            help="TOML file with a table [task]: what is grasped, and perhaps a table [robot].",
         ),
         click.option(
             "--set",
@@ -231,8 +308,8 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [], "--no-deskew")
     for name, key in ASSIGNED.items():
-        value = flags.pop(name)
-        put(name, [] if value is None else [f"{key}={toml_value(value)}"], f"--{name}", value)
+        value, option = flags.pop(name), f"--{name.replace('_', '-')}"
+        put(name, [] if value is None else [f"{key}={toml_value(value)}"], option, value)
     return flags.pop("config_file"), (*by_source[False], *by_source[True])
 
 
@@ -242,29 +319,54 @@ Examples:
   avsreplay config tumble.mcap --policy all    with the settings in the log itself
   avsreplay config --json --set plan.a_max_mps2=0.02"""
 
-INTRODUCTION = """# Settings
+INTRODUCTION = """# Which settings are there?
 
-This page is generated from the declarations in the code by `avsreplay config --markdown`.
+Most runs need none: lengths scale with the *extent* of the target, the diagonal of the bounding box
+of its model. These are the ones that people use; all others follow, table by table.
 
-A setting without a default applies as stated in its description. The target's extent is the
-diagonal of the bounding box of its model, so that the defaults suit a target of any size. A value
-outside its range, an unknown key or a wrong type is an error that names the file and the line.
+{frequent}
 
 Settings of a run are given, in order of precedence, by an option (`--set register.gate_m=0.2`), an
-environment variable (`AVSREPLAY_RUN_POLICY`,
-`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file, or the log's own
-`[run]` table. `avsreplay config` prints the effective configuration as a file that `--config`
-reads.
+environment variable (`AVSREPLAY_RUN_SET="register.gate_m=0.2 deskew=false"`), the `--config` file,
+or the log's own `[run]` table. `avsreplay config` prints the effective configuration as a file that
+`--config` reads. A value outside its range or an unknown key is an error with file and line.
+`avsreplay config --markdown` makes this page from the declarations in the code.
 """
 
+FREQUENT = {
+    "topic": "choose the clouds of a bag with several",
+    "model": "replay against this CAD file",
+    "model_unit": "state the unit of the model",
+    "crop_range": "remove a wall behind the target",
+    "fixed_frame": "transform the clouds of a moving camera",
+    "truth_topic": "compute errors against true poses",
+    "grasp": "grasp another point than the origin of the model",
+    "n_scans": "replay the first scans only",
+    "init": "begin at a given pose, or search for it",
+    "region": "follow a target that approaches",
+    "register.backend": "use another registration method",
+    "register.gate_m": "use a model that is less accurate than 1 % of its extent",
+    "estimator.start": "begin without, or with a given, state of motion",
+    "estimator.force_noise_mps15": "state that forces of known size act",
+    "faults.policy": "use the fault rule as printed in the paper",
+    "faults.rms_max_m": "accept noisier scans",
+    "task.position_m": "state how precise a capture must be",
+    "robot.accel_max_mps2": "state what the robot can do",
+    "limits.final_deg": "approach through a corridor",
+    "limits.clearance_m": "keep clear of the target",
+}  # key of a setting of a run or of reading a log: what it is used for
+
 SECTIONS = (
-    ("Run", "Keys of `--config` and `--set`.", "avsreplay.config:RunConfig"),
+    (
+        "Run",
+        "Keys of `--config` and `--set`. `avsreplay plan` takes those of `[limits]` as options.",
+        "avsreplay.config:RunConfig",
+    ),
     (
         "Reading a log",
-        "Options of `avsreplay run`, `info` and `record`.",
+        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`.",
         "avsreplay.log.options:SourceOptions",
     ),
-    ("Constraints of a plan", "Options of `avsreplay plan`.", "avsreplay.plan.limits:Limits"),
     (
         "Scenario",
         "A scenario file, see [Scenarios](scenario.md).",
@@ -283,7 +385,7 @@ SECTIONS = (
 )
 
 
-@click.command("config", cls=SectionedCommand, epilog=EPILOG)
+@click.command("config", cls=Command, epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path), required=False)
 @run_settings
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
@@ -322,39 +424,67 @@ def _own_table(log: Path) -> Mapping[str, Any]:
 
 def reference_page() -> str:
     """The text of docs/settings.md."""
-    return "\n".join([INTRODUCTION, *_page()]).rstrip("\n") + "\n"
+    found = {entry.key: entry for _, _, owner in SECTIONS[:2] for entry in _entries(owner)}
+    lines = ["| to | setting | default |", "|---|---|---|"]
+    lines += [
+        f"| {purpose} | `{key}` | {_default(found[key])} |" for key, purpose in FREQUENT.items()
+    ]
+    introduction = INTRODUCTION.replace("{frequent}", "\n".join(lines))
+    return "\n".join([introduction, *_page()]).rstrip("\n") + "\n"
 
 
-def _page() -> Iterator[str]:
+def _entries(owner: str) -> list[Entry]:
     import importlib
 
     from avsreplay.settings import entries
 
+    module, _, name = owner.partition(":")
+    return list(entries(getattr(importlib.import_module(module), name)))
+
+
+def _page() -> Iterator[str]:
     for title, introduction, owner in SECTIONS:
-        module, _, name = owner.partition(":")
         yield f"## {title}\n\n{introduction}\n"
         tables: dict[str, list[Entry]] = {}
-        for entry in entries(getattr(importlib.import_module(module), name)):
+        for entry in _entries(owner):
             tables.setdefault(entry.key.rpartition(".")[0], []).append(entry)
         for table, rows in tables.items():
             if table:
                 yield f"### [{table}]\n"
-            yield "| setting | default | unit | range | meaning |\n|---|---|---|---|---|"
+            yield "| setting | default, range | meaning |\n|---|---|---|"
             yield "\n".join(map(_row, rows)) + "\n"
 
 
 def _row(entry: Entry) -> str:
+    value = ", ".join(part for part in (_default(entry), _range(entry)) if part)
+    cells = (f"`{entry.key}`", value, entry.declared.doc)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _default(entry: Entry) -> str:
     from dataclasses import MISSING
 
     from avsreplay.toml_document import toml_value
 
     declared = entry.declared
     if entry.default is MISSING:
-        default = "required"
-    elif entry.default is None:
-        default = declared.automatic or "off"
-    else:
-        default = "`{}`" if entry.default == {} else f"`{toml_value(entry.default)}`"
-    limits = ", ".join(f"`{choice}`" for choice in entry.choices) or declared.range
-    cells = (f"`{entry.key}`", default, declared.unit, limits, declared.doc)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        return "required"
+    if entry.default is not None:
+        return "`{}`" if entry.default == {} else f"`{toml_value(entry.default)}`"
+    if declared.of_extent is not None:
+        return f"{declared.of_extent:g} extent" + ("/s" if declared.unit == "m/s" else "")
+    return declared.unset or "off"
+
+
+def _range(entry: Entry) -> str:
+    """The range in short, with the unit: "0 to 1", ">0 m"; names where these are the values."""
+    if entry.choices:
+        return "of " + "/".join(f"`{choice}`" for choice in entry.choices)
+    declared = entry.declared
+    lower = f">{declared.above:g}" if declared.above is not None else ""
+    lower = f"≥{declared.low:g}" if declared.low is not None else lower
+    upper = f"<{declared.below:g}" if declared.below is not None else ""
+    upper = f"≤{declared.high:g}" if declared.high is not None else upper
+    return " ".join(
+        part for part in (", ".join(filter(None, (lower, upper))), declared.unit) if part
+    )

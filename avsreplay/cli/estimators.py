@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import click
 
-from avsreplay.cli.backends import print_plain_table
+from avsreplay.cli.backends import print_json, print_plain_table, report_laws
+from avsreplay.cli.config import Command
 
 EPILOG = """\b
 Examples:
@@ -16,7 +14,7 @@ Examples:
   avsreplay run tumble.mcap --estimator ekf"""
 
 
-@click.command("estimators", epilog=EPILOG)
+@click.command("estimators", cls=Command, epilog=EPILOG)
 @click.option(
     "--check",
     "name",
@@ -36,27 +34,24 @@ def estimators_command(name: str | None, as_json: bool) -> None:
         UsageError: no estimator has this name.
         CheckFailed: it breaks a law.
     """
-    if name is None:
-        from avsreplay.estimate.plugin import about, names
+    if name is not None:
+        from avsreplay.estimate.contract import check
 
-        rows = [{"estimator": each, "description": about(each)} for each in names()]
-        if as_json:
-            click.echo(json.dumps(rows, indent=2))
-        else:
-            print_plain_table("Estimators", ("name", "description"), (r.values() for r in rows))
+        report_laws("estimator", name, check(name), as_json)
         return
-    from avsreplay.errors import CheckFailed
-    from avsreplay.estimate.contract import check
+    from avsreplay.parts import ESTIMATORS
 
-    found = check(name)
+    rows = [{"estimator": each, "description": _about(each)} for each in sorted(ESTIMATORS.names())]
     if as_json:
-        laws = [dataclasses.asdict(law) for law in found]
-        click.echo(json.dumps({"estimator": name, "findings": laws}, indent=2))
+        print_json(rows)
     else:
-        rows_of = ((law.law, "yes" if law.held else "NO", law.detail) for law in found)
-        print_plain_table(f"Contract of {name}", ("law", "holds", "measured"), rows_of)
-    broken = [law.law for law in found if not law.held]
-    if broken:
-        raise CheckFailed(
-            f"{len(broken)} of {len(found)} laws broken: {'; '.join(broken)}", where=name
-        )
+        print_plain_table("Estimators", ("name", "description"), (r.values() for r in rows))
+
+
+def _about(name: str) -> str:
+    from avsreplay.parts import ESTIMATORS
+
+    try:
+        return str(getattr(ESTIMATORS.load(name), "about", ""))
+    except ImportError as error:
+        return f"cannot be imported: {error}"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand, source_setting
+from avsreplay.cli.config import Command, source_setting
 from avsreplay.cli.options import (
     check_outputs,
     pose_options,
@@ -39,7 +39,7 @@ Examples:
   avsreplay info drive.bag --json"""
 
 
-@click.command(name="info", cls=SectionedCommand, epilog=EPILOG)
+@click.command(name="info", cls=Command, epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @source_options
 @pose_options
@@ -107,9 +107,9 @@ def _write_job(
     path: Path, source: Path, reading: dict[str, Any], advice: list[Advice], words: list[str]
 ) -> None:
     """Write the options of the command, and those that were advised with their reasons."""
-    from avsreplay.cli.job import job_text
     from avsreplay.cli.trial import advised_words, job_with
     from avsreplay.files import output_text
+    from avsreplay.job_file import job_text
 
     job, before = job_with(source, reading, words), job_with(source, reading, [])
     reasons = dict[str, str]()
@@ -353,7 +353,7 @@ Examples:
   avsreplay doctor x.mcap --repair clean.mcap"""
 
 
-@click.command(name="doctor", epilog=DOCTOR_EPILOG)
+@click.command("doctor", cls=Command, epilog=DOCTOR_EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--topic", help="The cloud topic, if there are several.")
 @click.option(

@@ -8,10 +8,12 @@ A command is the object ``<name>_command`` in ``avsreplay/cli/<name>.py``, or in
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib
 import io
 import os
 import re
+import shlex
 import signal
 import sys
 from collections.abc import Iterator
@@ -22,6 +24,7 @@ import click
 
 from avsreplay import __version__, arithmetic
 from avsreplay.cli import interrupts
+from avsreplay.cli.config import Command
 from avsreplay.errors import AvsError, UsageError, printable
 
 __all__ = ["entry_point"]
@@ -42,6 +45,7 @@ SUMMARIES = {
     "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
     "compare": "Compare saved results; gate one against a baseline.",
     "sweep": "Run a campaign of many runs and summarise it.",
+    "benchmark": "Run a suite of captures for every back end and estimator.",
     "config": "Print the effective settings of a run.",
     "completion": "Print the completion script of a shell.",
 }
@@ -85,8 +89,6 @@ class _Commands(click.Group):
             known = list(self._variables(ctx))
             unknown = [name for name in unknown if name not in known]
         if unknown:
-            import difflib
-
             near = difflib.get_close_matches(unknown[0], known, 1)
             hint = (
                 f"did you mean {near[0]}?"
@@ -133,7 +135,20 @@ class _Commands(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            raise click.UsageError(f"{error.message} Known: {', '.join(SUMMARIES)}.", ctx) from None
+            if Path(args[0]).exists():
+                hint = f"avsreplay {_command_for(Path(args[0]))} {shlex.join(args)}"
+                raise UsageError(
+                    "is no command", where=args[0], hint=f"did you mean: {hint}"
+                ) from None
+            near = difflib.get_close_matches(args[0], SUMMARIES, 1)
+            meant = f" Did you mean {near[0]}?" if near else ""
+            message = f"{error.message}{meant} Known: {', '.join(SUMMARIES)}."
+            raise click.UsageError(message, ctx) from None
+
+
+def _command_for(path: Path) -> str:
+    """The command that is suggested where only a file or folder is named."""
+    return "report" if (path / "rows.jsonl").is_file() else "run"
 
 
 PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "click", "rich")
@@ -192,7 +207,7 @@ Examples:
   avsreplay completion fish > ~/.config/fish/completions/avsreplay.fish"""
 
 
-@click.command("completion", epilog=COMPLETION_EPILOG)
+@click.command("completion", cls=Command, epilog=COMPLETION_EPILOG)
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion_command(shell: str) -> None:
     """Print the completion script for SHELL.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import (
     PATH,
     Numbers,
@@ -21,7 +21,7 @@ from avsreplay.cli.options import (
     check_suffix,
     read_options,
     report_losses,
-    source_options,
+    scan_options,
     tracked,
 )
 from avsreplay.errors import MissingBackend, UsageError
@@ -38,7 +38,7 @@ Examples:
   avsreplay run tumble.mcap --model auto    build the model and use it"""
 
 
-@click.command("model", cls=SectionedCommand, epilog=EPILOG)
+@click.command("model", cls=Command, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @click.option(
     "-o",
@@ -71,7 +71,7 @@ Examples:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-@source_options
+@scan_options
 def model_command(
     log: Path,
     output: Path,
@@ -259,7 +259,7 @@ Examples:
                                             the motion from these poses"""
 
 
-@click.command("odometry", cls=SectionedCommand, epilog=ODOMETRY_EPILOG)
+@click.command("odometry", cls=Command, epilog=ODOMETRY_EPILOG)
 @click.argument("log", type=PATH)
 @click.option(
     "-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM: .tum or .txt)."
@@ -271,7 +271,7 @@ Examples:
 )
 @click.option("--no-deskew", is_flag=True, help="Ignore the times of the points.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@source_options
+@scan_options
 def odometry_command(
     log: Path, output: Path, size: float | None, no_deskew: bool, overwrite: bool, **reading: Any
 ) -> None:

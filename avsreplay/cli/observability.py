@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import PATH, read_options, report_losses, source_options
 from avsreplay.errors import counted
 
@@ -46,7 +46,7 @@ of mass), and the least observed of the others. A direction of several states
 is a combination that the poses do not separate."""
 
 
-@click.command("observability", cls=SectionedCommand, epilog=EPILOG)
+@click.command("observability", cls=Command, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @click.option(
     "--init",

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 PATH = click.Path(path_type=Path)
+HTML = (".html", ".htm")
 
 
 class Numbers(click.ParamType[tuple[float, ...]]):
@@ -53,23 +54,6 @@ class Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
-class StartMode(click.ParamType[str | float]):
-    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the
-    first scan).
-    """
-
-    name = "mode|seconds"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The mode or the number; anything else is a usage error."""
-        if value in ("cold", "near", "paper"):
-            return value
-        try:
-            return float(value)
-        except ValueError:
-            self.fail(f"'{value}' is neither cold, near, paper nor a number of seconds", param, ctx)
-
-
 def added(*options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds ``options`` to a command in this order."""
 
@@ -81,42 +65,47 @@ def added(*options: Callable[[F], F]) -> Callable[[F], F]:
     return decorate
 
 
-run_source_options = added(
-    source_setting("--model", type=PATH),
-    source_setting("--cloud-model", is_flag=True),
-    source_setting("--model-unit"),
+model_options = added(
+    source_setting("--model", type=PATH, common=True),
+    source_setting("--model-unit", common=True),
     source_setting("--model-scale", type=float),
     source_setting("--model-mirror", is_flag=True),
-    source_setting("--topic"),
-    source_setting("--truth-topic"),
+    source_setting("--cloud-model", is_flag=True),
+)
+"""Options for the model of the target."""
+truth_options = added(
+    source_setting("--truth-topic", common=True),
     source_setting("--truth", "truth_file", type=PATH),
     source_setting("--truth-frame"),
-    source_setting("--truth-gap", "truth_gap_s", type=float),
-    source_setting("--fixed-frame"),
-    source_setting("--sensor-topic"),
+)
+"""Options for the true poses."""
+scan_options = added(
+    source_setting("-t", "--topic", common=True),
+    source_setting("--start", "start_s", type=float, common=True),
+    source_setting("--end", "end_s", type=float),
+    source_setting("--duration", "duration_s", type=float, common=True),
+    source_setting("-n", "--n-scans", type=int, common=True),
+    source_setting("--every-scan", "every", type=int),
     source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
-    source_setting("--scan-duration", "scan_duration_s", type=float),
-    source_setting("--intrinsics", type=str),
+    source_setting("--fixed-frame"),
+    source_setting("--sensor-topic"),
+    source_setting("--truth-gap", "truth_gap_s", type=float),
     source_setting("--scan-unit"),
+    source_setting("--scan-duration", "scan_duration_s", type=float),
     source_setting("--point-time", metavar="FIELD:UNIT:ORIGIN"),
     source_setting("--no-return", metavar="CODES"),
     source_setting("--byte-order"),
+    source_setting("--intrinsics", type=str),
     source_setting("--rate", "rate_hz", type=float),
-    source_setting("--every-scan", "every", type=int),
-    source_setting("--end", "end_s", type=float),
-    source_setting("--duration", "duration_s", type=float),
-    source_setting("--n-scans", type=int),
     source_setting("--clock"),
     source_setting("--max-message-mib", type=int),
     source_setting("--strict", is_flag=True),
 )
-"""Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None
-by default.
-"""
-source_options = added(source_setting("--start", "start_s", type=float), run_source_options)
-"""The same with the begin; the ``--start`` of ``run`` also takes the initialisation of the
-estimate.
+"""Options for the scans: which ones, in which frame, and what their values mean."""
+source_options = added(model_options, truth_options, scan_options)
+"""All options for reading a log; each has the name of its field in ``log.SourceOptions`` and is
+None by default.
 """
 pose_options = added(
     source_setting("--pose-sigma", type=Numbers(2), metavar="MM,DEG"),
@@ -158,7 +147,7 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         field, _, what = str(error).partition(" ")
         context = click.get_current_context(silent=True)
         known = context.command.params if context else []
-        option = next((param.opts[0] for param in known if param.name == field), field)
+        option = next((param.opts[-1] for param in known if param.name == field), field)
         raise UsageError(f"{option} {what}", hint="correct the option") from None
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import robot_option, setting_option
-from avsreplay.cli.options import Numbers, check_outputs
+from avsreplay.cli.config import Command, robot_option, setting_option
+from avsreplay.cli.options import HTML, Numbers, check_outputs, check_suffix
 
 if TYPE_CHECKING:
     from avsreplay.cli.plan_output import Answer, PossibleChange
@@ -62,24 +62,24 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
             2 usage, 3 unreadable input."""
 
 
-@click.command("plan", epilog=EPILOG)
+@click.command("plan", cls=Command, epilog=EPILOG)
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option(
     "--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence."
 )
 @setting_option("--a-max", "a_max_mps2", type=float, owner=PLAN)
 @setting_option("--horizon", "horizon_s", type=float, owner=PLAN)
-@setting_option("--latency", "latency_s", type=float, owner=PLAN)
-@setting_option("--period", "replan_period_s", type=float, owner=PLAN)
+@setting_option("--latency", "latency_s", type=float, owner=PLAN, common=False)
+@setting_option("--period", "replan_period_s", type=float, owner=PLAN, common=False)
 @setting_option("--from", "robot_position_m", type=Numbers(3), metavar="X,Y,Z", owner=PLAN)
 @setting_option("--cone-deg", type=float, owner=LIMITS)
-@setting_option("--cone-range", "cone_range_m", type=float, owner=LIMITS)
+@setting_option("--cone-range", "cone_range_m", type=float, owner=LIMITS, common=False)
 @setting_option("--final-deg", type=float, owner=LIMITS)
-@setting_option("--final-range", "final_range_m", type=float, owner=LIMITS)
+@setting_option("--final-range", "final_range_m", type=float, owner=LIMITS, common=False)
 @setting_option("--speed-max", "speed_max_mps", type=float, owner=LIMITS)
-@setting_option("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS)
+@setting_option("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS, common=False)
 @setting_option("--keepout", "keepout_m", type=float, owner=LIMITS)
-@setting_option("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
+@setting_option("--keepout-release", "keepout_release_m", type=float, owner=LIMITS, common=False)
 @setting_option("--clearance", "clearance_m", type=float, owner=LIMITS)
 @robot_option()
 @click.option(
@@ -167,6 +167,10 @@ def plan_command(
                 f"{value:g} is not in the range 1e-6 to 1e6", where=name, hint="correct the option"
             )
     check_outputs("export", "animate", overwrite=overwrite)
+    if export:
+        check_suffix(export, ".csv", ".txt")
+    if animate:
+        check_suffix(animate, *HTML)
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:
@@ -237,10 +241,12 @@ def _changes(
 ) -> list[PossibleChange]:
     """Return single changes with which a plan is found: of settings, then of the instant."""
     from dataclasses import replace
+    from itertools import islice
 
     from avsreplay.cli.plan_output import PossibleChange
     from avsreplay.errors import UsageError
     from avsreplay.saved_result import with_settings
+    from avsreplay.tables import column_of
 
     options = {p.name: p.opts[0] for p in click.get_current_context().command.params}
     params, limits = _given(saved, flags)
@@ -266,9 +272,9 @@ def _changes(
                 break
     for later_s in LATER_S:
         at_s = saved.rows[index].t_s + later_s
-        for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][
-            :1
-        ]:
+        known = zip(column_of(saved.rows, "t_s"), column_of(saved.rows, "converged"), strict=True)
+        later_ones = (k for k, (t_s, flag) in enumerate(known) if t_s >= at_s and flag)
+        for later in islice(later_ones, 1):
             made = planning.plan_at(later)
             if made.found:
                 return [

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import (
+    HTML,
     PATH,
     check_binary_output,
     check_outputs,
@@ -24,7 +25,7 @@ from avsreplay.cli.options import (
     source_options,
     tracked,
 )
-from avsreplay.errors import DataLost, UnreadableInput, UsageError
+from avsreplay.errors import DataLost, UsageError
 from avsreplay.files import STDOUT, check_output
 from avsreplay.report import export
 
@@ -44,7 +45,7 @@ Examples:
 KINDS = "Kinds of fault with their default strengths (docs/scenario.md describes them):"
 
 
-class RecordCommand(SectionedCommand):
+class RecordCommand(Command):
     """``record``, whose help lists the kinds of fault."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -200,7 +201,7 @@ def _format_of(output: Path, kind: str | None) -> str:
     return kind
 
 
-@click.command("export", epilog=EXPORT_EPILOG)
+@click.command("export", cls=Command, epilog=EXPORT_EPILOG)
 @click.argument("result", type=PATH)
 @click.option(
     "--to",
@@ -270,7 +271,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 
-@click.command("report", epilog=REPORT_EPILOG)
+@click.command("report", cls=Command, epilog=REPORT_EPILOG)
 @click.argument("result", type=PATH)
 @click.option(
     "-o",
@@ -288,6 +289,7 @@ def report_command(result: Path, output: Path | None, title: str | None, overwri
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
     check_output(page, overwrite=overwrite, inputs=[result])
+    check_suffix(page, *HTML)
     click.echo(write_page(result, page, title), err=page == STDOUT)
 
 
@@ -303,18 +305,12 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
         One line with the file and its size.
 
     Raises:
-        UnreadableInput: The result cannot be read or holds no row.
+        UnreadableInput: The result cannot be read or has no rows.
     """
     from avsreplay.files import output_text
     from avsreplay.report.page import build_page
 
     found = read_result(result)
-    if not found.rows:
-        raise UnreadableInput(
-            "holds no row",
-            where=str(result),
-            hint="name the result of a run with at least one scan",
-        )
     page = build_page(
         found.rows,
         found.summary,

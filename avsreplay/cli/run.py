@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import SectionedCommand, run_settings, take_run_settings
+from avsreplay.cli.config import Command, run_settings, take_run_settings
 from avsreplay.cli.options import (
     PATH,
-    StartMode,
     check_outputs,
     given_paths,
     log_file,
     pose_options,
     read_options,
     report_losses,
+    source_options,
 )
-from avsreplay.cli.options import run_source_options as source_options
 from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
@@ -38,16 +37,15 @@ if TYPE_CHECKING:
     from avsreplay.result_dir import ResultDirectory, ResultWriter
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
+    from avsreplay.viewers import RerunStream
 
 GRADES = ("pass", "check", "any")
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
-  avsreplay run y.mcap --model m.ply --topic /points -o results/ \\
-      --truth-topic /truth/pose --init truth
+  avsreplay run y.mcap --model m.ply -t /points -o results/ --init truth
   avsreplay record scenario.toml -o - | avsreplay run -
-  avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
-  avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json
+  avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02
   avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
@@ -102,18 +100,11 @@ class Requirement(click.ParamType[str | float]):
         return least
 
 
-@click.command("run", cls=SectionedCommand, epilog=EPILOG)
+@click.command("run", cls=Command, epilog=EPILOG)
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--start",
-    "starts",
-    type=StartMode(),
-    multiple=True,
-    help="Initialisation (cold, near, paper) or start time [s].",
-)
-@click.option(
-    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md)."
+    "--paper", is_flag=True, help="Use the method as printed in the paper (docs/equations.md)."
 )
 @source_options
 @pose_options
@@ -127,18 +118,16 @@ class Requirement(click.ParamType[str | float]):
     "-o",
     "--output",
     type=PATH,
-    help="Write rows, trajectories, beliefs and settings to this directory.",
+    help="Result directory: rows, trajectories, beliefs and settings.",
 )
 @click.option(
     "--report",
     "page",
     is_flag=True,
-    help="Add the HTML page, report.html, to the result directory.",
+    help="Also write the page report.html.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
-@click.option(
-    "--resume", is_flag=True, help="Continue the interrupted run in the result directory."
-)
+@click.option("--resume", is_flag=True, help="Continue an interrupted run in the directory.")
 @click.option(
     "--follow",
     is_flag=True,
@@ -149,9 +138,11 @@ class Requirement(click.ParamType[str | float]):
     "--require",
     "required",
     type=Requirement(),
+    metavar="GRADE|capture=P",
     multiple=True,
-    help="Exit with code 1 if the verdict is worse, or the capture is less probable (capture=0.9)."
-    " Without it FAIL gives code 1; any accepts every verdict. May be repeated.",
+    help="Exit code 1 if the verdict is worse: pass, check or any, or capture=0.9 for the least"
+    " probability of a capture. Without it FAIL gives code 1; any accepts every verdict. May be"
+    " repeated.",
 )
 @click.option(
     "--tables",
@@ -161,9 +152,10 @@ class Requirement(click.ParamType[str | float]):
     help="Print more tables: verdict, moments, capture, scans, curves, errors, faults, manoeuvres,"
     " parameters, consistency, run.",
 )
+@click.option("-v", "--verbose", is_flag=True, help="Print all tables, as --tables all.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
-@click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
+@click.option("--plain", is_flag=True, help="Leave out curves of errors and flagged scans.")
 @click.option(
     "--rerun",
     "to_rerun",
@@ -171,14 +163,16 @@ class Requirement(click.ParamType[str | float]):
     help="Show the run in Rerun (extra 'rerun').",
 )
 def run_command(log: Path, **flags: Any) -> None:
-    """Replay LOG through registration, filter, fault detector and planner, and print the tables.
+    """Replay LOG: an MCAP file, a ROS bag, a folder of scans, a job file, or - for standard input.
 
-    LOG is an MCAP file, a ROS bag, a folder of scans, or a job file with a log and its options. A
-    log written by 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model
-    FILE' names the options that it needs, and --write stores them as a job file.
-    If LOG is -, an MCAP file is read from standard input, and each scan is replayed as soon as it
-    is complete; --follow does the same with a file that is still being written. The results are
-    those of a replay of the complete log. \f Raises:
+    A log of 'avsreplay record' needs no option; for any other log 'avsreplay info LOG --model FILE'
+    names the options that it needs, and --write stores them as a job file.
+
+    \f
+    A log from standard input, or one that --follow reads while it is written, is replayed scan by
+    scan; the results are those of a replay of the complete log.
+
+    Raises:
         UsageError: options contradict each other.
     """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
@@ -221,9 +215,12 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
             from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
-        click.echo(done.verdict.line, err=True)
+        if wanted.as_json or not sys.stdout.isatty():  # else it stands above the table already
+            click.echo(done.verdict.line, err=True)
         _gate(wanted, done)
         report_losses(run.source, done.summary.status.get("damaged", 0))
+        if not wanted.required:
+            _check_required(["check"], done.verdict, where="tracking")
 
 
 @value_class(kw_only=True, eq=True)
@@ -239,6 +236,7 @@ class Wanted:
     follow: bool
     as_json: bool
     tables: tuple[str, ...]
+    verbose: bool
     table_every: int | None
     table_all: bool
     plain: bool
@@ -272,17 +270,12 @@ def _with_job_file(log: Path, flags: dict[str, Any]) -> Path:
     """Return the log of a job file and put its options into ``flags`` where none is given; any
     other log is returned as it is.
     """
-    if log.suffix != ".toml" or not log.is_file():
-        return log
-    from avsreplay.cli.job import read_job
+    from avsreplay.job_file import read_job
 
     job = read_job(log)
     if job is None:
         return log
     given = {**job.given, "golden": job.golden, "config_file": job.config}
-    start_s = given.pop("start_s", None)
-    if start_s is not None and not any(isinstance(each, float) for each in flags["starts"]):
-        flags["starts"] = (*flags["starts"], start_s)
     for name, value in given.items():
         if flags.get(name) is None:
             flags[name] = value
@@ -307,13 +300,10 @@ def job_of(log: Path, flags: dict[str, Any]) -> Job:
     of_file = tuple(flags.pop("assigned", ()))
     config_file, assignments = take_run_settings(flags)
     assignments = (*of_file, *assignments)
-    starts = flags.pop("starts")
     if flags.pop("paper"):
         from avsreplay.config import PAPER
 
         assignments = PAPER + assignments
-    assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
-    flags["start_s"] = next((start for start in reversed(starts) if isinstance(start, float)), None)
     return Job(
         source=log, options=read_options(flags), config_file=config_file, assignments=assignments
     )
@@ -357,68 +347,89 @@ def _replayed(
 
     An interrupt ends the replay and keeps what there is.
     """
-    from avsreplay.cli.options import tracked
     from avsreplay.report.verdict import verdict_of
     from avsreplay.result_dir import ResultWriter
     from avsreplay.viewers import RerunStream
 
     keeper = ResultWriter(target, run) if target else None
     viewer = RerunStream(run, wanted.to_rerun) if wanted.to_rerun else None
-    listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
-        rows = _resumed(run, keeper) if keeper and wanted.resume else []
-        kept = len(rows)
-        listeners += keeper.listeners if keeper else ()
-        if run.config.reference.value == "fit" and not kept:
-            run.fit_reference(tracked)
-        growing = run.job.growing
-        live = growing is not None and not wanted.as_json
-        interrupted = _collect(
-            run.rows(listeners, None if live else tracked), rows, growing, live=live
-        )
-        if growing and not interrupted and growing.outdated():
-            raise Outdated
-        changed = run.rescore(rows) if growing else []
-        for taker in (viewer, keeper) if changed else ():
-            if taker:
-                taker.correct(rows, changed)
+        if keeper and wanted.resume:
+            _resume(run, keeper)
+        rows, kept = run.taken, run.done
+        interrupted = _take_scans(run, keeper, viewer, live_allowed=not wanted.as_json)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
         summary = run.summary()
-        record = _record(run, summary)
-        record["capture"] = None if summary.assessment is None else summary.assessment.record()
-        record["measured_1s"] = None if run.flight.noise is None else list(run.flight.noise)
-        record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
-        grade = (
-            "check" if summary.healthy else "fail"
-        )  # a wrong model explains why no scan was used
-        record["preflight"] += [
-            {"grade": grade, "text": note} for note in _model_notes(run, advice)
-        ]
-        record["preflight"] += [
-            {"grade": "check", "text": note} for note in _untimed_notes(run, rows)
-        ]
+        record = _record(run, summary) | {"preflight": _findings(run, advice, rows, summary)}
         if interrupted:
             record["interrupted_after"] = len(rows)
-            how = "; add --resume to continue" if target and not growing else ""
-            text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
-            click.echo(f"avsreplay: {text}", err=True)
+            _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
-            keeper.finish(rows, record, resumable=interrupted and not growing)
+            keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
     )
 
 
-def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
-    """The rows of the interrupted run, whose state the open run continues from."""
+def _take_scans(
+    run: Run,
+    keeper: ResultWriter | None,
+    viewer: RerunStream | None,
+    *,
+    live_allowed: bool,
+) -> bool:
+    """Replay the scans that follow those taken; return whether this was interrupted.
+
+    Raises:
+        Outdated: the log has grown, and what was recorded later changes rows.
+    """
+    from avsreplay.cli.options import tracked
+
+    takers = [taker for taker in (viewer, keeper) if taker]
+    listeners: list[Listener] = [viewer] if viewer else []
+    listeners += keeper.listeners if keeper else ()
+    if run.config.reference.value == "fit" and not run.done:
+        run.fit_reference(tracked)
+    growing = run.job.growing
+    live = growing is not None and live_allowed
+    found = run.rows(listeners, None if live else tracked)
+    interrupted = _collect(found, run.taken, growing, live=live)
+    if growing and not interrupted and growing.outdated():
+        raise Outdated
+    changed = run.rescore() if growing else []
+    for taker in takers if changed else ():
+        taker.correct(run.taken, changed)
+    return interrupted
+
+
+def _findings(
+    run: Run, advice: list[Advice], rows: Sequence[Row], summary: Summary
+) -> list[dict[str, str]]:
+    """What the checks before and after the replay found, with grades."""
+    of_model = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
+    graded = [
+        *((each.grade, each.sentence) for each in advice),
+        *((of_model, note) for note in _model_notes(run, advice)),
+        *(("check", note) for note in _untimed_notes(run, rows)),
+    ]
+    return [{"grade": grade, "text": text} for grade, text in graded]
+
+
+def _say_interrupted(run: Run, rows: Sequence[Row], *, resumable: bool) -> None:
+    how = "; add --resume to continue" if resumable and not run.job.growing else ""
+    text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
+    click.echo(f"avsreplay: {text}", err=True)
+
+
+def _resume(run: Run, keeper: ResultWriter) -> None:
+    """Let the open run continue from the state of the interrupted one."""
     from avsreplay.cli.main import versions
 
-    rows = keeper.resume({**run.facts(), "versions": versions()})
-    click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
-    return rows
+    keeper.resume({**run.facts(), "versions": versions()})
+    click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
@@ -455,9 +466,13 @@ def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _collect(
-    found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False
+    found: Generator[Row],
+    rows: Sequence[Row],
+    growing: GrowingLog | None = None,
+    *,
+    live: bool = False,
 ) -> bool:
-    """Take all rows; True if the user interrupted the replay after at least one row.
+    """Take all rows, which the run keeps; True if the user interrupted after one or more.
 
     An interrupt takes effect between two scans, so that all results hold the same scans; a second
     one at once. With ``live`` a line is printed for each row.
@@ -472,7 +487,6 @@ def _collect(
             for row in found:
                 if live:
                     say_live(row)
-                rows.append(row)
                 if stopped() and not growing:
                     return True
             return stopped()
@@ -482,23 +496,33 @@ def _collect(
         return True
 
 
+def _changed(run: Run) -> list[str]:
+    """The settings that differ from their defaults; one that the user has not given says so."""
+    from avsreplay.config import load_config
+    from avsreplay.report.compare import changed_settings
+
+    given = load_config(run.job.config_file, {}, run.job.assignments)
+    stated = changed_settings(run.job.options, given)
+    return changed_settings(run.job.options, run.config, stated=stated)
+
+
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
     from avsreplay.cli.main import versions
-    from avsreplay.report.compare import changed_settings
     from avsreplay.report.result import facts_record
     from avsreplay.settings import dump
 
     header = run.source.header
     labels = header.labels if header.labels or header.seed is not None else None
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
-    changed = changed_settings(run.job.options, run.config)
     limits = dump(run.config.faults.resolved(run.surface.extent))
     return {
         **run.facts(),
         "limits": limits,
-        "changed_settings": changed,
+        "changed_settings": _changed(run),
         "facts": facts,
         "versions": versions(),
+        "capture": None if summary.assessment is None else summary.assessment.record(),
+        "measured_1s": None if run.flight.noise is None else list(run.flight.noise),
     }
 
 
@@ -508,10 +532,11 @@ def _print(wanted: Wanted, done: _Finished) -> None:
 
         click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
         return
-    from avsreplay.report.summary_tables import print_screen, print_tables
+    from avsreplay.report.summary_tables import TABLES, print_screen, print_tables
     from avsreplay.report.table import make_console
 
-    console, names = make_console(), set(wanted.tables)
+    console = make_console()
+    names = set(TABLES if wanted.verbose else wanted.tables)
     if wanted.table_all or wanted.table_every:
         names.add("scans")
     print_screen(console, done.rows, done.verdict)
@@ -544,25 +569,26 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
     if "interrupted_after" in done.record:
         raise KeyboardInterrupt
-    _check_required(wanted.required, done.verdict)
+    if wanted.required:
+        _check_required(wanted.required, done.verdict)
 
 
-def _check_required(required: Sequence[str | float], verdict: RunVerdict) -> None:
-    """Raise CheckFailed for a verdict that is worse than required; without a requirement on the
-    grade FAIL is worse.
+def _check_required(required: Sequence[str | float], verdict: RunVerdict, where: str = "") -> None:
+    """Raise CheckFailed for a verdict that is worse than required; where no grade is required, FAIL
+    is worse.
     """
     capture = verdict.capture
     probability = (None if capture is None else capture.probability) or 0.0
     for least in required:
         if isinstance(least, float) and (probability < least or not (capture and capture.succeeds)):
-            where = f"--require capture={least:g}"
-            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+            at = f"--require capture={least:g}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=at)
     order = ["pass", "check", "fail"]
     grades = [least for least in required if isinstance(least, str)] or ["check"]
     for grade in grades:
         if grade != "any" and order.index(verdict.grade.value.lower()) > order.index(grade):
-            where = f"--require {grade}" if required else "tracking"
-            raise CheckFailed(f"the verdict is {verdict.line}", where=where)
+            at = where or f"--require {grade}"
+            raise CheckFailed(f"the verdict is {verdict.line}", where=at)
 
 
 def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:

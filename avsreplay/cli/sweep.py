@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import PATH
 from avsreplay.errors import DataLost, UsageError, counted
 from avsreplay.files import check_output
@@ -32,7 +33,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or data was lost."""
 
 
-@click.command("sweep", epilog=EPILOG)
+@click.command("sweep", cls=Command, epilog=EPILOG)
 @click.argument("campaign", type=PATH)
 @click.option(
     "-o", "--output", type=PATH, help="Directory of the results; an existing one is continued."

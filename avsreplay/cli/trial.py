@@ -29,6 +29,7 @@ class Trial:
         used: of them in the estimate.
         inlier_ratio: median share of the points on the model, None where no scan is registered.
         pos_err_m, rot_err_deg: median errors of the registered pose, None without truth.
+        extent_m: size of the model.
         broken: why the replay ended, "" if it did not.
         reason: most frequent reason why scans were not used, "" if all were.
     """
@@ -38,17 +39,27 @@ class Trial:
     inlier_ratio: float | None = None
     pos_err_m: float | None = None
     rot_err_deg: float | None = None
+    extent_m: float = 0.0
     broken: str = ""
     reason: str = ""
 
     @property
-    def advice(self) -> Advice:
-        """Return the result as a finding."""
-        from avsreplay.model_size import Advice
+    def sound(self) -> bool:
+        """Whether most scans are used, at the true poses where these are known."""
+        return 2 * self.used >= self.scans and not self._elsewhere
 
+    @property
+    def _elsewhere(self) -> bool:
+        from avsreplay.report.verdict import ERROR_FAIL
+
+        return self.pos_err_m is not None and self.pos_err_m > ERROR_FAIL * self.extent_m
+
+    @property
+    def result(self) -> str:
+        """What the replay gave, in words."""
         if self.broken:
-            return Advice("fail", "replay", f"a run with these options ends: {self.broken}")
-        parts = [f"{self.used} of the first {self.scans} scans are used with these options"]
+            return self.broken
+        parts = [f"{self.used} of the first {self.scans} scans are used"]
         if self.inlier_ratio is not None:
             parts.append(f"{100 * self.inlier_ratio:.0f} % of the points on the model")
         if self.pos_err_m is not None and self.rot_err_deg is not None:
@@ -58,16 +69,26 @@ class Trial:
             )
         if self.reason:
             parts.append(f"the others: {self.reason}")
-        grade = "ok" if 2 * self.used >= self.scans else "check"
-        return Advice(grade, "replay", ", ".join(parts))
+        if self._elsewhere:
+            parts.append("are the true poses in another frame, or of another model?")
+        return ", ".join(parts)
+
+    @property
+    def advice(self) -> Advice:
+        """Return the result as a finding."""
+        from avsreplay.model_size import Advice
+
+        if self.broken:
+            return Advice("fail", "replay", f"a run with these options ends: {self.broken}")
+        return Advice("ok" if self.sound else "check", "replay", self.result)
 
 
 def advised_words(found: Sequence[Advice]) -> dict[str, str]:
     """Return the options of findings that can be added as they are, each with its reason.
 
     Args:
-        found: the findings; an option with a placeholder, an alternative, or of a finding that asks
-            for nothing (but true poses) is left out.
+        found: the findings; an option with a placeholder, an alternative, or of a finding that
+            requires nothing (but true poses) is left out.
     """
     out = dict[str, str]()
     for each in found:
@@ -101,9 +122,7 @@ def job_with(source: Path, reading: Mapping[str, Any], options: Sequence[str]) -
     with run_command.make_context("run", [str(source), *words]) as context:
         flags = dict(context.params)
         for name, value in given.items():
-            if name == "start_s":
-                flags["starts"] = (value,)
-            elif name == "poses":
+            if name == "poses":
                 flags["backend"] = "poses" if value else flags["backend"]
             elif flags.get(name) is None:
                 flags[name] = value
@@ -123,7 +142,7 @@ def tried(job: Job) -> Trial:
         with Run(
             dataclasses.replace(job, options=dataclasses.replace(job.options, n_scans=n))
         ) as run:
-            return _of_rows(list(run.rows()))
+            return _of_rows(list(run.rows()), run.surface.extent)
     except AvsError as error:
         return Trial(n, broken=str(error))
 
@@ -131,7 +150,8 @@ def tried(job: Job) -> Trial:
 def try_advice(
     source: Path, reading: Mapping[str, Any], found: Sequence[Advice]
 ) -> tuple[list[Advice], list[str]]:
-    """Try the advised options, and without a fixed frame where no scan can be moved to it.
+    """Try the advised options, and without a fixed frame where the scans are not used in it or are
+    not at the true poses.
 
     Args:
         source: the log.
@@ -146,18 +166,17 @@ def try_advice(
     options = list(advised_words(found))
     first = tried(job_with(source, reading, options))
     frames = [option for option in options if option.startswith("--fixed-frame ")]
-    if not frames or 2 * first.used >= first.scans:
+    if not frames or first.sound:
         return [first.advice], options
     rest = [option for option in options if option not in frames]
     second = tried(job_with(source, reading, rest))
-    if second.used <= first.used:
+    if (second.sound, second.used) <= (first.sound, first.used):
         return [first.advice], options
-    text = f"with {frames[0]} only {first.used} of the first {first.scans} scans are used"
-    why = first.broken or first.reason
-    return [Advice("check", "transforms", f"{text} ({why}): it is left out"), second.advice], rest
+    text = f"{frames[0]} is left out, because with it {first.result}"
+    return [Advice("check", "transforms", text), second.advice], rest
 
 
-def _of_rows(rows: Sequence[Row]) -> Trial:
+def _of_rows(rows: Sequence[Row], extent_m: float) -> Trial:
     unused = [row.reason if row.status == "ok" else row.status for row in rows if not row.gamma]
     reason = max(sorted(set(unused)), key=unused.count) if unused else ""
     return Trial(
@@ -166,6 +185,7 @@ def _of_rows(rows: Sequence[Row]) -> Trial:
         _median([row.inlier_ratio for row in rows]),
         _median([row.reg_pos_err_m for row in rows]),
         _median([row.reg_rot_err_deg for row in rows]),
+        extent_m,
         reason=str(reason),
     )
 

@@ -9,7 +9,7 @@ error has the stated covariance, so that a filter that is linear in its errors c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from avsreplay.estimate.measurement import innovation_vector, measurement_jacobi
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.plugged import AnyEstimator, estimator_of
 from avsreplay.geometry import Array, Pose
+from avsreplay.parts import LawResult
 from avsreplay.records import Alignment, AlignStatus, Belief, Reason, State, Verdict
 
 EXTENT_M = 2.0
@@ -35,15 +36,6 @@ MEAN_NEES = (0.3, 2.5)  # allowed mean of the squared error over its variance, p
 LATER_S = 10.0  # a forecast is compared with the motion this long after the last pose
 SEED = 20
 NS = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class LawResult:
-    """Result of one law: its name, whether it holds and the figures in one line."""
-
-    law: str
-    held: bool
-    detail: str
 
 
 @value_class

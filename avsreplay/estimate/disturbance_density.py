@@ -2,7 +2,9 @@
 them.
 
 The whitened residuals of the poses are linear in the initial values y and in impulses u of the
-disturbance between the poses, with u ~ N(0, q^2). The likelihood of every root density q is a
+disturbance between the poses, with u ~ N(0, q^2). Those of other disturbances are further unknowns
+with a prior, not a part of the covariance of the residuals: over a long log they are so large that
+this covariance could no longer be factored. The likelihood of every root density q is a
 closed form in the eigenvectors of the information on u; so are the mean and the covariance of the
 present rate or velocity, given q.
 
@@ -35,14 +37,32 @@ _FEW_ROWS = 36  # rows up to which a triangular matrix is inverted
 
 @value_class
 class Residuals:
-    """Whitened residuals e (n,) and their Jacobian J (n, m); information (m, m) and offset
-    (m,) of the prior.
+    """Whitened residuals e (n,) and their Jacobian J (n, m) by unknowns with a Gaussian prior.
+
+    ``root`` (p, m) is a root of the prior's information, root' root, and ``off`` (m,) the offset of
+    the unknowns from the prior's mean.
     """
 
     e: Array
     J: Array
-    info: Array
+    root: Array
     off: Array
+
+    def extended(self, effects: Array, off: Array) -> Residuals:
+        """The residuals with k more unknowns of prior 1 sigma 1: effects (n, k), off (k,)."""
+        k, (p, m) = len(off), self.root.shape
+        root = np.zeros((p + k, m + k))
+        root[:p, :m], root[p:, m:] = self.root, np.eye(k)
+        J = np.hstack([self.J, effects])
+        return Residuals(self.e, J, root, np.concatenate([self.off, off]))
+
+
+def information_root(info: Array) -> Array:
+    """A root (m, m) of an information matrix (m, m), root' root; directions of which rounding makes
+    the information negative have none.
+    """
+    values, axes = np.linalg.eigh(info)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T)
 
 
 @value_class
@@ -107,10 +127,13 @@ class Marginal:
 
 
 def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
-    """Marginal likelihood of residuals with noise V (n, n) and impulses with ``effects`` (n, k)."""
+    """Marginal likelihood of residuals with noise V (n, n) and impulses with ``effects`` (n, k).
+
+    V is the covariance of the errors of the poses alone, which is well conditioned.
+    """
     root = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
-    prior, k = np.linalg.cholesky(data.info).T, effects.shape[1]
-    white = _divided(root, np.hstack([effects, data.J, data.e[:, None]]))
+    prior, k = data.root, effects.shape[1]
+    white = divided(root, np.hstack([effects, data.J, data.e[:, None]]))
     columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])
     Q, R = np.linalg.qr(np.vstack([white[:, k:-1], prior]))
     e = np.concatenate([white[:, -1], prior @ data.off])
@@ -127,15 +150,15 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     )
 
 
-def _divided(L: Array, B: Array) -> Array:
+def divided(L: Array, B: Array) -> Array:
     """L^-1 B for a lower triangular L (n, n) and B (n, m), by halves: numpy has the general
     solution only.
     """
     if len(L) <= _FEW_ROWS:
         return np.asarray(_motion.lower_inverse(np.ascontiguousarray(L)) @ B)
     half = len(L) // 2
-    first = _divided(L[:half, :half], B[:half])
-    return np.concatenate([first, _divided(L[half:, half:], B[half:] - L[half:, :half] @ first)])
+    first = divided(L[:half, :half], B[:half])
+    return np.concatenate([first, divided(L[half:, half:], B[half:] - L[half:, :half] @ first)])
 
 
 def probability_beside(evidence: float) -> float:

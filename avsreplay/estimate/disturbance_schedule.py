@@ -327,7 +327,9 @@ def _positions(track: Track, chart: Chart) -> PositionRows | None:
     """
     if not track.older or track.fixes[0].orbit is not None:
         return None
-    every = (*track.older, *track.fixes)
+    # poses that a new start used again are in both
+    by_instant = {f.t_ns: f for f in (*track.older, *track.fixes)}
+    every = tuple(by_instant[t_ns] for t_ns in sorted(by_instant))
     weights, epoch_ns = np.array([f.weight for f in every]), every[0].t_ns
     return position_rows(
         poses_of(every), weights, chart.arm_c, _POSITIONS, epoch_ns, track.manoeuvres

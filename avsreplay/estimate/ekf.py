@@ -7,6 +7,8 @@ program's own estimator gains over this one is what these are worth.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avsreplay.estimate.dynamics import grasp_forecast, propagate
@@ -22,10 +24,30 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.plugin import Context
 from avsreplay.geometry import IDENTITY_QUAT, Array, Pose
 from avsreplay.records import Belief, Forecast, State
+from avsreplay.settings import Settings, setting
 
 SIGMA_MARGIN = 0.01  # |sigma| stays below 1 minus this margin (eq:sigma_bounds)
-TORQUE_RADPS15 = 1e-5  # root density of the angular acceleration: keeps P from vanishing
-FORCE_OF_EXTENT_PS15 = 1e-5  # root density of the acceleration, in units of the target's extent
+
+
+@dataclass(frozen=True, slots=True)
+class EkfParams(Settings):
+    """Parameters of the plain filter."""
+
+    torque_radps15: float = setting(
+        1e-5,
+        "Root density of the angular acceleration; above 0 it keeps the covariance from vanishing.",
+        unit="rad/s^1.5",
+        low=0.0,
+        high=1e6,
+    )
+    force_mps15: float | None = setting(
+        None,
+        "Root density of the acceleration.",
+        unit="m/s^1.5",
+        low=0.0,
+        high=1e6,
+        of_extent=1e-5,
+    )
 
 
 class Ekf:
@@ -35,11 +57,15 @@ class Ekf:
         context: extent, start and standard deviations of the run.
     """
 
+    name = "ekf"
+    parameters = EkfParams
     about = "extended Kalman filter with the covariance of the registration, without adaptation"
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._force = FORCE_OF_EXTENT_PS15 * context.extent_m
+        given = context.own if isinstance(context.own, EkfParams) else EkfParams()
+        own = given.resolved(context.extent_m)
+        self._drives = own.torque_radps15, float(own.force_mps15 or 0.0)
 
     def start(self, t_ns: int, T_ac: Pose) -> Belief:
         """The given belief, else a body at rest at the pose with the standard deviations of the
@@ -53,7 +79,7 @@ class Ekf:
 
     def predict(self, state: Belief, t_ns: int) -> Belief:
         """The belief at another instant (eq:state-prop, eq:cov-prop)."""
-        return propagate(state, t_ns, TORQUE_RADPS15, self._force)[0]
+        return propagate(state, t_ns, *self._drives)[0]
 
     def update(self, state: Belief, T_ac: Pose, C: Array) -> Belief:
         """The posterior of one pose; sigma stays within its bounds."""
@@ -71,7 +97,7 @@ class Ekf:
 
     def forecast(self, state: Belief, times_s: Array) -> Forecast:
         """The predicted 1 sigma of the grasp point."""
-        return grasp_forecast(state, times_s, TORQUE_RADPS15, self._force)
+        return grasp_forecast(state, times_s, *self._drives)
 
     def belief(self, state: Belief) -> Belief:
         """The state itself."""

@@ -30,10 +30,13 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.disturbance_density import (
+    DENSITIES,
     Marginal,
     Present,
     Residuals,
     density_in_use,
+    divided,
+    information_root,
     marginal,
     probability_beside,
 )
@@ -158,7 +161,7 @@ def estimate_levels(
             found[k] = _of_positions(likely, positions), positions.present
         else:
             found[k] = (
-                marginal(_covariance(likely, parts, k), parts.effects[k - 4], data),
+                _of_impulses(k - 4, likely, parts, data),
                 parts.present[k - 4],
             )
         yield n**3 // 40
@@ -185,7 +188,15 @@ def estimate_levels(
 def _of_positions(theta: Array, rows: PositionRows) -> Marginal:
     """The likelihood of a random force from positions alone."""
     V = np.kron(np.eye(3), theta[1] * rows.white + theta[3] * rows.common)
-    return marginal(V, rows.force, Residuals(rows.e, rows.J, rows.info, np.zeros(len(rows.info))))
+    root = information_root(rows.info)
+    return marginal(V, rows.force, Residuals(rows.e, rows.J, root, np.zeros(len(root))))
+
+
+def _of_impulses(k: int, theta: Array, parts: _Components, data: Residuals) -> Marginal:
+    """The likelihood of a random torque (k = 0) or force (1), given the density of the other."""
+    other = parts.impulses(1 - k, theta)
+    known = data.extended(other, np.zeros(other.shape[1])) if theta[5 - k] > 0.0 else data
+    return marginal(parts.errors(theta), parts.effects[k], known)
 
 
 def _slack(e: Array, theta: Array, parts: _Components) -> float:
@@ -222,15 +233,15 @@ def disturbed_likelihood(
     data, parts = _linearised(points, problem)
     theta, likelihood = _variances(levels), -math.inf
     if others:
-        theta[[4 + k for k in kinds]] = 0.0
-        V, nothing = _covariance(theta, parts), np.zeros((data.e.size, 0))
+        V, nothing = parts.errors(theta), np.zeros((data.e.size, 0))
+        for k in (0, 1):
+            if k not in kinds and theta[4 + k] > 0.0:
+                data = data.extended(beside := parts.impulses(k, theta), np.zeros(beside.shape[1]))
         return _log_mean(
             np.array([marginal(V, nothing, _extended(data, *each)).none for each in others])
         )
     for k in (*kinds, *kinds[:-1]):  # each given the other
-        density, likelihood = marginal(
-            _covariance(theta, parts, 4 + k), parts.effects[k], data
-        ).likeliest
+        density, likelihood = _of_impulses(k, theta, parts, data).likeliest
         theta[4 + k] = density**2
     return likelihood
 
@@ -248,9 +259,9 @@ class _Components:
     """The six components at unit factors.
 
     Attributes:
-        C: their covariances; of the errors of attitude and position (3n, 3n), of the disturbances
-            (6n, 6n).
-        effects: (6n, 3(n - 1)) of torque and of force, the roots of their covariances.
+        C: covariances (3n, 3n) of the errors of attitude and position, first the independent ones,
+            then the common ones.
+        effects: (6n, 3(n - 1)) of impulses of torque and of force, of unit density.
         present: the rate in {B} and the velocity at the last point, by initial values and by these
             impulses.
     """
@@ -258,6 +269,17 @@ class _Components:
     C: tuple[Array, ...]
     effects: tuple[Array, Array]
     present: tuple[Present, Present]
+
+    def errors(self, theta: Array) -> Array:
+        """Covariance (6n, 6n) of the errors of the poses."""
+        half = len(self.C[0])
+        V = np.zeros((2 * half, 2 * half))
+        V[:half, :half], V[half:, half:] = _pose_errors(theta, self)
+        return V
+
+    def impulses(self, k: int, theta: Array) -> Array:
+        """Effects of impulses of torque (k = 0) or force (1) with the density of theta."""
+        return self.effects[k] * math.sqrt(theta[4 + k])
 
 
 def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components]:
@@ -271,34 +293,23 @@ def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components
         np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in (*effects, H @ T)
     )
     f, off = problem.factors**-2.0, problem.chart.minus(problem.prior.mean)
-    C = white * f[0], white * f[1], common * f[0], common * f[1], torque @ torque.T, force @ force.T
-    data = Residuals(np.ascontiguousarray(e.T).reshape(-1), J, problem.prior.info, off)
+    C, root = (
+        (white * f[0], white * f[1], common * f[0], common * f[1]),
+        information_root(problem.prior.info),
+    )
+    data = Residuals(np.ascontiguousarray(e.T).reshape(-1), J, root, off)
     return data, _Components(C, (torque, force), present)
 
 
 def _extended(data: Residuals, effects: Array, size: Array) -> Residuals:
     """The residuals with other unknowns, as in ``disturbed_likelihood``."""
     m = len(size)
-    J = np.hstack([data.J, np.ascontiguousarray(effects.transpose(1, 0, 2)).reshape(-1, m)])
-    info = np.block(
-        [[data.info, np.zeros((len(data.info), m))], [np.zeros((m, len(data.info))), np.eye(m)]]
-    )
-    return Residuals(data.e, J, info, np.concatenate([data.off, size]))
+    return data.extended(np.ascontiguousarray(effects.transpose(1, 0, 2)).reshape(-1, m), size)
 
 
 def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
     """Covariances (3n, 3n) of the errors of the poses, attitude and position."""
     return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(BLOCKS)]
-
-
-def _covariance(theta: Array, parts: _Components, without: int | None = None) -> Array:
-    """V (6n, 6n) of the residuals, ``without`` one of the disturbances."""
-    V, half = np.zeros_like(parts.C[4]), len(parts.C[0])
-    V[:half, :half], V[half:, half:] = _pose_errors(theta, parts)
-    for k in (4, 5):
-        if theta[k] > 0.0 and k != without:
-            V += theta[k] * parts.C[k]
-    return V
 
 
 def _disturbances(
@@ -329,21 +340,35 @@ def _disturbances(
 def _improved(
     theta: Array, open_: NDArray[np.bool_], parts: _Components, data: Residuals, points: Poses
 ) -> Array:
-    """Variance components (6,) after one step of average information from theta (6,)."""
-    inverse = np.linalg.inv(_covariance(theta, parts))
-    VJ = inverse @ data.J
-    G = np.linalg.inv(data.J.T @ VJ + data.info)
-    moved = -G @ (VJ.T @ data.e + data.info @ data.off)
-    left = data.e + data.J @ moved
-    P, Py = inverse - VJ @ G @ VJ.T, inverse @ left
-    applied, traces, half = np.zeros((6, len(Py))), np.zeros(6), len(parts.C[0])
+    """Variance components (6,) after one step of average information from theta (6,).
+
+    P is the inverse of the covariance of the residuals with all unknowns marginal. It follows from
+    an orthogonal basis of the unknowns' effects and never from the covariance itself, which is
+    singular to rounding where a disturbance acts for long.
+    """
+    everything = data
+    for k in (0, 1):
+        if theta[4 + k] > 0.0:
+            impulses_k = parts.impulses(k, theta)
+            everything = everything.extended(impulses_k, np.zeros(impulses_k.shape[1]))
+    root = np.asarray(np.linalg.cholesky(parts.errors(theta)))
+    white = divided(root, np.hstack([everything.J, data.e[:, None]]))
+    Q, _ = np.linalg.qr(np.vstack([white[:, :-1], everything.root]))
+    known = np.concatenate([white[:, -1], everything.root @ everything.off])
+    n, back = len(root), np.ascontiguousarray(divided(root, np.eye(len(root))).T)
+    left = (known - Q @ (Q.T @ known))[:n]
+    reduced = back @ Q[:n]
+    P, Py = back @ back.T - reduced @ reduced.T, back @ left
+    applied, traces, half = np.zeros((6, n)), np.zeros(6), len(parts.C[0])
     for k in np.flatnonzero(open_).tolist():
-        here, C = (
-            slice(None) if k >= 4 else slice(half * (k % 2), half * (k % 2) + half),
-            parts.C[k],
-        )
-        applied[k, here] = C @ Py[here]
-        traces[k] = float(np.sum(C * P[here, here]))
+        if k < 4:
+            here = slice(half * (k % 2), half * (k % 2) + half)
+            applied[k, here] = parts.C[k] @ Py[here]
+            traces[k] = float(np.sum(parts.C[k] * P[here, here]))
+        else:
+            effects = parts.effects[k - 4]
+            applied[k] = effects @ (effects.T @ Py)
+            traces[k] = float(np.sum(effects * (P @ effects)))
     score = 0.5 * (applied @ Py - traces)
     info = 0.5 * (applied @ P @ applied.T)
     for k, (dof, size) in enumerate(_priors(points)):
@@ -387,6 +412,7 @@ def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) 
     factor = np.where(disturbance, _STEP**2, _STEP)[free]
     old, new = theta[free], theta[free] + inverse @ (score[free] / scale) / scale
     started = np.where(old > 0.0, np.clip(new, old / factor, old * factor), np.maximum(new, 0.0))
+    started = np.where(disturbance[free], np.minimum(started, DENSITIES[-1] ** 2), started)
     small = disturbance[free] & (new <= 0.0) & (old * scale < _SMALL)
     out[free] = np.where(small, 0.0, started)
     out[:4] = np.clip(out[:4], 1.0 / _MOST_FACTOR, _MOST_FACTOR)

@@ -9,11 +9,11 @@ from enum import Enum
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.settings import Settings, are_orthonormal, given, setting
+from avsreplay.parts import ESTIMATORS, OWN
+from avsreplay.settings import Settings, Tables, are_orthonormal, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-OWN, PRINTED = "own", "paper"  # the estimators that are no plug-ins
 _PER_POSE = (
     0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
 )
@@ -247,6 +247,14 @@ class EstimatorParams(Settings):
         unit="deg",
         above=0.0,
     )
+    own: Tables = setting(
+        Tables, "The parameters of estimators, one table [estimator.NAME] each.", parts=ESTIMATORS
+    )
+
+    def with_own(self) -> EstimatorParams:
+        """Return the same with the parameters of the estimator that is used, given or default."""
+        kind = ESTIMATORS.parameters(self.method)
+        return self if kind is None else replace(self, own=self.own.with_part(self.method, kind))
 
     def check(self) -> None:
         """Raise ValueError where the axes of the orbit are not orthonormal, or it has an

@@ -25,11 +25,13 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
 )
 from avsreplay.estimate.noise import Noise
-from avsreplay.estimate.params import OWN, PRINTED, Adaptation, EstimatorParams, Start
+from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
 from avsreplay.estimate.plugin import Context, Method, load_method
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array, Pose
+from avsreplay.parts import ESTIMATORS, OWN, PRINTED
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
+from avsreplay.settings import NoParameters
 
 
 class PluggedEstimator:
@@ -54,7 +56,9 @@ class PluggedEstimator:
         self.name, self.params, self.start = name, params.resolved(extent_m), start
         self.frame = EstimatorFrame(ZERO, ZERO, 0)
         self._noise = Noise(replace(self.params, adapt=Adaptation.OFF), extent_m)
-        self._method = method(Context(extent_m, start, self.params.start_1s))
+        kind = ESTIMATORS.parameters(name) or NoParameters
+        own = self.params.own.of(name, kind).resolved(extent_m)
+        self._method = method(Context(extent_m, start, self.params.start_1s, own))
 
     def initial(self, t_ns: int, T_ac: Pose, acquired: bool = False) -> Track:  # noqa: ARG002
         """The state before the first scan, at a pose that was given or found."""

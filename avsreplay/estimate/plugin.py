@@ -1,22 +1,21 @@
 """Estimators as plug-ins: the protocol, and how a name becomes an estimator.
 
-An estimator of another package is a class with five functions, registered in the entry-point
-group ``avsreplay.estimators``. The program tests each pose (gamma), computes the observability and
-plans in the same way for every estimator, so that estimators can be compared.
+An estimator is a part (``parts.ESTIMATORS``): a class with five functions, and with its own
+parameters in ``[estimator.NAME]``. The program tests each pose (gamma), computes the observability
+and plans in the same way for every estimator, so that estimators can be compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import metadata
 from typing import Any, Protocol, TypeVar
 
-from avsreplay.errors import MissingBackend, UsageError, value_class
-from avsreplay.estimate.params import OWN, PRINTED
+from avsreplay.errors import MissingBackend, value_class
 from avsreplay.geometry import Array, Pose
+from avsreplay.parts import ESTIMATORS
 from avsreplay.records import Belief, Forecast
+from avsreplay.settings import NoParameters, Settings
 
-GROUP = "avsreplay.estimators"
 State = TypeVar("State")
 
 
@@ -28,11 +27,13 @@ class Context:
         extent_m: diagonal of the target's bounding box [m].
         start: a given belief in {A}, or None: the first pose is all that is known.
         start_1s: (20,) standard deviations of the error states of a start from a pose alone.
+        own: the parameters of the estimator, of its class ``parameters``.
     """
 
     extent_m: float
     start: Belief | None
     start_1s: Array
+    own: Settings = NoParameters()
 
 
 class Method(Protocol[State]):
@@ -71,20 +72,6 @@ class Method(Protocol[State]):
         """Return mean and covariance (20, 20) of the state in {A}."""
 
 
-def names() -> tuple[str, ...]:
-    """The names of the installed estimators, sorted."""
-    return tuple(sorted({OWN, PRINTED, *(e.name for e in metadata.entry_points(group=GROUP))}))
-
-
-def about(name: str) -> str:
-    """Return one line about an estimator, from the attribute ``about`` of its class."""
-    built_in = {
-        OWN: "batch fit and noise-adaptive constrained filter, with tests of hypotheses",
-        PRINTED: "the noise-adaptive constrained filter as printed in the paper",
-    }
-    return built_in.get(name) or str(getattr(load_method(name), "about", ""))
-
-
 def load_method(name: str) -> Callable[[Context], Method[Any]]:
     """Return the class of an estimator.
 
@@ -95,20 +82,12 @@ def load_method(name: str) -> Callable[[Context], Method[Any]]:
         UsageError: no estimator has this name.
         MissingBackend: it cannot be imported.
     """
-    found = [entry for entry in metadata.entry_points(group=GROUP) if entry.name == name]
-    if not found:
-        raise UsageError(
-            f"no estimator is called '{name}'",
-            where="--estimator",
-            hint=f"one of: {', '.join(names())}",
-        )
-    entry = min(found, key=lambda each: each.value)  # the same one in every run
     try:
-        loaded: Callable[[Context], Method[Any]] = entry.load()
+        found: Callable[[Context], Method[Any]] = ESTIMATORS.load(name)
     except ImportError as error:
         raise MissingBackend(
             f"estimator '{name}' cannot be imported: {error}",
             where="--estimator",
             hint="reinstall the package that provides it",
         ) from error
-    return loaded
+    return found

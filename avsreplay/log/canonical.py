@@ -4,7 +4,7 @@ A decoder returns the fields of a cloud as they are declared (``raw_cloud``). Wh
 inferred here from a sample of the clouds of a log, once: byte order, unit of the coordinates, times
 of the points, and the codes of missing returns. Each inference has its evidence, which ``info``,
 ``doctor`` and ``run`` print, and an option that overrides it; what the values do not decide is
-refused. What comes after this layer need not test the values of a scan again.
+an error. What comes after this layer need not test the values of a scan again.
 """
 
 from __future__ import annotations
@@ -157,6 +157,7 @@ class Cloud:
         )
 
 
+@np.errstate(invalid="ignore", over="ignore")  # any bytes may stand where a number is expected
 def infer(sample: Sequence[TimedCloud], period_s: float | None, options: SourceOptions) -> Meaning:
     """Return what the numbers of the clouds of a log mean.
 
@@ -177,6 +178,7 @@ def infer(sample: Sequence[TimedCloud], period_s: float | None, options: SourceO
     return Meaning(swapped, unit_m, time, codes, (*order, *unit, *times, *missing))
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def canonical(raw: RawCloud, meaning: Meaning, reference_ns: int | None = None) -> Cloud:
     """Return a cloud in metres, with its returns only and their times after its stamp.
 
@@ -245,8 +247,10 @@ def coordinates(raw: RawCloud) -> NDArray[Any]:
         size = x.dtype.itemsize
         at = [column.__array_interface__["data"][0] for column in (x, y, z)]
         if at[1] - at[0] == at[2] - at[1] == size:
+            # an explicit byte order, although it is the native one, is not that of plain floats
+            native = x.view(np.float32 if size == 4 else np.float64)
             return np.lib.stride_tricks.as_strided(
-                x, (len(x), 3), (x.strides[0], size), writeable=False
+                native, (len(x), 3), (x.strides[0], size), writeable=False
             )
     kinds = [column.dtype for column in (x, y, z)]
     kind = np.float32 if all(k.kind == "f" and k.itemsize <= 4 for k in kinds) else np.float64
@@ -256,8 +260,7 @@ def coordinates(raw: RawCloud) -> NDArray[Any]:
 def _intensities(raw: RawCloud) -> NDArray[np.float32] | None:
     """The intensity (n,) of each point in the sensor's own unit."""
     name = next((name for name in raw.fields if name in _INTENSITY_NAMES), None)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return None if name is None else raw.column(name).astype(np.float32)
+    return None if name is None else raw.column(name).astype(np.float32)
 
 
 def _stated(options: SourceOptions) -> Meaning:
@@ -297,8 +300,7 @@ def _ordinary(raw: RawCloud) -> float:
         values = raw.column(axis)
         if values.dtype.kind != "f":
             return 1.0
-        with np.errstate(invalid="ignore"):
-            size = np.abs(values[np.isfinite(values)].astype(np.float64))
+        size = np.abs(values[np.isfinite(values)].astype(np.float64))
         size = size[size > 0.0]
         seen, good = seen + len(size), good + int(np.count_nonzero((size > low) & (size < high)))
     return good / seen if seen else 1.0

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_format as mcap
-from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
+from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.header import MODEL_ENDINGS
-from avsreplay.log.index import MAX_NS, ChunkStore, Recording, Sink
+from avsreplay.log.index import MAX_NS, Sink
 from avsreplay.log.mcap_format import Channel, Fields, RecordSink, SummarySection, read_summary
 from avsreplay.log.mcap_salvage import (
     ChannelTable,
@@ -28,14 +28,14 @@ from avsreplay.log.mcap_salvage import (
     next_record,
 )
 from avsreplay.log.options import Loss
+from avsreplay.log.record_pass import RecordPass
 
 _TIMES = struct.Struct("<QQ")
 _BLOCK = 1 << 20
 _LEAST_CHUNK, _LEAST_MESSAGE = 49, 22
-_MAX_LOSSES = 10_000
 
 
-class McapFile(Recording):
+class McapFile(RecordPass):
     """One MCAP file, indexed on construction.
 
     Attributes:
@@ -68,18 +68,14 @@ class McapFile(Recording):
             UnreadableInput: the file does not exist, is empty or is not MCAP.
         """
         self._copy_to = copy_to
-        super().__init__(path, limit, sinks)
+        super().__init__(path, limit, sinks, upto)
         self.closed_properly = False
         self.summary, self.data_end, self.unchecked = SummarySection(), (0, 0), 0
         self._channels = ChannelTable(self._table)
         self._model: tuple[str, int, int] | None = None
-        self._bad_chunk: Loss | None = None
         self._resume: int | None = None
         self._trusted = 8  # everything before this offset is confirmed by a checksum
-        self._orphans = self._seen = 0
-        self._file, self._open_end = ByteFile(path, upto), upto is not None
-        self._size = self._file.size
-        self._chunks = ChunkStore(self._file, limit)
+        self._seen, self._open_end, self._size = 0, upto is not None, self._file.size
         try:
             self._survey()
         except BaseException:
@@ -122,17 +118,10 @@ class McapFile(Recording):
             raise UnreadableInput("not an MCAP file", where=shown(self.path), hint=hint)
         summary = self.summary = read_summary(self._file, self._limit)
         self._adopt(summary)
-        at = 8
-        while at < self._size and not self.closed_properly and len(self.losses) < _MAX_LOSSES:
-            at = self._step(at, summary)
-        self._settle()
-        if len(self.losses) >= _MAX_LOSSES:
-            self._lose(
-                Loss("damaged at too many places: the rest is not read", at, self._size - at)
-            )
-        elif self.closed_properly:
+        whole = self._pass(8, self._size, lambda at: self._step(at, summary))
+        if self.closed_properly:
             self._after_end(self.data_end[0] + 13)
-        elif not self._open_end:
+        elif whole and not self._open_end:
             self._lose(
                 Loss(
                     "the file was not closed: messages that its recorder had not yet written are"
@@ -173,19 +162,13 @@ class McapFile(Recording):
             if end > self._size or (summary.start and end > summary.start):
                 raise BadMessage("a record ends past the file")
             if length > self._limit and opcode != mcap.CHUNK and begins_record(self._file, end):
-                self._lose(
-                    Loss(
-                        f"a record of {length} bytes is over the limit of {self._limit}",
-                        at,
-                        end - at,
-                    )
-                )
+                self._lose(Loss(self._too_large(length), at, end - at))
                 return end
             self._take(opcode, at, end)
         except BadMessage as error:
             return self._resync(at, summary, str(error))
         resume, self._resume = self._resume or end, None
-        return resume
+        return self._size if self.closed_properly else resume
 
     def _take(self, opcode: int, at: int, end: int) -> None:
         handler = _HANDLERS.get(opcode)
@@ -200,7 +183,7 @@ class McapFile(Recording):
 
     def _content(self, at: int, end: int) -> Fields:
         if end - at > self._limit:
-            raise BadMessage(f"a record of {end - at} bytes is over the limit of {self._limit}")
+            raise BadMessage(self._too_large(end - at))
         return Fields(memoryview(self._file.read(at + 9, end - at - 9)))
 
     def _take_header(self, at: int, end: int) -> None:
@@ -236,10 +219,7 @@ class McapFile(Recording):
         size = fields.number(4)
         if size % 16 or size != end - at - 15:
             raise BadMessage("a message index whose lengths contradict each other")
-        if self._bad_chunk is None:
-            return
-        count = size // 16
-        self._bad_chunk = replace(self._bad_chunk, messages=(self._bad_chunk.messages or 0) + count)
+        self._count_lost(size // 16)
 
     def _take_attachment(self, at: int, end: int) -> None:
         fields = self._content(at, end)
@@ -345,17 +325,6 @@ class McapFile(Recording):
             )
         return channel
 
-    def _lose(self, loss: Loss) -> None:
-        self.losses.append(replace(loss, file=self.path.name))
-
-    def _settle(self) -> None:
-        """List the last damaged chunk, after the message indexes behind it have given its message
-        count.
-        """
-        if self._bad_chunk is not None:
-            self._lose(self._bad_chunk)
-            self._bad_chunk = None
-
     def _resync(self, at: int, summary: SummarySection, why: str) -> int:
         """Return the next offset after ``at`` where a readable record begins."""
         inner = self._swallowed(self._trusted - 1, at)
@@ -378,10 +347,7 @@ class McapFile(Recording):
 
     def _account(self, summary: SummarySection) -> None:
         """List the messages that the summary counts and the pass did not find."""
-        if self._orphans:
-            self._lose(
-                Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans)
-            )
+        self._lose_orphans()
         known = self._seen + sum(loss.messages or 0 for loss in self.losses if loss.chunks)
         blind = [loss for loss in self.losses if loss.bytes and loss.messages is None]
         missing = 0 if summary.messages is None else summary.messages - known

@@ -8,7 +8,6 @@ only in a log written by this package, by a message length that no other type ha
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
 
 from avsreplay.log import mcap_format as mcap
 from avsreplay.log.bytes_io import BadMessage, ByteFile
@@ -17,6 +16,7 @@ from avsreplay.log.index import MessageTable, canonical_type
 from avsreplay.log.mcap_format import Channel, Fields
 from avsreplay.log.point_cloud2 import read_layout
 from avsreplay.log.pose_messages import read_pose
+from avsreplay.log.record_pass import search
 from avsreplay.log.writer import BODY_TOPIC, LIBRARY, TRUTH_TOPIC
 
 
@@ -97,12 +97,6 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
     return cursor.pos == len(cursor.data)
 
 
-_FIRST_WINDOW, _WINDOW = (
-    1 << 12,
-    1 << 20,
-)  # the next record is usually near; the search grows to the largest window
-_MARGIN = 64  # a candidate is recognised by at most so many bytes
-_MAX_CANDIDATES = 1_000_000
 _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
 
 
@@ -136,7 +130,7 @@ def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
 
 def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
     """Return the first offset in [at, last) where a chunk may begin, wherever it ends."""
-    return _search(
+    return search(
         file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size)
     )
 
@@ -148,12 +142,10 @@ def next_record(
     of a known channel.
     """
     if chunked:
-        return _search(
+        return search(
             file, at, stop, mcap.chunk_candidates, lambda place: is_chunk(file, place, stop)
         )
-    return _search(
-        file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels)
-    )
+    return search(file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels))
 
 
 def _messages(window: bytes) -> list[int]:
@@ -167,23 +159,3 @@ def _is_message(file: ByteFile, at: int, stop: int, channels: frozenset[int]) ->
     if end > stop or end < at + 31 or int.from_bytes(head[9:11], "little") not in channels:
         return False
     return end == stop or begins_record(file, end)
-
-
-def _search(
-    file: ByteFile,
-    at: int,
-    stop: int,
-    candidates: Callable[[bytes], Iterable[int]],
-    accept: Callable[[int], bool],
-) -> int | None:
-    tried, width = 0, _FIRST_WINDOW
-    while at < stop:
-        window = file.read_at_most(at, min(width, stop - at) + _MARGIN)
-        for place in candidates(window):
-            tried += 1
-            if tried > _MAX_CANDIDATES:  # a file made to look like records everywhere
-                return None
-            if at + place < stop and accept(at + place):
-                return at + place
-        at, width = at + width, min(2 * width, _WINDOW)
-    return None

@@ -29,6 +29,7 @@ from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
 from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
+from avsreplay.log.result_log import RUN_RECORD
 from avsreplay.log.scan_files import DEPTH_FORMAT, by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
 from avsreplay.log.topics import chosen_topic, optional_topic
@@ -95,9 +96,7 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
     if (path / "run.json").is_file():
-        raise UnreadableInput(
-            "is the result of a run, not a log", where=shown(path), hint="name the log"
-        )
+        raise _no_log(path)
     if options.poses and path.is_file() and not _is_log(path):
         return _open_pose_file(path, options)
     if path.is_dir() and not _is_bag_folder(path):
@@ -107,6 +106,11 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
             "neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans"
         )
     return _messages(path, options, inspect, upto)
+
+
+def _no_log(path: Path) -> UnreadableInput:
+    hint = "name the log that was replayed; 'avsreplay report' and 'plan' read results"
+    return UnreadableInput("is the result of a run, not a log", where=shown(path), hint=hint)
 
 
 def _messages(
@@ -132,6 +136,8 @@ def _messages(
             if inspect
             else chosen_topic(recording, options, path)
         )
+        if RUN_RECORD in recording.metadata and not inspect:
+            raise _no_log(path)
         header, lost = _header(recording, options)
         if header.fixed_frame and options.fixed_frame is None and options.sensor_topic is None:
             # read once more, because the first reading did not collect the transforms
@@ -253,6 +259,7 @@ def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
 
 
 _STORAGE, BAG_METADATA = (".mcap", ".db3"), "metadata.yaml"
+_NUMBERED = re.compile(r"_\d+(?=\.)")  # of the parts of a bag: drive_0.mcap, drive_1.mcap
 _LISTED = re.compile(
     r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
 )
@@ -329,12 +336,22 @@ def _folder(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
 def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     """Return the files of a bag in order, and a loss for each file in its metadata that is
     missing.
+
+    Raises UnreadableInput for files that no metadata join and whose names differ in more than a
+    number.
     """
     there = sorted(
         (p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name)
     )
     metadata = path / BAG_METADATA
     if not metadata.is_file():
+        if len({_NUMBERED.sub("", file.name) for file in there}) > 1:
+            first = ", ".join(shown(file.name) for file in there[:3])
+            raise UnreadableInput(
+                f"{len(there)} logs that are not parts of one bag: {first}",
+                where=shown(path),
+                hint="name one of them",
+            )
         return there, []
     text = metadata.read_bytes()[: 4 << 20].decode("utf-8", "backslashreplace")
     listed = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))

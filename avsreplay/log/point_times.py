@@ -236,8 +236,7 @@ def relative_s(raw: RawCloud, time: PointTime, stamp_ns: int) -> NDArray[np.floa
 
 
 def _bounded(times: Array, limit_s: float) -> Array:
-    with np.errstate(invalid="ignore"):
-        return np.where(np.abs(times) <= limit_s, times, np.nan)
+    return np.where(np.abs(times) <= limit_s, times, np.nan)
 
 
 def _within(value_ns: int, cycle_ns: int) -> int:
@@ -498,6 +497,12 @@ class _Candidate:
             else "its values are next to the stamp"
         )
         evidence = f"{how} and differ by {span_s:.4g} s within a scan"
+        if not same:
+            evidence += (
+                "; one delay of all instants stays unknown: up to"
+                f" {span_s:.3g} s if the stamp is that of another point, and more by the delay of"
+                " the stamp if it is a time of reception"
+            )
         return Reading(self.name, time, evidence, step_s=self._step * unit.seconds)
 
     def _relative(self) -> Reading:

@@ -196,12 +196,11 @@ def _usable(points: NDArray[Any]) -> NDArray[Any]:
 
 
 def _finite(points: NDArray[Any], largest: float) -> NDArray[np.bool_] | None:
-    with np.errstate(invalid="ignore", over="ignore"):
-        if np.einsum("ij,ij->", points, points) < largest**2:  # fast: no point can be outside
-            return None
-        kept: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
-        kept &= (np.abs(points) <= largest).all(axis=1)
-        return kept
+    if np.einsum("ij,ij->", points, points) < largest**2:  # fast: no point can be outside
+        return None
+    kept: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
+    kept &= (np.abs(points) <= largest).all(axis=1)
+    return kept
 
 
 def _away_from_origin(points: NDArray[Any]) -> NDArray[np.bool_] | None:
@@ -221,8 +220,7 @@ def _equals(values: NDArray[Any], code: float) -> NDArray[np.bool_]:
 
 
 def _not_at(points: NDArray[Any], code: float) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore", over="ignore"):
-        distance = np.linalg.norm(points.astype(np.float64), axis=1)
+    distance = np.linalg.norm(points.astype(np.float64), axis=1)
     return ~_equals(distance, code)
 
 

@@ -10,20 +10,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from avsreplay.errors import value_class
-from avsreplay.log.bytes_io import ROS1_MAGIC, BadMessage, ByteFile
-from avsreplay.log.index import ChunkStore, Recording, Sink, canonical_type
+from avsreplay.log.bytes_io import ROS1_MAGIC, BadMessage
+from avsreplay.log.index import Sink, canonical_type
 from avsreplay.log.mcap_format import ChunkHead, Fields
 from avsreplay.log.options import Loss
+from avsreplay.log.record_pass import RecordPass, search
 
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
-_FIRST_WINDOW, _WINDOW, _MARGIN = 1 << 12, 1 << 20, 128
+# the length of a record's header, and the first of its fields, of which a chunk has three
+_HEAD = re.compile(rb"(?=[\x08-\x80]\x00{3}[\x04-\x40]\x00{3}(?:op=\x05|compression=|size=))")
 _MAX_HEAD, _MOST_FOREIGN = 1 << 16, 10_000
-_MAX_CANDIDATES, _MAX_LOSSES = 20_000, 10_000
 _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 
@@ -47,7 +46,7 @@ class _Record:
         return int.from_bytes(self.fields[name], "little")
 
 
-class Ros1Bag(Recording):
+class Ros1Bag(RecordPass):
     """One ROS 1 bag, indexed on construction."""
 
     kind = "ros1 bag"
@@ -66,10 +65,6 @@ class Ros1Bag(Recording):
         """
         super().__init__(path, limit, sinks)
         self._topics: dict[int, str] = {}
-        self._bad_chunk: Loss | None = None
-        self._orphans = self._tried = 0
-        self._file = ByteFile(path)
-        self._chunks = ChunkStore(self._file, limit)
         try:
             self._survey()
         except BaseException:
@@ -79,12 +74,8 @@ class Ros1Bag(Recording):
     def _survey(self) -> None:
         stop = self._index_at()
         self._adopt(stop)
-        at, end = len(ROS1_MAGIC), stop or self._file.size
-        while at < end and len(self.losses) < _MAX_LOSSES:
-            at = self._step(at, end)
-        self._settle()
-        if len(self.losses) >= _MAX_LOSSES:
-            self._lose(Loss("damaged at too many places: the rest is not read", at, end - at))
+        end = stop or self._file.size
+        self._pass(len(ROS1_MAGIC), end, lambda at: self._step(at, end))
         if stop is None:
             self._lose(
                 Loss(
@@ -94,15 +85,7 @@ class Ros1Bag(Recording):
                     0,
                 )
             )
-        if self._orphans:
-            self._lose(
-                Loss(
-                    "messages of a connection whose definition is lost",
-                    0,
-                    0,
-                    messages=self._orphans,
-                )
-            )
+        self._lose_orphans()
 
     def _index_at(self) -> int | None:
         """Return the offset of the index, None if the bag was not closed or its header is
@@ -146,10 +129,9 @@ class Ros1Bag(Recording):
             self._message(record, data, -1, record.data_at)
         elif record.op == _CONNECTION:
             self._connection(record, self._data(record))
-        elif record.op == _INDEX and self._bad_chunk is not None:
-            messages = (self._bad_chunk.messages or 0) + record.number("count")
-            self._bad_chunk = replace(self._bad_chunk, messages=messages)
-        elif record.op not in (_BAG, _INDEX, _CHUNK_INFO):
+        elif record.op == _INDEX:
+            self._count_lost(record.number("count") if self._bad_chunk else 0)
+        elif record.op not in (_BAG, _CHUNK_INFO):
             raise BadMessage(f"a record of unknown kind {record.op}")
 
     def _take_chunk(self, at: int, record: _Record) -> None:
@@ -197,9 +179,7 @@ class Ros1Bag(Recording):
 
     def _data(self, record: _Record) -> memoryview:
         if record.data_size > self._limit:
-            raise BadMessage(
-                f"a record of {record.data_size} bytes is over the limit of {self._limit}"
-            )
+            raise BadMessage(self._too_large(record.data_size))
         return memoryview(self._file.read(record.data_at, record.data_size))
 
     def _record(self, at: int) -> _Record:
@@ -210,41 +190,23 @@ class Ros1Bag(Recording):
         return _parsed(memoryview(raw)[:size], at + 8 + size, int.from_bytes(raw[size:], "little"))
 
     def _resync(self, at: int, end: int, why: str) -> int:
-        found = self._next_chunk(at + 1, end)
+        found = search(
+            self._file,
+            at + 1,
+            end,
+            lambda window: (match.start() for match in _HEAD.finditer(window)),
+            lambda place: self._is_chunk(place, end),
+        )
         resume = end if found is None else found
         self._lose(Loss(why, at, resume - at))
         return resume
 
-    def _next_chunk(self, at: int, end: int) -> int | None:
-        start, width = at, _FIRST_WINDOW
-        while at < end:
-            window = self._file.read_at_most(at, width + _MARGIN)
-            for match in _CHUNK_OP.finditer(window):
-                self._tried += 1
-                if self._tried > _MAX_CANDIDATES:  # a file made to look like chunks everywhere
-                    return None
-                for place in range(max(at + match.start() - _MARGIN, start), at + match.start()):
-                    if self._is_chunk(place, end):
-                        return place
-            at, width = at + width, min(2 * width, _WINDOW)
-        return None
-
     def _is_chunk(self, at: int, end: int) -> bool:
-        if not 8 <= int.from_bytes(self._file.read_at_most(at, 4), "little") <= _MARGIN:
-            return False
         try:
             record = self._record(at)
         except BadMessage:
             return False
         return record.op == _CHUNK and record.end <= end
-
-    def _settle(self) -> None:
-        if self._bad_chunk is not None:
-            self._lose(self._bad_chunk)
-            self._bad_chunk = None
-
-    def _lose(self, loss: Loss) -> None:
-        self.losses.append(replace(loss, file=self.path.name))
 
 
 def _records(view: memoryview) -> Iterator[_Record]:

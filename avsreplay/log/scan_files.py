@@ -24,6 +24,7 @@ from avsreplay.log.ply import read_ply
 from avsreplay.read_budget import BadFile, ReadBudget
 
 
+@np.errstate(invalid="ignore", over="ignore")  # any bytes may stand where a number is expected
 def read_points(path: Path, limit: int) -> NDArray[Any]:
     """Return the (n, 3) points of a file [m], float32 or float64, NaN where the sensor had no
     return.

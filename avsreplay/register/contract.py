@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
+from avsreplay.parts import LawResult
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.backend import (
     NO_LIMIT,
@@ -54,15 +55,6 @@ BOXES = (
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 FACES = np.array([(a, b, c) for p, q, r, s in QUADS for a, b, c in ((p, q, r), (p, r, s))])
-
-
-@dataclass(frozen=True, slots=True)
-class LawResult:
-    """Result of one law: its name, whether it holds and the figures in one line."""
-
-    law: str
-    held: bool
-    detail: str
 
 
 class Bench:
@@ -245,9 +237,8 @@ def repeats(bench: Bench) -> LawResult:
     bits = {
         (run.T_ac.q.tobytes(), run.T_ac.t.tobytes(), run.iterations, run.inliers) for run in runs
     }
-    return LawResult(
-        "runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3"
-    )
+    said = f"{len(bits)} different results of 3" if len(bits) > 1 else "3 equal results"
+    return LawResult("runs repeat to the bit", len(bits) == 1, said)
 
 
 def roughly(bench: Bench) -> LawResult:

@@ -178,7 +178,7 @@ class RegisterParams(Settings):
     def with_own(self) -> RegisterParams:
         """Return the same with the parameters of the back end that is used, given or default."""
         kind = BACKENDS.parameters(self.backend) or NoParameters
-        return replace(self, own=self.own.including(self.backend, self.own.of(self.backend, kind)))
+        return replace(self, own=self.own.with_part(self.backend, kind))
 
     def limits(self, extent_m: float) -> RegistrationLimits:
         """Return the parameters of a back end for a model of a given size.

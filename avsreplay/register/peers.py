@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, ClassVar
 
 import numpy as np
@@ -65,6 +66,24 @@ class SampledParams(Settings):
         " them suppress noise and smooth edges; a scan with fewer points is not aligned.",
         low=3,
         high=1000,
+    )
+
+
+class GicpCost(Enum):
+    """What small_gicp minimises."""
+
+    GICP = "gicp"  # distances between distributions at both points
+    PLANE = "plane"  # distances to the tangent planes of the model
+
+
+@dataclass(frozen=True, slots=True)
+class SmallGicpParams(SampledParams):
+    """Parameters of the back end ``small_gicp``."""
+
+    cost: GicpCost = setting(
+        GicpCost.GICP,
+        "What is minimised: distances between distributions (gicp), or distances to the tangent"
+        " planes of the model (plane).",
     )
 
 
@@ -171,8 +190,12 @@ def best_motion(moving: Array, fixed: Array) -> Pose:
     return Pose(turn.q, d_bar - turn.R @ c_bar)
 
 
+_METHODS = {GicpCost.GICP: "GICP", GicpCost.PLANE: "PLANE_ICP"}
+
+
 class SmallGicpBackend(Backend):
-    """GICP, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
+    """GICP or point-to-plane ICP, coarse to fine: first with correspondences up to ``reach_m``,
+    then up to ``gate_m``.
 
     ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second,
     if it had an inlier.
@@ -180,16 +203,18 @@ class SmallGicpBackend(Backend):
 
     name: ClassVar[str] = "small_gicp"
     accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
-    about: ClassVar[str] = "small_gicp's GICP against points sampled from the model, one thread"
+    about: ClassVar[str] = (
+        "small_gicp's GICP or point-to-plane ICP against points sampled from the model, one thread"
+    )
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("small_gicp", "small_gicp"),)
     get: ClassVar[str] = "pip install 'avsreplay[small_gicp]'"
-    parameters = SampledParams
+    parameters = SmallGicpParams
 
     def __init__(self, target: Target) -> None:
         import small_gicp
 
         self._library: Any = small_gicp
-        self._limits, self._own = target.limits, target.parameters(SampledParams)
+        self._limits, self._own = target.limits, target.parameters(SmallGicpParams)
         points, _ = sample(target.surface, self._own.surface_points)
         self._cloud, self._tree = self._prepared(points)
 
@@ -205,7 +230,7 @@ class SmallGicpBackend(Backend):
                 scan,
                 self._tree,
                 T_ca.matrix,
-                registration_type="GICP",
+                registration_type=_METHODS[self._own.cost],
                 max_correspondence_distance=reach,
                 num_threads=1,
                 max_iterations=self._limits.n_max,

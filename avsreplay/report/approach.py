@@ -12,9 +12,9 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
-from avsreplay.report.charts import values
 from avsreplay.report.view import View
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 WIDTH, HEIGHT, BORDER = 440, 380, 26  # of one panel [px]
 FLOWN = frozenset(
@@ -24,9 +24,9 @@ _POSITION, _ATTITUDE = ("x_m", "y_m", "z_m"), ("qx", "qy", "qz", "qw")
 _BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
-def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
-    """Return the parts (n, 3) of the planned paths that were flown, in {C} at the estimate of each
-    scan [m].
+def flown_parts(rows: Sequence[Row], view: View) -> list[tuple[int, Array]]:
+    """Return the parts of the planned paths that were flown: index of the first row, and positions
+    (n, 3) in {C} at the estimate of each scan [m].
 
     A path is followed until the next one begins or its end is reached. A part ends where the robot
     follows no plan.
@@ -35,11 +35,15 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
         rows: one per scan.
         view: its paths.
     """
-    t = np.array([row.t_ns for row in rows], np.int64)
+    t = np.array(column_of(rows, "t_ns"), np.int64)
     r, q = (
-        np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE)
+        np.stack([numbers(rows, name) for name in names], axis=1)
+        for names in (_POSITION, _ATTITUDE)
     )
-    y, flown = np.full((len(rows), 3), np.nan), np.array([row.action in FLOWN for row in rows])
+    y, flown = (
+        np.full((len(rows), 3), np.nan),
+        np.array([a in FLOWN for a in column_of(rows, "action")]),
+    )
     begins = [path.t_ns for path in view.paths[1:]]
     for path, next_ns in zip(view.paths, [*begins, np.iinfo(np.int64).max], strict=False):
         k = int(np.searchsorted(t, path.t_ns))
@@ -52,8 +56,9 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
         at = np.stack([np.interp(since[on], planned, x) for x in path.points.T], axis=1)
         y[on] = geometry.rotate(geometry.matrix(geometry.conjugate(q[on])), at - r[on])
     known = np.isfinite(y).all(axis=1)
-    parts = np.split(y, np.flatnonzero(known[1:] != known[:-1]) + 1)
-    return [part for part in parts if len(part) > 1 and np.isfinite(part).all()]
+    cuts = np.flatnonzero(known[1:] != known[:-1]) + 1
+    parts = zip([0, *cuts.tolist()], np.split(y, cuts), strict=True)
+    return [(k, part) for k, part in parts if len(part) > 1 and np.isfinite(part).all()]
 
 
 def approach_picture(
@@ -72,7 +77,7 @@ def approach_picture(
     axis = np.array(header.get("task", {}).get("axis", (1.0, 0.0, 0.0)))
     side, grasp = geometry.across(axis), np.array(header.get("task", {}).get("grasp_m", (0, 0, 0)))
     body, corners = np.asarray(view.vertices, np.float64) - grasp, view.faces
-    parts = [part - grasp for part in parts]
+    lines = [part - grasp for _, part in parts]
     limits = header.get("approach", {})
     cones = [
         (limits.get(f"{name}_deg"), limits.get(f"{name}_range_m")) for name in ("cone", "final")
@@ -84,8 +89,8 @@ def approach_picture(
         ("turned by 90° about the axis", np.cross(axis, side)),
     ):
         flat = np.stack([axis, second], axis=1)
-        shown = [body @ flat, *(part @ flat for part in parts), *outlines, np.zeros((1, 2))]
-        panels.append((name, shown[0], shown[1 : 1 + len(parts)], np.concatenate(shown)))
+        shown = [body @ flat, *(line @ flat for line in lines), *outlines, np.zeros((1, 2))]
+        panels.append((name, shown[0], shown[1 : 1 + len(lines)], np.concatenate(shown)))
     low = np.min([p[3].min(axis=0) for p in panels], axis=0)
     high = np.max([p[3].max(axis=0) for p in panels], axis=0)
     scale = float(np.min((np.array([WIDTH, HEIGHT]) - 2 * BORDER) / np.maximum(high - low, 1e-6)))
@@ -115,11 +120,11 @@ def approach_picture(
                 "title": name,
                 "body": _triangles(place(flat_body), corners),
                 "cones": [_text(place(outline), "M", "L") for outline in outlines],
-                "lines": [_text(place(line), "", " ") for line in lines],
-                "start": place(lines[0][:1])[0].tolist(),
+                "lines": [_text(place(line), "", " ") for line in flat_lines],
+                "start": place(flat_lines[0][:1])[0].tolist(),
                 "grasp": place(np.zeros((1, 2)))[0].tolist(),
             }
-            for name, flat_body, lines, _ in panels
+            for name, flat_body, flat_lines, _ in panels
         ],
     }
 

@@ -9,7 +9,6 @@ import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ from avsreplay.parts import FAULTS
 from avsreplay.records import State
 from avsreplay.report.episodes import Episode
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
-from avsreplay.report.summary_parts import add_rows
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
 
@@ -30,11 +29,6 @@ def pack(array: ArrayLike, kind: str) -> dict[str, str]:
     """Return ``{"type", "data"}`` of a flattened array; ``kind`` is f8, f4, i4, i2, u4 or u1."""
     flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
     return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
-
-
-def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
-    """A column as floats (n,), NaN where a row has no value."""
-    return np.array(list(map(attrgetter(name), rows)), dtype=np.float64)
 
 
 def embed(value: Any) -> str:
@@ -57,7 +51,15 @@ _WINDOW = 10
 WIDE = 20.0  # largest over typical value from which an axis is logarithmic
 KINDS = {  # colour and pattern of each place
     "flagged": (
-        *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
+        *(
+            "not_aligned",
+            "fit_error",
+            "no_scan",
+            "frozen",
+            "pose_jump",
+            "few_inliers",
+            "not_converged",
+        ),
         "halves_differ",
         *("doubtful", "sensor_bias", "clock"),
     ),
@@ -72,30 +74,30 @@ KINDS = {  # colour and pattern of each place
         "approach_on_prediction",
     ),
 }
+FIRST = ("position", "nis", "capture")  # charts that stand beside the states; others are folded
+SAME = 1e-3  # largest difference of two lines, over the range of the first, that are drawn as one
 _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
 def derived(rows: Sequence[Row]) -> Columns:
     """Every column that a chart draws, (n,) each; empty ones are left out."""
-    taken: dict[str, list[Any]] = {name: [] for name in _DIRECT}
-    add_rows(taken, rows)
-    out = {name: np.array(column, dtype=np.float64) for name, column in taken.items()}
+    out = {name: numbers(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (
         ("sigma1", "sigma1_1s"),
         ("sigma2", "sigma2_1s"),
         *((f"c{a}_m", "c_1s_m") for a in "xyz"),
     ):
-        _band(out, name, values(rows, sigma))
+        _band(out, name, numbers(rows, sigma))
     for axis in "xyz":
-        _band(out, f"mu_{axis}_deg", values(rows, "mu_1s_deg"))
+        _band(out, f"mu_{axis}_deg", numbers(rows, "mu_1s_deg"))
     out["capture_time_s_lo"], out["capture_time_s_hi"] = _spread(out["capture_time_s"])
     return {name: column for name, column in out.items() if np.isfinite(column).any()}
 
 
 def _attitude(rows: Sequence[Row]) -> NDArray[np.float64]:
     """Attitude mu as a rotation vector [deg], (3, n)."""
-    q = np.stack([values(rows, f"mu{a}") for a in "xyzw"], axis=-1)
+    q = np.stack([numbers(rows, f"mu{a}") for a in "xyzw"], axis=-1)
     known = np.isfinite(q).all(axis=-1)
     out = np.full((len(rows), 3), np.nan)
     out[known] = np.degrees(geometry.log(q[known]))
@@ -120,9 +122,19 @@ def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def _line(
-    name: str, label: str, colour: int, *, dash: bool = False, points: bool = False
+    name: str,
+    label: str,
+    colour: int,
+    *,
+    dash: bool = False,
+    points: bool = False,
+    measured: bool = False,
 ) -> dict[str, Any]:
-    return {"column": name, "label": label, "colour": colour, "dash": dash, "points": points}
+    """One line of a chart; ``measured``: it is of the measurement alone, so that the axis follows
+    the scans that were used, and rejected values beyond it are marked at the edge.
+    """
+    marks = {"dash": dash, "points": points, "measured": measured}
+    return {"column": name, "label": label, "colour": colour, **marks}
 
 
 def _chart(
@@ -144,6 +156,7 @@ def _chart(
     """
     return {
         "key": key,
+        "first": key in FIRST,
         "title": title,
         "unit": unit,
         "log": log,
@@ -154,7 +167,10 @@ def _chart(
 
 
 def charts(
-    columns: Columns, truth: State | None = None, limits: Mapping[str, float] | None = None
+    columns: Columns,
+    truth: State | None = None,
+    limits: Mapping[str, float] | None = None,
+    used: NDArray[np.bool_] | None = None,
 ) -> list[Chart]:
     """The charts that have data, in reading order.
 
@@ -162,6 +178,7 @@ def charts(
         columns: from ``derived``.
         truth: true parameters, drawn as horizontal lines.
         limits: limits of the fault detector: ``rms_max_m``, ``alpha_max_m`` and ``length_m`` [m].
+        used: (n,) whether each scan was used; None if all were.
     """
     whole = [
         *_error_charts(),
@@ -171,7 +188,10 @@ def charts(
     ]
     kept = []
     for chart in whole:
-        chart["series"] = [s for s in chart["series"] if s["column"] in columns]
+        chart["series"] = distinct(
+            [(s, columns[s["column"]]) for s in chart["series"] if s["column"] in columns],
+            logarithmic=bool(chart["log"]),
+        )
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
         if chart["key"] in ("position", "attitude") and not any(
             "_err_" in s["column"] for s in chart["series"]
@@ -180,8 +200,38 @@ def charts(
                 "error", "uncertainty"
             )  # no truth: the predicted 1 sigma alone
         if chart["series"]:
-            kept.append(_scaled(chart, columns))
+            kept.append(_scaled(chart, columns, used))
     return kept
+
+
+def distinct(
+    lines: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], *, logarithmic: bool
+) -> list[dict[str, Any]]:
+    """Return the lines that differ from every earlier one; the label of a line names those that
+    are equal to it.
+
+    Args:
+        lines: each with its values (n,).
+        logarithmic: whether the axis is.
+    """
+    kept: list[tuple[dict[str, Any], NDArray[np.float64]]] = []
+    for line, column in lines:
+        heights = np.log10(np.where(column > 0.0, column, np.nan)) if logarithmic else column
+        equal = next((k for k, (_, other) in enumerate(kept) if _equal(other, heights)), None)
+        if equal is None:
+            kept.append((line, heights))
+        else:
+            first, other = kept[equal]
+            kept[equal] = ({**first, "label": f"{first['label']} = {line['label']}"}, other)
+    return [line for line, _ in kept]
+
+
+def _equal(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    known = np.isfinite(first)
+    if first.shape != second.shape or not known.any() or (known != np.isfinite(second)).any():
+        return False
+    span = float(np.ptp(first[known]))
+    return float(np.abs(first - second)[known].max()) <= SAME * span
 
 
 def flight_charts(columns: Columns) -> list[Chart]:
@@ -205,17 +255,20 @@ def flight_charts(columns: Columns) -> list[Chart]:
         _chart("margin", "Margin of the constraints", "m", lines, levels=[(0.0, "limit", 3)]),
     ]
     return [
-        _scaled(chart, columns)
+        _scaled(chart, columns) | {"first": True}
         for chart in whole
         if any(s["column"] in columns for s in chart["series"])
     ]
 
 
-def _scaled(chart: Chart, columns: Columns) -> Chart:
+def _scaled(chart: Chart, columns: Columns, used: NDArray[np.bool_] | None = None) -> Chart:
     """The chart with its axis; typical values in metres below 1 m are drawn in millimetres,
     as in the tables.
     """
-    sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]
+    sizes = [
+        np.abs(_on_axis(columns[s["column"]], used if s["measured"] else None))
+        for s in chart["series"]
+    ]
     typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)
     if chart["log"] is None:
         chart = chart | {"log": 0.0 < WIDE * typical < largest}
@@ -225,15 +278,22 @@ def _scaled(chart: Chart, columns: Columns) -> Chart:
     return chart | {"unit": "mm", "factor": 1000.0, "levels": levels}
 
 
+def _on_axis(column: NDArray[np.float64], used: NDArray[np.bool_] | None) -> NDArray[np.float64]:
+    """The values that an axis follows: those of used scans, all where none of them has one."""
+    if used is None or not np.isfinite(column[used]).any():
+        return column
+    return column[used]
+
+
 def _error_charts() -> list[Chart]:
     position = [
         _line("pos_err_m", "estimate", 0),
-        _line("reg_pos_err_m", "registration", 1, points=True),
+        _line("reg_pos_err_m", "registration", 1, points=True, measured=True),
         _line("pos_1s_m", "predicted 1 sigma", 2, dash=True),
     ]
     attitude = [
         _line("rot_err_deg", "estimate", 0),
-        _line("reg_rot_err_deg", "registration", 1, points=True),
+        _line("reg_rot_err_deg", "registration", 1, points=True, measured=True),
         _line("rot_1s_deg", "predicted 1 sigma", 2, dash=True),
     ]
     return [
@@ -251,14 +311,19 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
     nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
     return [
         _chart(
-            "fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit, log=None
+            "fit",
+            "Fit error",
+            "m",
+            [_line("rms_m", "rms over inliers", 0, measured=True)],
+            levels=fit,
+            log=None,
         ),
         _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
         _chart(
             "nis",
             "Innovation squared (NIS)",
             "",
-            [_line("nis", "NIS", 0, points=True)],
+            [_line("nis", "NIS", 0, points=True, measured=True)],
             levels=nis,
             log=True,
         ),
@@ -266,7 +331,7 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
             "innovation",
             "Position innovation",
             "m",
-            [_line("innov_m", "length", 0)],
+            [_line("innov_m", "length", 0, measured=True)],
             levels=jump,
             log=True,
         ),
@@ -274,7 +339,7 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
             "turn",
             "Attitude innovation",
             "deg",
-            [_line("innov_deg", "angle", 0)],
+            [_line("innov_deg", "angle", 0, measured=True)],
             levels=turn,
             log=True,
         ),
@@ -346,12 +411,18 @@ def _plan_charts() -> list[Chart]:
     return [
         _chart("gramian", "Gramian condition, log10", "", condition),
         _chart("rank", "Gramian rank of 20", "", [_line("ogm_rank", "rank", 0)]),
-        _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)], log=None),
+        _chart(
+            "noise",
+            "Adapted noise, position",
+            "m",
+            [_line("r_pos_m", "1 sigma", 0, measured=True)],
+            log=None,
+        ),
         _chart(
             "noise_turn",
             "Adapted noise, attitude",
             "deg",
-            [_line("r_rot_deg", "1 sigma", 0)],
+            [_line("r_rot_deg", "1 sigma", 0, measured=True)],
             log=None,
         ),
         _chart(
@@ -379,12 +450,13 @@ def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[st
 
     Of ``episodes`` only those without any scan are drawn, over their window.
     """
-    flagged = [None if row.gamma == 1 else row.reason for row in rows]
+    gammas, reasons = column_of(rows, "gamma"), column_of(rows, "reason")
+    flagged = [None if gamma == 1 else why for gamma, why in zip(gammas, reasons, strict=True)]
     bare = [_bare(e, rows) for e in episodes if not e.scans and rows]
-    actions = _runs(rows, [row.action or None for row in rows], "action")
+    actions = _runs(rows, [action or None for action in column_of(rows, "action")], "action")
     found = (
         _runs(rows, flagged, "flagged")
-        + _runs(rows, [row.fault for row in rows], "injected")
+        + _runs(rows, column_of(rows, "fault"), "injected")
         + bare
         + actions
     )
@@ -399,7 +471,7 @@ def _style(lane: str, word: str) -> dict[str, int]:
 
 
 def _bare(episode: Episode, rows: Sequence[Row]) -> dict[str, Any]:
-    near = min(range(len(rows)), key=lambda k: abs(rows[k].t_s - episode.start_s))
+    near = int(np.argmin(np.abs(numbers(rows, "t_s") - episode.start_s)))
     window = {"from": episode.start_s, "to": episode.end_s, "first": near, "last": near}
     return {"lane": "injected", "word": episode.kind, **window}
 
@@ -428,12 +500,12 @@ def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> 
         return list(range(len(rows)))
     turns: set[int] = set()
     for name in ("gamma", "reason", "fault", "action"):
-        column = list(map(attrgetter(name), rows))
-        turns.update(k for k, (before, now) in enumerate(pairwise(column), 1) if now != before)
+        words = column_of(rows, name)
+        turns.update(k for k, (before, now) in enumerate(pairwise(words), 1) if now != before)
     kept = {0, len(rows) - 1, *always, *(turns if len(turns) <= most // 4 else ())}
     step = -(-len(rows) * 5 // (most - len(kept)))
     peaks = [
-        np.nan_to_num(values(rows, name), nan=-1.0)
+        np.nan_to_num(numbers(rows, name), nan=-1.0)
         for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")
     ]
     for begin in range(0, len(rows), step):

@@ -20,10 +20,10 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Array, Pose
-from avsreplay.report.jsonl import field_types, plain
+from avsreplay.report.jsonl import plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
-from avsreplay.rows import Column, Row, columns
+from avsreplay.rows import Column, Row, columns, field_types
 from avsreplay.settings import dump
 
 FORMAT = "avsreplay-run/1"
@@ -191,31 +191,44 @@ def write_layout(path: str | Path) -> None:
         )
 
 
-_HEAD = """# Columns of a row
+_HEAD = """# What do the columns of a row mean?
 
-Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. A value is null where it does
-not apply, for example an error without ground truth. Frames, units and symbols are defined under
-[conventions](conventions.md), terms in the [glossary](glossary.md).
+Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. These are the columns that
+people use; all follow by subject.
 
-The tables state the tolerance of a [golden file](ci.md) for each column: a value passes if it
-differs from the expected one by at most the absolute tolerance plus the relative tolerance times
-the expected value; *exact* columns are equal. [rows.schema.json](rows.schema.json) is the JSON
-schema of a row.
+{frequent}
 
-`python -m avsreplay.report.export` makes this page (with `--schema` the schema) from
-`avsreplay/rows.py`; a test compares them.
+A column whose type ends with ? is null where it does not apply, for example an error without ground
+truth. [Conventions](conventions.md) defines frames and units, the [glossary](glossary.md) terms.
+*Golden* is the tolerance of a [golden file](ci.md): absolute, or relative to the expected value;
+columns without one are equal. [rows.schema.json](rows.schema.json) is the JSON schema of a row.
+`python -m avsreplay.report.export` makes this page, with `--schema` the schema.
 """
+
+FREQUENT = {
+    "which scan": ("seq", "t_s"),
+    "was it used, and why not": ("gamma", "reason", "status", "message"),
+    "pose of the target": ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+    "how certain it is": ("pos_1s_m", "rot_1s_deg", "converged"),
+    "errors against ground truth": ("pos_err_m", "rot_err_deg"),
+    "does the covariance fit the errors": ("nis", "nees"),
+    "plan and action": ("capture_time_s", "action"),
+}  # what people look for: the columns that have it
 
 
 def columns_page() -> str:
     """Return the Markdown page."""
-    parts = [_HEAD]
+    lines = ["| question | columns |", "|---|---|"]
+    lines += [
+        f"| {what} | {', '.join(f'`{n}`' for n in names)} |" for what, names in FREQUENT.items()
+    ]
+    parts = [_HEAD.replace("{frequent}", "\n".join(lines))]
     words: list[str] = []
     for each in columns():
         if each.section is not None:
             parts += [*words, f"\n## {each.section.title}\n\n"]
             parts += [f"{each.section.text}\n\n"] if each.section.text else []
-            parts.append("| column | type | unit | golden | meaning |\n|---|---|---|---|---|\n")
+            parts.append("| column | type | golden | meaning |\n|---|---|---|---|\n")
             words = []
         parts.append(_line(each, *field_types()[each.name]))
         if each.words:
@@ -225,17 +238,17 @@ def columns_page() -> str:
 
 
 def _line(column: Column, kind: type, nullable: bool) -> str:
-    tolerance = " + ".join(
+    tolerance = ", ".join(
         text
         for value, text in (
             (column.atol, f"{column.atol:g}"),
-            (column.rtol, f"{column.rtol:g} relative"),
+            (column.rtol, f"{100 * column.rtol:g}%"),
         )
         if value
     )
-    word = kind.__name__ + (" or null" if nullable else "")
+    word = kind.__name__ + ("?" if nullable else "") + (f" {column.unit}" if column.unit else "")
     meaning = column.text.replace("|", "\\|")
-    return f"| `{column.name}` | {word} | {column.unit} | {tolerance or 'exact'} | {meaning} |\n"
+    return f"| `{column.name}` | {word} | {tolerance} | {meaning} |\n"
 
 
 def row_schema() -> dict[str, Any]:

@@ -4,6 +4,7 @@ annotations.
 
 from __future__ import annotations
 
+import difflib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -49,7 +50,9 @@ class GateRule(Settings):
         """Raise ValueError for an unknown metric or a rule without a limit."""
         known = [m.name for m in METRICS]
         if self.metric not in known:
-            raise ValueError(f"unknown metric '{self.metric}'; known: {', '.join(known)}")
+            near = difflib.get_close_matches(self.metric, known, 1, 0.0)[0]
+            meant = f"did you mean '{near}'? 'avsreplay compare --metrics' lists all"
+            raise ValueError(f"unknown metric '{ascii(self.metric)[1:-1][:40]}'; {meant}")
         if not self.limits:
             raise ValueError(
                 f"the rule on '{self.metric}' has no limit; give one of {', '.join(_LIMITS)}"

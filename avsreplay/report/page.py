@@ -21,9 +21,10 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
 from avsreplay.report import charts
-from avsreplay.report.approach import approach_picture
+from avsreplay.report.approach import approach_picture, flown_parts
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
+from avsreplay.report.flown import flight_facts
 from avsreplay.report.gate import RuleOutcome, gate_table
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import (
@@ -37,6 +38,7 @@ from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of
 from avsreplay.report.view import View, cone_lines, scene, thin_surface
 from avsreplay.rows import Row
+from avsreplay.tables import chosen, column_of, numbers
 
 MOST_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
@@ -52,10 +54,16 @@ class Section:
 
 @value_class(eq=True)
 class Folded:
-    """Preformatted text that is shown on request."""
+    """Parts, or preformatted text, that are shown on request."""
 
     title: str
-    text: str
+    text: str = ""
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def listed(self) -> list[tuple[str, Part]]:
+        """The parts with their kinds, for the template."""
+        return _listed(self.parts)
 
 
 Part = Table | Section | Folded | Markup
@@ -93,10 +101,10 @@ def build_html(
     Args:
         title: of the page and its first heading.
         lines: under the title, the verdict first.
-        parts: tables, headings, figures and folded text, in order; a table without rows is left
+        parts: tables, headings, figures and folded parts, in order; a table without rows is left
             out.
         data: charts and 3D view for the scripts; without it the page has no script.
-        lead: parts above the charts.
+        lead: parts beside the 3D view.
         grade: pass, check or fail, the colour of the first line.
 
     Returns:
@@ -117,12 +125,20 @@ def build_html(
             style=style,
             script=script,
             data=embedded,
+            more=any(not chart["first"] for chart in (data or {}).get("charts", ())),
+            shown=bool(data and data["scene"]),
         )
     )
 
 
 def _listed(parts: Iterable[Part]) -> list[tuple[str, Part]]:
-    return [(_kind(part), part) for part in parts if not isinstance(part, Table) or part.rows]
+    return [(_kind(part), part) for part in parts if _has_content(part)]
+
+
+def _has_content(part: Part) -> bool:
+    if isinstance(part, Folded):
+        return bool(part.text or _listed(part.parts))
+    return not isinstance(part, Table) or bool(part.rows)
 
 
 def _kind(part: Part) -> str:
@@ -159,36 +175,48 @@ def build_page(
     """
     verdict = verdict_of(rows, summary, header)
     kept = charts.most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
-    place, all_rows, rows = {k: n for n, k in enumerate(kept)}, rows, [rows[k] for k in kept]
+    place, all_rows = {k: n for n, k in enumerate(kept)}, rows
+    rows = chosen(rows, np.array(kept, int))
+    stamps = set(column_of(rows, "t_ns"))
     columns = charts.derived(rows)
+    used = numbers(rows, "gamma") == 1.0
     t1 = summary.convergence.t1_s
+    flown = [] if view is None else flown_parts(rows, view)
     data = {
-        "runs": [
-            {
-                "name": title,
-                "t": charts.pack(charts.values(rows, "t_s"), "f8"),
-                "columns": _packed(columns),
-            }
-        ],
-        "charts": charts.charts(columns, truth, (header or {}).get("limits")),
+        "runs": [_run_data(title, rows, columns)],
+        "charts": charts.charts(columns, truth, (header or {}).get("limits"), used),
         "spans": charts.spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
-        "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
-        "scans": [row.seq for row in rows],
-        "scene": scene(rows, dict(poses), view),
+        "states": [
+            [gamma, reason, fault or ""]
+            for gamma, reason, fault in zip(
+                *(column_of(rows, name) for name in ("gamma", "reason", "fault")), strict=True
+            )
+        ],
+        "scans": column_of(rows, "seq"),
+        "scene": scene(rows, {t_ns: pose for t_ns, pose in poses if t_ns in stamps}, view)
+        | {"flown": _flown_data(flown)},
+        "chosen": flown[-1][0] + len(flown[-1][1]) - 1 if flown else 0,
     }
     errors, faults, manoeuvres, *others = summary_tables(summary, rows)
     picture = approach_picture(rows, view, header or {})
-    parts: list[Part] = (
-        [] if picture is None else [Section("Approach"), render("approach.svg", **picture)]
-    )
-    parts += [errors, *others, facts_table("Run", fact_lines(summary))]
+    parts: list[Part] = [moments_table(verdict, place)]
+    if picture is not None:
+        parts += [Section("Approach"), render("approach.svg", **picture)]
+    parts += [
+        Folded("Faults and manoeuvres", parts=(faults, manoeuvres)),
+        Folded("Reasons and settings", parts=(verdict_table(verdict),)),
+        Folded(
+            "Errors, parameters and consistency",
+            parts=(errors, *others, facts_table("Run", fact_lines(summary))),
+        ),
+    ]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
     capture = [] if verdict.capture is None else verdict.capture.described()
-    lead = [moments_table(verdict, place), facts_table("Capture", capture), faults, manoeuvres]
-    parts = [verdict_table(verdict), *parts]
+    capture += flight_facts(all_rows, view, header or {}, verdict.capture)
+    lead = [facts_table("Capture", capture)]
     lines = [verdict.line, in_one_line(summary)]
     if len(rows) < len(all_rows):
         count = f"{len(rows)} of {len(all_rows)} scans"
@@ -197,6 +225,21 @@ def build_page(
             " errors."
         )
     return build_html(title, lines, parts, data, lead, verdict.grade.value.lower())
+
+
+def _run_data(name: str, rows: Sequence[Row], columns: charts.Columns) -> dict[str, Any]:
+    """Times, columns and gamma of one run."""
+    return {
+        "name": name,
+        "t": charts.pack(numbers(rows, "t_s"), "f8"),
+        "columns": _packed(columns),
+        "used": charts.pack(column_of(rows, "gamma"), "u1"),
+    }
+
+
+def _flown_data(flown: Sequence[tuple[int, Array]]) -> list[dict[str, Any]]:
+    """Flown parts in {C}: the row of the first position, and the positions."""
+    return [{"first": k, "points": charts.pack(points, "f4")} for k, points in flown]
 
 
 def _packed(columns: charts.Columns) -> dict[str, Any]:
@@ -221,12 +264,7 @@ def build_comparison(
     columns = [charts.derived(run.rows) for run in runs]
     data = {
         "runs": [
-            {
-                "name": run.name,
-                "t": charts.pack(charts.values(run.rows, "t_s"), "f8"),
-                "columns": _packed(own),
-            }
-            for run, own in zip(runs, columns, strict=True)
+            _run_data(run.name, run.rows, own) for run, own in zip(runs, columns, strict=True)
         ],
         "charts": _overlaid(runs, columns),
         "spans": charts.spans(runs[0].rows),
@@ -247,6 +285,9 @@ def build_comparison(
     )
 
 
+_COMPARED_FIRST = ("pos_err_m", "rot_err_deg", "nis", "capture_time_s")  # charts not folded
+
+
 def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
     if not outcomes:
         return ""
@@ -263,14 +304,22 @@ def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) ->
     everything: charts.Columns = {
         name: column for own in reversed(columns) for name, column in own.items()
     }
+    instants = [[row.t_s for row in run.rows] for run in runs]
+    together = all(own == instants[0] for own in instants)
     out = []
     for chart in charts.charts(everything):
         for line in chart["series"]:
-            series = [
-                {**line, "run": k, "label": run.name, "colour": k, "dash": k % 2 == 1}
-                for k, run in enumerate(runs)
-                if line["column"] in columns[k]
+            name = line["column"]
+            lines = [
+                ({**line, "run": k, "label": run.name, "colour": k, "dash": k % 2 == 1}, of[name])
+                for k, (run, of) in enumerate(zip(runs, columns, strict=True))
+                if name in of
             ]
+            series = (
+                charts.distinct(lines, logarithmic=bool(chart["log"]))
+                if together
+                else [line for line, _ in lines]
+            )
             alone = len(chart["series"]) == 1
             title = chart["title"] if alone else f"{chart['title']}: {line['label']}"
             levels = chart["levels"] if alone else []
@@ -282,6 +331,7 @@ def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) ->
                     "series": series,
                     "bands": [],
                     "levels": levels,
+                    "first": line["column"] in _COMPARED_FIRST,
                 }
             )
     return out
@@ -325,7 +375,14 @@ def build_flight_page(
         name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()
     }
     data = {
-        "runs": [{"name": title, "t": charts.pack(flight.t_s, "f8"), "columns": _packed(columns)}],
+        "runs": [
+            {
+                "name": title,
+                "t": charts.pack(flight.t_s, "f8"),
+                "columns": _packed(columns),
+                "used": None,
+            }
+        ],
         "charts": charts.flight_charts(columns),
         "spans": [],
         "marks": [],
@@ -336,7 +393,7 @@ def build_flight_page(
         "3D view: frame of the fixture {C}, in which the target is at rest. Time counts from the"
         " instant of planning."
     )
-    return build_html(title, [*lines, note], [facts_table("Plan", facts)], data)
+    return build_html(title, [*lines, note], [], data, [facts_table("Plan", facts)])
 
 
 def _scene(flight: Flight) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import textwrap
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 from rich.console import Console
 
 from avsreplay.errors import counted
@@ -32,42 +33,53 @@ from avsreplay.report.table import (
 from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
 
-SCREEN_ROWS, SCREEN_MOMENTS = 9, 3  # scans and worst moments on the first screen
+SCREEN_ROWS, SCREEN_MOMENTS = 10, 3  # scans and worst moments on the first screen
+SCREEN_LINES, LEAST_ROWS = 23, 3  # lines of the first screen beside the prompt; fewest scans
+TABLE_LINES = 6  # of the table over time beside its scans: title, heads, rule, note, empty line
 TABLES = (  # names of the tables of a run
     *("verdict", "moments", "capture", "scans", "curves"),
     *("errors", "faults", "manoeuvres", "parameters", "consistency", "run"),
 )
-_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+_STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 
 def print_screen(console: Console, rows: Sequence[Row], verdict: RunVerdict) -> None:
-    """Print the answer in about 24 lines: verdict, worst moments, and the four quantities of the
-    run over time.
+    """Print the answer in 24 lines: verdict, worst moments, and the four quantities of the run over
+    time, of fewer scans where the verdict is long.
 
     Args:
         console: where to print.
         rows: one per scan.
         verdict: on the run.
     """
+    moments = verdict.moments[:SCREEN_MOMENTS]
+    left = SCREEN_LINES - _lines(console, verdict.line) - 1 - len(moments) - TABLE_LINES
     print_line(console, verdict.line)
     console.print()
-    for m in verdict.moments[:SCREEN_MOMENTS]:
+    for m in moments:
         span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
         line = f"{span} s: {m.what}; {m.cause}"
         print_line(console, textwrap.shorten(line, console.width, placeholder=" ..."))
     if rows:
-        print_table(console, over_time_table(rows), tight=True)
+        shown = min(max(left, LEAST_ROWS), SCREEN_ROWS)
+        print_table(console, over_time_table(rows, shown), tight=True)
 
 
-def over_time_table(rows: Sequence[Row]) -> Table:
+def _lines(console: Console, text: str) -> int:
+    """Number of lines that a text takes on the console."""
+    return len(textwrap.wrap(text, console.width)) or 1
+
+
+def over_time_table(rows: Sequence[Row], most: int = SCREEN_ROWS) -> Table:
     """Pose error, gamma with its reason, condition number of the Gramian and planned time of
     capture over time.
 
     Args:
-        rows: one per scan; about ten of them are shown.
+        rows: one per scan.
+        most: number of scans that are shown, at even intervals, with the first and the last one.
     """
-    step = -(-len(rows) // SCREEN_ROWS)
-    chosen = [rows[k] for k in sorted({*range(0, len(rows), step), len(rows) - 1})]
+    places = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    chosen = [rows[k] for k in dict.fromkeys(places.tolist())]
     lines = tuple(
         (
             f"{row.t_s:.1f}",
@@ -91,7 +103,7 @@ def over_time_table(rows: Sequence[Row]) -> Table:
         "planned\ncapture [s]",
         "action",
     )
-    note = "more: --tables NAME,... (" + ", ".join(TABLES) + ") or all; page: -o DIR --report"
+    note = "more tables: -v or --tables NAME,...; page: -o DIR --report"
     return Table(f"{len(chosen)} of {len(rows)} scans", heads, lines, align="rlrrrrl", note=note)
 
 
@@ -143,7 +155,7 @@ def print_tables(
 
 
 def verdict_table(verdict: RunVerdict) -> Table:
-    """Reasons, first pose, robot and changed settings, as on terminal and page."""
+    """Reasons, first pose, robot and the settings that differ from their defaults."""
     marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
     rows: list[tuple[str | TableCell, ...]] = [
         ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
@@ -153,10 +165,10 @@ def verdict_table(verdict: RunVerdict) -> Table:
         rows.append(("task", verdict.task))
     if verdict.robot:
         rows.append(("robot", verdict.robot))
-    rows += [("changed setting", text) for text in verdict.changed] or [
+    rows += [("setting", text) for text in verdict.changed] or [
         ("settings", "all at their defaults")
     ]
-    return Table("Verdict", ("what", "value"), tuple(rows), align="l")
+    return Table("Reasons and settings", ("what", "value"), tuple(rows), align="l")
 
 
 def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
@@ -165,7 +177,8 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
     for m in verdict.moments:
         span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
         rows.append((TableCell(span, scan=(place or {}).get(m.row)), m.what, m.cause))
-    return Table("Worst moments", ("time [s]", "what", "cause"), tuple(rows), align="l")
+    heads = ("time [s]", "what", "cause")
+    return Table("Worst moments", heads, tuple(rows), align="l", wide=True)
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
@@ -192,7 +205,8 @@ def error_table(summary: Summary) -> Table:
     rows = tuple(
         _error_row(name, unit, spread) for name, unit, spread in found if spread is not None
     )
-    return Table(title, ("of", "unit", "n", *_STATISTICS), rows, align="llr")
+    note = "poses are compared at equal times and without an alignment; sse is the sum of squares"
+    return Table(title, ("of", "unit", "n", *_STATISTICS), rows, align="llr", note=note)
 
 
 def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
@@ -202,7 +216,8 @@ def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
         name,
         unit,
         str(spread.count),
-        *(format(factor * getattr(spread, s), spec) for s in _STATISTICS),
+        *(format(factor * getattr(spread, s), spec) for s in _STATISTICS[:-1]),
+        f"{factor * factor * spread.sse:.3g}",
     )
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +32,44 @@ STEP_RAD = 0.25
 MOST_STEPS = 100_000  # largest number of steps of the integration, 2 kB each: at least 4000 turns
 Vector = tuple[float, ...]
 Rows = Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Push(Settings):
+    """One table [[motion.push]]: a sudden change of the target's velocity and angular rate."""
+
+    at_s: float = setting(doc="Its instant after the begin of the log.", unit="s", low=0.0)
+    velocity_mps: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Change of the velocity of the mass centre in {A}.", unit="m/s"
+    )
+    rate_radps: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Change of the angular rate, in the axes of {C}.", unit="rad/s"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Load(Settings):
+    """One table [[motion.load]]: a constant torque and force on the target."""
+
+    start_s: float = setting(
+        0.0, "Time from which it acts, after the begin of the log.", unit="s", low=0.0
+    )
+    duration_s: float | None = setting(
+        None, "Time for which it acts.", unit="s", above=0.0, unset="to the end of the log"
+    )
+    torque_radps2: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0),
+        "Torque over the trace of the inertia, in the axes of {C}.",
+        unit="rad/s^2",
+    )
+    force_mps2: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Force per unit mass in {A}.", unit="m/s^2"
+    )
+
+    @property
+    def end_s(self) -> float:
+        """Time at which it ends [s after the begin]."""
+        return math.inf if self.duration_s is None else self.start_s + self.duration_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +118,8 @@ class MotionParams(Settings):
     disturbance_step_s: float = setting(
         1.0, "Time for which a disturbance is constant.", unit="s", above=0.0
     )
+    push: tuple[Push, ...] = setting((), "Sudden changes of the motion, one table each.")
+    load: tuple[Load, ...] = setting((), "Constant torques and forces, one table each.")
 
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion."""
@@ -198,10 +239,10 @@ def _integrate(
         raise _too_long(span_s)
     starts: list[float] = []
     table: list[Array] = []
-    for begin, until, torque, force in _windows(
-        params, sum(inertia[i][i] for i in range(3)), span_s, rng
-    ):
-        t = begin
+    trace = sum(inertia[i][i] for i in range(3))
+    windows = _windows(params, trace, span_s, rng)
+    for begin, until, torque, force in _loaded(windows, params, trace):
+        t, now = begin, _pushed(now, params.push, begin)
         while t < until:
             momentum = math.sqrt(sum(x * x for x in _times(inertia, now.w)))
             end = min(until, t + STEP_RAD * least / momentum) if momentum > 0.0 else until
@@ -232,6 +273,37 @@ def _windows(
         torque = tuple(params.torque_std_radps2 * trace * float(x) for x in rng.standard_normal(3))
         force = tuple(params.force_std_mps2 * float(x) for x in rng.standard_normal(3))
         yield k * params.disturbance_step_s, (k + 1) * params.disturbance_step_s, torque, force
+
+
+def _loaded(
+    windows: Iterator[tuple[float, float, Vector, Vector]], params: MotionParams, trace: float
+) -> Iterator[tuple[float, float, Vector, Vector]]:
+    """The windows, divided where a load begins or ends and at each push, with the loads added."""
+    events = {each.at_s for each in params.push}
+    events |= {t for load in params.load for t in (load.start_s, load.end_s)}
+    for begin, until, torque, force in windows:
+        cuts = [begin, *sorted(t for t in events if begin < t < until), until]
+        for start, end in pairwise(cuts):
+            acting = [each for each in params.load if each.start_s <= start < each.end_s]
+            yield (
+                start,
+                end,
+                _sum(torque, [tuple(trace * x for x in each.torque_radps2) for each in acting]),
+                _sum(force, [each.force_mps2 for each in acting]),
+            )
+
+
+def _sum(first: Vector, others: Sequence[Vector]) -> Vector:
+    for other in others:
+        first = tuple(a + b for a, b in zip(first, other, strict=True))
+    return first
+
+
+def _pushed(now: _Instant, pushes: Sequence[Push], t: float) -> _Instant:
+    """The state after the pushes at the time t [s]."""
+    due = [each for each in pushes if each.at_s == t]
+    w, v = _sum(now.w, [p.rate_radps for p in due]), _sum(now.v, [p.velocity_mps for p in due])
+    return _Instant(now.q, w, now.r, v)
 
 
 def _terms(

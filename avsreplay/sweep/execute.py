@@ -12,19 +12,20 @@ import json
 import logging
 import signal
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from avsreplay import __version__, settings, toml_document
 from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
 from avsreplay.files import output_text
+from avsreplay.job_file import JobFile, read_job
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import lost_text
 from avsreplay.plan.arm import with_arm
@@ -68,8 +69,7 @@ def log_of(task: Task, folder: Path) -> Path:
 
 
 def _replayed(task: Task, log: Path) -> RunResult:
-    options = SourceOptions(model=Path(task.model)) if task.log and task.model else SourceOptions()
-    with Run(Job(source=log, options=options, assignments=task.assignments, prefetch=0)) as run:
+    with Run(_job(task, log)) as run:
         length_m = settings.given(run.config.faults.resolved(run.surface.extent).length_m)
         lines: list[tuple[Any, ...]] = []
 
@@ -89,6 +89,18 @@ def _replayed(task: Task, log: Path) -> RunResult:
         if what := lost_text(run.source.losses, run.source.damaged, len(run)):
             return RunResult(task.id, "lossy", what, *found)
         return RunResult(task.id, "ok", None, *found)
+
+
+def _job(task: Task, log: Path) -> Job:
+    """The run of a log, or of a job file, whose golden file is not used."""
+    job = JobFile(log=log, given={}) if (found := read_job(log)) is None else found
+    given = dict(job.given) | ({"model": Path(task.model)} if task.log and task.model else {})
+    return Job(
+        source=job.log,
+        options=SourceOptions(**given),
+        config_file=job.config,
+        assignments=(*job.assignments, *task.assignments),
+    )
 
 
 def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, Any]:
@@ -168,11 +180,23 @@ CONNECT_S = 10  # time limit for the answer of a scheduler [s]
 LOOK_EVERY = 64  # completions between two queries for the number of workers
 
 
+class Identified(Protocol):
+    """A task of any kind: it can be sent to a worker and has an id."""
+
+    @property
+    def id(self) -> str:
+        """The id of its result."""
+
+
+T = TypeVar("T", bound=Identified)
+
+
 def run_tasks(
-    tasks: Iterable[Task],
+    tasks: Iterable[T],
     workers: int = 0,
     scheduler: str | None = None,
     dashboard: str = "127.0.0.1:0",
+    work: Callable[[T], RunResult] = run_task,  # type: ignore[assignment]
 ) -> Iterator[RunResult]:
     """Run tasks; yields one result per task, in order of completion.
 
@@ -182,16 +206,17 @@ def run_tasks(
             without Dask.
         scheduler: Address of a Dask scheduler, whose workers must see the files that tasks name.
         dashboard: Address at which the Dask dashboard of ``workers`` listens.
+        work: Makes one of them; it is a function of a module, so that workers can import it.
 
     Raises:
         MissingBackend: Dask is needed and not installed.
         UnreadableInput: The scheduler does not answer.
     """
     if workers == 0 and scheduler is None:
-        yield from _here(tasks)
+        yield from _here(tasks, work)
         return
     with _client(workers, scheduler, dashboard) as client:
-        yield from _on(client, iter(tasks))
+        yield from _on(client, iter(tasks), work)
 
 
 def _distributed() -> Any:
@@ -205,10 +230,10 @@ def _distributed() -> Any:
         ) from None
 
 
-def _here(tasks: Iterable[Task]) -> Iterator[RunResult]:
+def _here(tasks: Iterable[T], work: Callable[[T], RunResult]) -> Iterator[RunResult]:
     with ThreadPoolExecutor(max_workers=1) as pool:
         for task in tasks:
-            future = pool.submit(run_task, task)
+            future = pool.submit(work, task)
             error = future.exception()
             yield future.result() if error is None else _crashed(task.id, error)
 
@@ -259,7 +284,7 @@ def _no_interrupt() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
+def _on(client: Any, tasks: Iterator[T], work: Callable[[T], RunResult]) -> Iterator[RunResult]:
     """Keep a bounded number of tasks at the scheduler, which repeats the tasks of a failed worker
     on another one.
     """
@@ -269,7 +294,7 @@ def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
         if count % LOOK_EVERY == 0:
             limit = IN_FLIGHT * max(1, sum(client.nthreads().values()))
         while held < limit and (task := next(tasks, None)) is not None:
-            running.add(client.submit(run_task, task, key=f"run-{task.id}", pure=False))
+            running.add(client.submit(work, task, key=f"run-{task.id}", pure=False))
             held += 1
         if held == 0:
             return

@@ -25,6 +25,7 @@ import avsreplay
 from avsreplay import geometry, toml_document
 from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.job_file import read_job
 from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
@@ -40,7 +41,7 @@ class Task:
         id: Hash of everything below except folder names.
         scenario: TOML text, "" where a log is replayed.
         folder: Folder to which file names in the scenario are relative.
-        log: Log file, or "".
+        log: Log, or job file with a log and its options, or "".
         model: Model file, or "".
         assignments: Settings ``a.b=value`` of the replay.
         scans: Whether one row per scan is kept.
@@ -199,7 +200,7 @@ def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> d
         for name, text in texts.items()
         for path in _models_of(text, (loaded.folder / name).parent)
     }
-    return {path: _sha256(Path(path)) for path in sorted(paths - {""})}
+    return {path: _digest(Path(path)) for path in sorted(paths - {""})}
 
 
 def _models_of(scenario: str, folder: Path) -> tuple[str, ...]:
@@ -212,6 +213,20 @@ def _models_of(scenario: str, folder: Path) -> tuple[str, ...]:
         *(each.get("model") for each in table.get("object", ())),
     ]
     return tuple(str(folder / name) if name else "" for name in names)
+
+
+def _digest(path: Path) -> str:
+    """Hash of a file, of the files of a folder, or of a job file and all that it names."""
+    if path.is_dir():
+        parts = {file.name: file for file in sorted(path.iterdir()) if file.is_file()}
+    elif (job := read_job(path)) is not None:
+        parts = {"": path} | {str(k): named for k, named in enumerate(job.inputs)}
+    else:
+        return _sha256(path)
+    each = [
+        (name, _sha256(part) if part == path else _digest(part)) for name, part in parts.items()
+    ]
+    return hashlib.sha256(json.dumps(each).encode()).hexdigest()
 
 
 def _sha256(path: Path) -> str:

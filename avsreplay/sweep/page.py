@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,7 +19,9 @@ from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, Wor
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its
 # own
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
-_LEFT, _WIDTH, _ROW = 50, 460, 26  # fits a telephone without scrolling
+_LEFT, _WIDTH, _ROW, _HEAD = 12, 460, 44, 52  # fits a telephone without scrolling
+_LABEL = 62  # characters of the name of a combination over its line
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
 _FALSE_MIN = 1e-4  # left end of the ROC's logarithmic axis
 _X0, _Y0, _SIZE = 60, 20, 380
 _KIND_HEADS = (
@@ -54,7 +57,7 @@ def build_sweep_page(summary: SweepSummary) -> str:
     """The page of a campaign's summary; the same summary gives the same bytes."""
     cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
     figures = [
-        _spans(title, [(n, c.metrics.get(name)) for n, c in cells])
+        _spans(title, [(_named(n, c), c.metrics.get(name)) for n, c in cells])
         for name, title in HEADLINES.items()
     ]
     parts: list[Part] = [
@@ -108,6 +111,10 @@ def words(values: Mapping[str, Any]) -> str:
     return ", ".join(pairs) or "no change"
 
 
+def _named(number: int, cell: Cell) -> str:
+    return f"{number}: {words(cell.values)}"
+
+
 def _status_line(summary: SweepSummary) -> str:
     ended = ", ".join(f"{count} {word}" for word, count in summary.status.items()) or "none"
     return f"{summary.done} of {summary.planned} runs done: {ended}."
@@ -121,9 +128,7 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
         text = (
             "" if nees is None else f"{nees.mean_per_dof:.3f} ({nees.low:.3f} to {nees.high:.3f})"
         )
-        rows.append(
-            (f"{number}: {words(cell.values)}", str(cell.runs), str(cell.status.get("ok", 0)), text)
-        )
+        rows.append((_named(number, cell), str(cell.runs), str(cell.status.get("ok", 0)), text))
     heads = ("combination", "runs", "ok", "NEES per state at the end\n(band where consistent)")
     return Table("Combinations", heads, tuple(rows), wide=True)
 
@@ -132,7 +137,8 @@ def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """A row per combination: share of the runs that meet each criterion, with its 95 % interval."""
     names = list(cells[0][1].rates) if cells else []
     rows = tuple(
-        (str(number), *(_share(cell.rates[name]) for name in names)) for number, cell in cells
+        (_named(number, cell), *(_share(cell.rates[name]) for name in names))
+        for number, cell in cells
     )
     return Table("Success", ("combination", *names), rows, wide=True)
 
@@ -169,7 +175,7 @@ def cell_table(number: int, cell: Cell) -> Table:
                 band,
             )
         )
-    title = f"{number}: {words(cell.values)} ({cell.runs} runs)"
+    title = f"{_named(number, cell)} ({cell.runs} runs)"
     return Table(title, ("metric", "runs", "5 %", "median", "95 %", "95 % interval"), tuple(rows))
 
 
@@ -216,13 +222,25 @@ def _interval(low: float | None, high: float | None, style: str) -> str:
     return "" if low is None or high is None else f"{low:{style}} to {high:{style}}"
 
 
-def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Markup | None:
-    """One line per combination, on one axis from 0 (or the least value) up."""
-    known = [(number, q) for number, q in entries if q is not None]
+def round_ticks(low: float, high: float) -> list[float]:
+    """Return two to seven multiples of a round number; the first is at most ``low``, the last at
+    least ``high``.
+    """
+    span = high - low or abs(high) or 1.0
+    power = 10.0 ** math.floor(math.log10(span / 5.0))
+    step = next(s * power for s in _STEPS if s * power >= span / 5.0)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [float(f"{k * step:.12g}") for k in range(first, max(last, first + 1) + 1)]
+
+
+def _spans(title: str, entries: Sequence[tuple[str, Quantiles | None]]) -> Markup | None:
+    """One line per combination under its name, on one axis from 0 (or the least value) up."""
+    known = [(name, q) for name, q in entries if q is not None]
     if not known:
         return None
-    low = min(0.0, *(q.q05 for _, q in known)) if len(known) > 1 else min(0.0, known[0][1].q05)
-    high = max(max(q.q95, q.median_high or q.q95) for _, q in known)
+    least = min([0.0, *(q.q05 for _, q in known)])
+    ticks = round_ticks(least, max(max(q.q95, q.median_high or q.q95) for _, q in known))
+    low, high = ticks[0], ticks[-1]
     scale = (_WIDTH - _LEFT - 30) / (high - low or 1.0)
 
     def x(value: float) -> str:
@@ -230,29 +248,29 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
 
     lines = [
         {
-            "label": number,
+            "label": textwrap.shorten(name, _LABEL, placeholder=" ..."),
             "title": (
-                f"{number}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count}"
-                " runs"
+                f"{name}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count} runs"
             ),
-            "y": _ROW * (k + 3),
+            "y": _HEAD + _ROW * (k + 1) - 10,
             "x": {
                 **{name: x(getattr(q, name)) for name in ("q05", "q95", "median")},
                 "median_low": x(q.median if q.median_low is None else q.median_low),
                 "median_high": x(q.median if q.median_high is None else q.median_high),
             },
         }
-        for k, (number, q) in enumerate(known)
+        for k, (name, q) in enumerate(known)
     ]
     return render(
         "spans.svg",
         title=title,
         width=_WIDTH,
-        height=_ROW * (len(known) + 3),
-        title_y=_ROW - 8,
-        head_y=2 * _ROW,
-        label_x=_LEFT - 20,
-        ticks=[(x(v), f"{v:.3g}") for v in dict.fromkeys((low, 0.5 * (low + high), high))],
+        height=_HEAD + _ROW * len(known) + 8,
+        title_y=18,
+        head_y=_HEAD - 12,
+        label_x=_LEFT - 8,
+        ticks=[(x(v), f"{v:.6g}") for v in ticks],
+        top=_HEAD - 6,
         lines=lines,
     )
 

@@ -1,5 +1,5 @@
 """Approaches of the whole chain with vision lost before the capture; writes the table of
-docs/planning-results.md.
+docs/results.md.
 
 python tests/benchmarks/plan_blackout.py [--check]
 
@@ -20,7 +20,7 @@ from avsreplay import replay, toml_document
 from avsreplay.record import record
 from avsreplay.simulate.scenario import load_scenario
 
-PAGE = Path(__file__).parents[2] / "docs" / "planning-results.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results.md"
 LENGTH_S, DURATION_S = 12.0, 60.0
 STARTS_S = (10.0, 14.0)
 HEAD = (

@@ -86,15 +86,26 @@ const Charts = (() => {
     ];
   }
 
-  // The y range follows the lines and levels; a band may widen it to at most three times that.
+  // The y range follows the lines and levels; a band may widen it to at most three times that. Of a
+  // measured line only the scans that were used count, unless none was.
+  function extent(u, main, i0, i1, all) {
+    let a = Infinity, b = -Infinity;
+    for (const { at, used } of main) {
+      if (!u.series[at].show) continue;
+      for (let i = i0; i <= i1; i++) {
+        const v = u.data[at][i];
+        if (v === null || v === undefined || (!all && used && !used[i])) continue;
+        if (v < a) a = v;
+        if (v > b) b = v;
+      }
+    }
+    return [a, b];
+  }
   function yRange(spec, main) {
     return (u, low, high) => {
       const [i0, i1] = u.series[0].idxs || [0, u.data[0].length - 1];
-      let a = Infinity, b = -Infinity;
-      for (const s of main) {
-        if (!u.series[s].show) continue;
-        for (let i = i0; i <= i1; i++) { const v = u.data[s][i]; if (v !== null && v !== undefined) { if (v < a) a = v; if (v > b) b = v; } }
-      }
+      let [a, b] = extent(u, main, i0, i1, false);
+      if (a > b) [a, b] = extent(u, main, i0, i1, true);
       for (const level of spec.levels) if (level.label !== "truth" || spec.bands.length) { a = Math.min(a, level.y); b = Math.max(b, level.y); }
       if (a > b) return spec.log ? [0.1, 1] : [0, 1];
       if (spec.log) return uPlot.rangeLog(a, b, 10, false);
@@ -125,9 +136,28 @@ const Charts = (() => {
       ctx.restore();
     };
   }
-  function foreground(spec, shared) {
+  // Triangles at the edge for the values beyond it; returns their number.
+  function edges(u, main) {
+    const { ctx, bbox } = u, px = devicePixelRatio, { min, max } = u.scales.y, [i0, i1] = u.series[0].idxs || [0, -1];
+    let count = 0;
+    for (const { at, used, colour: k } of main) {
+      if (!used || !u.series[at].show) continue;
+      ctx.fillStyle = colour(k);
+      for (let i = i0; i <= i1; i++) {
+        const v = u.data[at][i];
+        if (v === null || v === undefined || (v <= max && v >= min)) continue;
+        const x = u.valToPos(u.data[0][i], "x", true), up = v > max, tip = up ? bbox.top + px : bbox.top + bbox.height - px, foot = tip + (up ? 8 : -8) * px;
+        ctx.beginPath(); ctx.moveTo(x, tip); ctx.lineTo(x - 5 * px, foot); ctx.lineTo(x + 5 * px, foot); ctx.closePath(); ctx.fill();
+        count++;
+      }
+    }
+    return count;
+  }
+  function foreground(spec, shared, main = [], beyond = null) {
     return (u) => {
       const { ctx, bbox } = u, px = devicePixelRatio;
+      const count = edges(u, main);
+      if (beyond) beyond.textContent = count ? `▲ ${count} rejected beyond the axis` : "";
       ctx.save();
       ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
       ctx.lineWidth = px; ctx.font = 11 * px + "px system-ui, sans-serif"; ctx.setLineDash([3 * px, 3 * px]);
@@ -203,7 +233,8 @@ const Charts = (() => {
 
   function lineChart(host, spec, shared) {
     const { node, caption } = figure(host, spec, shared);
-    const data = [shared.line.t], series = [{}], bands = [], outputs = [], main = [];
+    const data = [shared.line.t], series = [{}], bands = [], outputs = [], main = [], beyond = el("span", { class: "beyond" });
+    caption.append(beyond);
     const columns = (run) => shared.runs[run].columns;
     const add = (run, values, options) => { data.push(spread(shared.line, run, values, spec.log, spec.factor || 1)); series.push(options); return series.length - 1; };
     for (const b of spec.bands) {
@@ -219,13 +250,13 @@ const Charts = (() => {
       const dots = { show: true, size: 4, width: 1, stroke: () => colour(s.colour), fill: () => colour(s.colour) };
       const single = { size: 5, width: 1, stroke: () => colour(s.colour), fill: () => colour(s.colour), filter: (u, at, show) => show ? null : alone(u.data[at]) };
       const at = add(s.run || 0, columns(s.run || 0)[s.column], { label: s.label, stroke: () => colour(s.colour), width: 1.6, dash: s.dash ? [6, 4] : undefined, points: s.points ? dots : single, paths: s.points ? () => null : undefined, spanGaps: false });
-      main.push(at);
+      main.push({ at, used: s.measured ? shared.used[s.run || 0] : null, colour: s.colour });
       const output = el("output", {}, "–"), key = el("button", { type: "button", class: "key", "aria-pressed": "true", title: "show or hide" }, swatch(s.colour, s.dash, s.points), s.label, output);
       key.addEventListener("click", () => { const show = key.getAttribute("aria-pressed") !== "true"; key.setAttribute("aria-pressed", String(show)); u.setSeries(at, { show }); });
       caption.append(key);
       outputs.push({ at, output });
     }
-    const u = new uPlot(options(spec, shared, series, { range: yRange(spec, main), bands }), data, node);
+    const u = new uPlot(options(spec, shared, series, { range: yRange(spec, main), bands, draw: foreground(spec, shared, main, beyond) }), data, node);
     return finish(u, spec, outputs, shared);
   }
 
@@ -270,15 +301,31 @@ const Charts = (() => {
     return finish(u, spec, [], shared);
   }
 
-  // hooks: hover(idx or null), choose(idx).
-  function build(host, page, hooks) {
+  // Width of a chart in a host whose children stand in columns; more: a folded host of the same form.
+  function widthIn(host, wide, columns) {
+    const gap = 12, count = columns || getComputedStyle(host).gridTemplateColumns.split(" ").length;
+    return Math.max((wide - gap * (count - 1)) / count - 14, 240);
+  }
+  // Whether each scan of a run on the common axis was used.
+  function usedScans(line, run, k) {
+    if (!run.used) return null;
+    const values = Packed.unpack(run.used);
+    if (!line.place) return values;
+    const out = new Array(line.t.length);
+    line.place[k].forEach((at, i) => { out[at] = values[i]; });
+    return out;
+  }
+
+  // host, more: of the charts that are shown and that are folded. hooks: hover(idx or null), choose(idx).
+  function build(host, more, page, hooks) {
     readTheme();
     const runs = page.runs.map((r) => ({ name: r.name, t: Packed.unpack(r.t), columns: Object.fromEntries(Object.entries(r.columns).map(([n, p]) => [n, Packed.unpack(p)])) }));
     const line = timeline(runs), t = line.t;
     const all = [];
     let chosen = 0, hovered = null, syncing = false, waiting = false;
     const steps = t.slice(1).map((v, k) => v - t[k]).sort((a, b) => a - b);
-    const shared = { runs, line, spans: page.spans, marks: page.marks, half: (steps[steps.length >> 1] || 1) / 2, width: Math.max(host.clientWidth - 14, 240), choose: hooks.choose };
+    const shared = { runs, line, spans: page.spans, marks: page.marks, half: (steps[steps.length >> 1] || 1) / 2, width: widthIn(host, host.clientWidth), choose: hooks.choose };
+    shared.used = page.runs.map((run, k) => usedScans(line, run, k));
     shared.hover = (u) => {
       const inside = u.cursor.left >= 0 && u.cursor.idx !== null && u.cursor.idx !== undefined;
       hovered = inside ? u.cursor.idx : null;
@@ -306,7 +353,7 @@ const Charts = (() => {
       event.preventDefault();
     };
     if (page.states) all.push(strip(host, shared));
-    for (const spec of page.charts) all.push(lineChart(host, spec, shared));
+    for (const spec of page.charts) all.push(lineChart(spec.first || !more ? host : more, spec, shared));
     if (t.length === 1 && all.length) reset();
 
     function readouts() {
@@ -331,8 +378,8 @@ const Charts = (() => {
       all[0].u.setScale("x", { min: t[0] - half, max: t[t.length - 1] + half });
     }
     function choose(k) { chosen = k; pins(); readouts(); }
-    function resize(wide = host.clientWidth) {
-      const width = Math.max(wide - 14, 240);
+    function resize(wide = host.clientWidth, columns = 0) {
+      const width = widthIn(host, wide, columns);
       for (const c of all) if (c.u.width !== width) c.u.setSize({ width, height: c.u.height });
       requestAnimationFrame(pins);
     }

@@ -14,10 +14,11 @@
   paintTheme(wish.matches);
 
   let zoom = null, ready = false, view = { choose() {}, resize() {} };
-  const charts = Charts.build(by("charts"), page, { hover: tell, choose, zoomed(range) { zoom = range; remember(); } });
+  const charts = Charts.build(by("charts"), by("others"), page, { hover: tell, choose, zoomed(range) { zoom = range; remember(); } });
   const t = charts.t, last = t.length - 1;
   if (page.scene) view = Scene.build(by("scene"), page.scene, t);
-  let chosen = 0, timer = null;
+  const first = page.chosen || 0;  // where the page begins: the end of the flight
+  let chosen = first, timer = null;
   slider.max = String(last);
 
   function words(k) {
@@ -34,13 +35,13 @@
   // The zoom and the chosen scan stand in the address, so that a view can be sent to someone else.
   function remember() {
     if (!ready) return;
-    const parts = [...(zoom ? ["t=" + zoom.map((v) => +v.toPrecision(8)).join(",")] : []), ...(chosen ? ["row=" + chosen] : [])];
+    const parts = [...(zoom ? ["t=" + zoom.map((v) => +v.toPrecision(8)).join(",")] : []), ...(chosen !== first ? ["row=" + chosen] : [])];
     history.replaceState(null, "", parts.length ? "#" + parts.join("&") : location.pathname + location.search);
   }
   function recall() {
-    const said = new URLSearchParams(location.hash.slice(1)), range = (said.get("t") || "").split(",").map(Number), row = Number(said.get("row"));
+    const said = new URLSearchParams(location.hash.slice(1)), range = (said.get("t") || "").split(",").map(Number), row = Number(said.get("row") ?? NaN);
     if (range.length === 2 && range.every(Number.isFinite)) charts.zoomTo(range[0], range[1]);
-    if (Number.isInteger(row) && row > 0 && row <= last) choose(row);
+    if (Number.isInteger(row) && row >= 0 && row <= last) choose(row);
   }
   function choose(k) {
     chosen = k;
@@ -66,9 +67,10 @@
     if (jump) { choose(Number(jump.dataset.scan)); by("charts").scrollIntoView(); slider.focus({ preventScroll: true }); }
   });
   new ResizeObserver(() => { charts.resize(); view.resize(); }).observe(by("charts"));
-  addEventListener("beforeprint", () => charts.resize(660));  // CSS pixels between the margins of A4 and of US letter
+  addEventListener("beforeprint", () => charts.resize(660, 1));  // CSS pixels between the margins of A4 and of US letter
   addEventListener("afterprint", () => charts.resize());
-  choose(0);
+  for (const folded of document.querySelectorAll("details")) folded.addEventListener("toggle", () => charts.resize());
+  choose(first);
   recall();
   ready = true;
   addEventListener("hashchange", recall);

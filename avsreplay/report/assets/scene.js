@@ -107,24 +107,27 @@ const Scene = (() => {
     const estimate = Packed.unpack(scene.estimate), truth = Packed.unpack(scene.truth), clouds = decode(scene);
     const mesh = model(vertices, faces), bounds = ball(vertices);
     const flight = scene.flight ? { axis: scene.flight.axis, near: scene.flight.near_m, cones: Packed.unpack(scene.flight.cones) } : null;
+    const usual = (scene.flown || []).length ? 1.7 : 1;  // the last metres of a flight are in view, too
+    const flown = (scene.flown || []).map((part) => ({ first: part.first, points: Packed.unpack(part.points) }));
     const paths = scene.paths.map((p) => ({ t: p.t_s, points: Packed.unpack(p.points) }));
     const buffer = (data) => { const b = gl.createBuffer(); gl.bindBuffer(gl.ARRAY_BUFFER, b); gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW); return b; };
     const fixed = { place: buffer(mesh.place), normal: buffer(mesh.normal), edges: buffer(mesh.edges), bare: buffer(vertices) };
     const scratch = gl.createBuffer(), scratchTint = gl.createBuffer();
-    let chosen = 0, yaw = 0.55, pitch = 0.35, zoom = 1, whole = false, bright = false, dirty = true;
+    let chosen = 0, yaw = 0.55, pitch = 0.35, zoom = usual, whole = false, bright = false, dirty = true;
 
     const note = document.createElement("span"), bar = document.createElement("div"), legend = document.createElement("ul");
     bar.className = "bar"; legend.className = "legend";
     const button = (text, act) => { const b = document.createElement("button"); b.type = "button"; b.textContent = text; b.addEventListener("click", act); bar.append(b); return b; };
     const all = flight ? ball([...vertices, ...paths[0].points]) : null, [less, more] = flight ? ["Whole flight", "Last metres"] : ["Target only", "Whole scene"];
-    const fit = button(more, () => { whole = !whole; zoom = 1; fit.textContent = whole ? less : more; draw(); });
-    button("Reset view", () => { yaw = 0.55; pitch = 0.35; zoom = 1; draw(); });
+    const fit = button(more, () => { whole = !whole; zoom = whole ? 1 : usual; fit.textContent = whole ? less : more; draw(); });
+    button("Reset view", () => { yaw = 0.55; pitch = 0.35; zoom = whole ? 1 : usual; draw(); });
     if (clouds.cap && clouds.intensity) { const by = button("Colour by intensity", () => { bright = !bright; by.textContent = bright ? "Colour by residual" : "Colour by intensity"; rescale(); draw(); }); }
     bar.append(note);
     const entry = (colour, text) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = colour; li.append(i, text); legend.append(li); };
     if (faces.length) entry("#56b4e9", flight ? "target" : "model at the estimate");
     if (truth.some(Number.isFinite)) entry("#2fc39a", faces.length ? "model at the true pose (edges)" : "true pose");
     if (paths.length) entry("#ff8f4a", "planned path");
+    if (flown.length) entry("#e58ad6", "gripper and its path so far, relative to the target");
     if (flight) { entry("#e58ad6", "gripper and its path so far"); if (flight.cones.length) entry("#2ec299", "approach cones"); } else entry("#8c99ad", "line of sight");
     const scale = document.createElement("li"); scale.className = "ramp";
     const rescale = () => { const [name, top] = bright ? ["intensity", clouds.brightest.toPrecision(3)] : ["residual", (clouds.cap * 1000).toPrecision(3) + " mm"]; scale.replaceChildren(name + " 0", document.createElement("b"), top); };
@@ -182,6 +185,11 @@ const Scene = (() => {
       if (flight) {
         const end = 3 * (chosen + 1);
         shape(gl.POINTS, 1, { buffer: scratch, data: path.points.slice(end - 3, end) }, IDENTITY, COLOUR.flown, 2, { tint: new Float32Array(COLOUR.flown.slice(0, 3)), bead: 11 * px });
+      }
+      for (const part of flown) if (part.first <= chosen) {  // fixed to the target: the frame in which it is at rest
+        const so_far = part.points.subarray(0, 3 * (chosen - part.first + 1)), end = so_far.length;
+        lines(so_far, pose, COLOUR.flown, gl.LINE_STRIP);
+        if (part === flown.filter((p) => p.first <= chosen).pop()) shape(gl.POINTS, 1, { buffer: scratch, data: so_far.slice(end - 3, end) }, pose, COLOUR.flown, 2, { tint: new Float32Array(COLOUR.flown.slice(0, 3)), bead: 11 * px });
       }
       if (found >= 0) { const c = cloudArrays(clouds, found, bright ? clouds.intensity : clouds.residual); shape(gl.POINTS, c.size, { buffer: scratch, data: c.place }, IDENTITY, COLOUR.sight, 2, { tint: c.tint, bead: 4 * px }); }
       if (faces.length) { gl.depthMask(false); shape(gl.TRIANGLES, mesh.place.length / 3, { buffer: fixed.place }, pose, COLOUR.estimate, 1, { normal: fixed.normal }); gl.depthMask(true); }

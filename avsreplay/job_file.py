@@ -49,15 +49,21 @@ class JobFile:
     config: Path | None = None
     golden: Path | None = None
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files and folders on which its result depends, without those of its settings."""
+        named = [self.given.get(key) for key in _PATHS]
+        return (self.log, *(p for p in (*named, self.config) if p and p != Path("auto")))
+
 
 def read_job(path: Path) -> JobFile | None:
     """Read a job file.
 
     Args:
-        path: the file.
+        path: the file, or a log.
 
     Returns:
-        Its content; None if the file names no log, and so is no job.
+        Its content; None if it is no TOML file or names no log, and so is no job.
 
     Raises:
         UnreadableInput: it cannot be read.
@@ -66,6 +72,8 @@ def read_job(path: Path) -> JobFile | None:
     from avsreplay.log import SourceOptions
     from avsreplay.toml_document import build, load
 
+    if path.suffix != ".toml" or not path.is_file():
+        return None
     document = load(path)
     if not isinstance(document.table.get("log"), str):
         return None

@@ -1,0 +1,146 @@
+"""A whole benchmark on one short scenario: results, continuation, comparison, plots."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from avsreplay.benchmark import results
+from avsreplay.benchmark.scores import MEASURES, difference, scores
+from avsreplay.benchmark.work import capture_of
+from avsreplay.errors import UnreadableInput, UsageError
+
+SHORT = ("benchmark", "--quick", "--only", "clean-fast,real-tosses", "--n-scans", 6)
+
+
+def of(key):
+    return next(each for each in MEASURES if each.key == key)
+
+
+def run(**values):
+    base = {"scenario": "a", "group": "clean", "repeat": 0, "entry": "x+own", "status": "ok"}
+    return {**base, "wrong": 0, "usable": 10, "used_usable": 10, **values}
+
+
+@pytest.fixture(scope="module")
+def made(cli, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("benchmark")
+    nothing = folder / "nothing"
+    asked = (*SHORT, "--workers", 0, "--data", nothing, "-o", folder / "out")
+    done = cli(*asked, "--backend", "horn", "--estimator", "own,ekf")
+    assert done.code == 0, done.err
+    return folder, done.out
+
+
+@pytest.mark.slow
+def test_one_table_shows_each_entry_and_the_scenario_without_data(made):
+    folder, text = made
+    found = results.read(folder / "out" / "benchmark.json")
+    assert "horn+own" in text
+    assert "horn+ekf" in text
+    assert "real-tosses" in text
+    assert "not available" in text
+    assert [r["scans"] for r in found["runs"] if r["status"] == "ok"] == [6, 6]
+    assert found["suite"]["name"] == "capture-1"
+    assert "ms_per_scan" not in json.dumps(found)
+    ElementTree.parse(folder / "out" / "plots" / "clean.svg")
+
+
+@pytest.mark.slow
+def test_the_same_command_makes_nothing_again_and_gives_the_same_bytes(made, cli):
+    folder, text = made
+    before = (folder / "out" / "benchmark.json").read_bytes()
+    journal = (folder / "out" / "journal.txt").read_bytes()
+    asked = (*SHORT, "--workers", 0, "--data", folder / "nothing", "-o", folder / "out")
+    done = cli(*asked, "--backend", "horn", "--estimator", "own,ekf")
+    assert done.out == text
+    assert (folder / "out" / "benchmark.json").read_bytes() == before
+    assert (folder / "out" / "journal.txt").read_bytes() == journal
+
+
+@pytest.mark.slow
+def test_compare_reads_two_results(made, cli):
+    folder, _ = made
+    path = folder / "out" / "benchmark.json"
+    done = cli("compare", path, path)
+    assert done.code == 0, done.err
+    assert "2 of 2 runs agree" in done.out
+    other = json.loads(path.read_text())
+    other["suite"]["seed"] = 1
+    (folder / "other.json").write_text(json.dumps(other))
+    assert cli("compare", path, folder / "other.json").code == 2
+
+
+def test_without_a_directory_the_command_says_what_to_add(cli):
+    done = cli("benchmark")
+    assert done.code == 2
+    assert "-o DIR" in done.err
+
+
+def test_the_list_describes_every_scenario_and_its_data(cli):
+    done = cli("benchmark", "--list")
+    assert done.code == 0
+    assert done.out.count(" (hard)") == 5
+    assert "Stanford 3D Scanning Repository" in " ".join(done.out.split())
+
+
+def test_a_wrong_pose_is_counted_by_run_and_in_total():
+    found = scores([run(wrong=0), run(wrong=7), run(wrong=0), run(wrong=1)])["wrong"]
+    assert (found.value, found.count, found.total) == (0.5, 4, 8)
+    assert 0.0 < found.low < 0.5 < found.high < 1.0
+
+
+def test_a_failed_run_uses_no_scan_and_has_no_error():
+    failed = {k: v for k, v in run().items() if k not in ("wrong", "usable", "used_usable")}
+    found = scores([run(), {**failed, "status": "failed"}])
+    assert found["failed"].total == 1
+    assert found["used"].count == 1
+
+
+def test_shares_are_those_of_the_usable_scans():
+    found = scores([run(used_usable=5), run(used_usable=10)])["used"]
+    assert found.value == 0.75
+    assert found.low <= 0.75 <= found.high
+
+
+def test_a_difference_is_called_better_only_with_evidence():
+    base = [run(attitude_deg=1.0 + 0.01 * k) for k in range(8)]
+    other = [run(attitude_deg=0.5 + 0.02 * k) for k in range(8)]
+    measure = of("attitude_deg")
+    assert difference("x", measure, base, other).word == "better"
+    assert difference("x", measure, other, base).word == "worse"
+    assert difference("x", measure, base, base).word == "same"
+    assert difference("x", measure, base[:1], other[:1]).word == "no evidence"
+    assert difference("x", of("brier"), base, other) is None
+
+
+def test_rows_with_different_names_are_compared_where_each_result_has_one():
+    base = results.document(SUITE, [], [run(captured=0.0)])
+    other = results.document(SUITE, [], [run(entry="mine+own", captured=1.0)])
+    found, (agreeing, count) = results.compared(base, other)
+    assert (agreeing, count) == (0, 1)
+    assert {each.entry for each in found} == {"x+own -> mine+own"}
+    two = results.document(SUITE, [], [run(entry="mine+own"), run(entry="other+own")])
+    with pytest.raises(UsageError, match="no entry"):
+        results.compared(base, two)
+
+
+SUITE = {"name": "s", "sha256": "0" * 64, "seed": 1, "repeats": 1, "n_scans": None}
+
+
+def test_two_runs_agree_within_one_percent_of_a_figure_and_exactly_in_counts():
+    assert results.agree(run(nees=1.0), run(nees=1.005))
+    assert not results.agree(run(nees=1.0), run(nees=1.02))
+    assert not results.agree(run(), run(wrong=1))
+    assert not results.agree(run(nees=1.0), run())
+
+
+def test_a_file_that_is_no_result_is_named(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text("{}")
+    with pytest.raises(UnreadableInput, match="avsreplay-benchmark"):
+        results.read(path)
+
+
+def test_where_the_motion_is_not_free_no_capture_is_judged():
+    assert set(capture_of(None).values()) == {None}
