@@ -13,7 +13,7 @@ from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.plugged import estimator_of
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
 from avsreplay.parts import OWN
@@ -136,40 +136,15 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
     return TargetGeometry(
         np.array(axis_c),
         hull_vertices(surface.vertices),
-        Body(
-            np.ascontiguousarray(surface.vertices, float),
-            np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
-        ),
+        _body(surface),
     )
 
 
-<<<<<<< HEAD
-def grasp_advice(task: Task, surface: Surface, axis_c: tuple[float, float, float]) -> str:
-=======
-def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]:
-    """Closest points (n, 3) and signed distances (n,) of points (n, 3) in {C}.
-
-    A point is inside where the winding number of the faces is above one half: also where closed
-    parts overlap and the nearest face is inside another part. An open sheet has no inside.
-    """
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-
-    @cache
-    def indexed() -> tuple[SurfaceIndex, Winding]:
-        return SurfaceIndex.build(surface, surface.extent), winding(
-            surface.vertices, np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3)
-        )
-
-    def closest(y: Array) -> tuple[Array, Array]:
-        index, turns = indexed()
-        found = index.closest(y)
-        distance = np.sqrt(found.d2)
-        within = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
-        inside = turns.inside(np.ascontiguousarray(y[within]), distance[within], INSIDE)
-        distance[within[inside]] *= -1.0
-        return found.foot, distance
-
-    return closest
+def _body(surface: Surface) -> Body:
+    return Body(
+        np.ascontiguousarray(surface.vertices, float),
+        np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
+    )
 
 
 def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
@@ -178,11 +153,10 @@ def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
     Args:
         surface: model of the target in {C}.
     """
-    return patches(surface, _signed_distance(surface))
+    return patches(surface, _body(surface))
 
 
 def grasp_advice(task: Task, surface: Surface) -> str:
->>>>>>> main
     """Return in words which grasp points could be used in place of one that cannot.
 
     Args:
