@@ -286,7 +286,7 @@ class PipelineState:
     failed: tuple[Array, ...] = ()
     followed: Followed | None = None
     following: Following = Following()
-    content: bytes = b""
+    content: str = ""
 
     @property
     def captured_ns(self) -> int | None:
@@ -601,14 +601,14 @@ def _effort(state: PipelineState, scan: Scan) -> Effort:
     return effort_for(shown(scan.points), state.failed)
 
 
-def _content(scan: Scan) -> bytes:
+def _content(scan: Scan) -> str:
     """Digest of the points or the pose of a scan, empty where it has none."""
     if scan.pose is not None:
         T_ac = scan.pose.T_ac
-        return T_ac.q.tobytes() + T_ac.t.tobytes()
+        return T_ac.q.tobytes().hex() + T_ac.t.tobytes().hex()
     if not len(scan.points):
-        return b""
-    return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).digest()
+        return ""
+    return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).hexdigest()
 
 
 def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:

@@ -305,7 +305,7 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
         One line with the file and its size.
 
     Raises:
-        UnreadableInput: The result cannot be read or holds no row.
+        UnreadableInput: The result cannot be read or has no rows.
     """
     from avsreplay.files import output_text
     from avsreplay.report.page import build_page

@@ -355,9 +355,10 @@ def _replayed(
     viewer = RerunStream(run, wanted.to_rerun) if wanted.to_rerun else None
     with keeper or nullcontext():
         begun = time.perf_counter()
-        rows = _resumed(run, keeper) if keeper and wanted.resume else []
-        kept = len(rows)
-        interrupted = _take_scans(run, rows, keeper, viewer, live_allowed=not wanted.as_json)
+        if keeper and wanted.resume:
+            _resume(run, keeper)
+        rows, kept = run.taken, run.done
+        interrupted = _take_scans(run, keeper, viewer, live_allowed=not wanted.as_json)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
@@ -367,7 +368,7 @@ def _replayed(
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
-            keeper.finish(rows, record, resumable=interrupted and not run.job.growing)
+            keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
     )
@@ -375,13 +376,12 @@ def _replayed(
 
 def _take_scans(
     run: Run,
-    rows: list[Row],
     keeper: ResultWriter | None,
     viewer: RerunStream | None,
     *,
     live_allowed: bool,
 ) -> bool:
-    """Replay the scans that follow ``rows`` and add theirs; return whether this was interrupted.
+    """Replay the scans that follow those taken; return whether this was interrupted.
 
     Raises:
         Outdated: the log has grown, and what was recorded later changes rows.
@@ -391,17 +391,17 @@ def _take_scans(
     takers = [taker for taker in (viewer, keeper) if taker]
     listeners: list[Listener] = [viewer] if viewer else []
     listeners += keeper.listeners if keeper else ()
-    if run.config.reference.value == "fit" and not rows:
+    if run.config.reference.value == "fit" and not run.done:
         run.fit_reference(tracked)
     growing = run.job.growing
     live = growing is not None and live_allowed
     found = run.rows(listeners, None if live else tracked)
-    interrupted = _collect(found, rows, growing, live=live)
+    interrupted = _collect(found, run.taken, growing, live=live)
     if growing and not interrupted and growing.outdated():
         raise Outdated
-    changed = run.rescore(rows) if growing else []
+    changed = run.rescore() if growing else []
     for taker in takers if changed else ():
-        taker.correct(rows, changed)
+        taker.correct(run.taken, changed)
     return interrupted
 
 
@@ -424,13 +424,12 @@ def _say_interrupted(run: Run, rows: Sequence[Row], *, resumable: bool) -> None:
     click.echo(f"avsreplay: {text}", err=True)
 
 
-def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
-    """The rows of the interrupted run, whose state the open run continues from."""
+def _resume(run: Run, keeper: ResultWriter) -> None:
+    """Let the open run continue from the state of the interrupted one."""
     from avsreplay.cli.main import versions
 
-    rows = keeper.resume({**run.facts(), "versions": versions()})
-    click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
-    return rows
+    keeper.resume({**run.facts(), "versions": versions()})
+    click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
@@ -467,9 +466,13 @@ def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _collect(
-    found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False
+    found: Generator[Row],
+    rows: Sequence[Row],
+    growing: GrowingLog | None = None,
+    *,
+    live: bool = False,
 ) -> bool:
-    """Take all rows; True if the user interrupted the replay after at least one row.
+    """Take all rows, which the run keeps; True if the user interrupted after one or more.
 
     An interrupt takes effect between two scans, so that all results hold the same scans; a second
     one at once. With ``live`` a line is printed for each row.
@@ -484,7 +487,6 @@ def _collect(
             for row in found:
                 if live:
                     say_live(row)
-                rows.append(row)
                 if stopped() and not growing:
                     return True
             return stopped()
@@ -500,11 +502,8 @@ def _changed(run: Run) -> list[str]:
     from avsreplay.report.compare import changed_settings
 
     given = load_config(run.job.config_file, {}, run.job.assignments)
-    stated = set(changed_settings(run.job.options, given))
-    all_of_run = changed_settings(run.job.options, run.config)
-    return [
-        text if text in stated else text.removesuffix(")") + "; by the log)" for text in all_of_run
-    ]
+    stated = changed_settings(run.job.options, given)
+    return changed_settings(run.job.options, run.config, stated=stated)
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
