@@ -283,6 +283,8 @@ class Registrar:
         ambiguous = best.status is AlignStatus.AMBIGUOUS  # which no longer search changes
         if (more and not budget.exhausted) or sure or ambiguous:
             return best
+        if best.status in ACCEPTED and (known := self._symmetry.equal(scan, best)).members:
+            return replace(known, equal=False)  # whatever a longer search would find
         return replace(
             best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND
         )
