@@ -283,8 +283,6 @@ class Registrar:
         ambiguous = best.status is AlignStatus.AMBIGUOUS  # which no longer search changes
         if (more and not budget.exhausted) or sure or ambiguous:
             return best
-        if best.status in ACCEPTED and (known := self._symmetry.equal(scan, best)).members:
-            return replace(known, equal=False)  # whatever a longer search would find
         return replace(
             best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_FOUND
         )
@@ -394,7 +392,10 @@ class Registrar:
         found = self._symmetry.rivalled(scan, found, rivals)
         if found.status is AlignStatus.AMBIGUOUS or covered or not self._visibility.sided:
             return found
-        return self._neighbourhood.of_one(scan, found, budget)
+        one = self._neighbourhood.of_one(scan, found, budget)
+        if one.status not in ACCEPTED and (said := self._symmetry.equal(scan, found)).members:
+            return replace(said, equal=False)
+        return one
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see
@@ -523,7 +524,8 @@ class Registrar:
         """The result of a search at that of its equal poses which is nearest to the guess."""
         if found.status not in ACCEPTED:
             return found
-        best = min(self.images(found.T_ac), key=lambda T_ac: _turn(T_ac, guess))
+        poses = (found.T_ac, *self._symmetry.equal(scan, found).members)
+        best = min(poses, key=lambda T_ac: _turn(T_ac, guess))
         if best is found.T_ac:
             return found
         few = self._restarter.part(scan)
