@@ -422,7 +422,16 @@ def _crop_advice(
     """The crop that keeps the target in all examined scans; None if hardly any point lies
     outside it.
     """
-    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
+    size_m = max(diameter(points, trimmed=False) for points in targets)
+    centres = np.array([points.mean(axis=0) for points in targets])
+    if len(targets) < len(clouds) and np.ptp(centres, axis=0).max() > size_m:
+        at = ", ".join(f"{v:.1f}" for v in centres[0])
+        text = (
+            f"{why} in {len(targets)} of {len(clouds)} examined scans, first at ({at}) m, and moves"
+            f" by {_metres(float(np.ptp(centres, axis=0).max()))}: no fixed crop keeps it"
+        )
+        return Advice("check", "background", text, "--region X,Y,Z")
+    margin = _MARGIN * size_m
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = (
         max(min(r.min() for r in ranges) - margin, 0.0),

@@ -502,11 +502,8 @@ def _changed(run: Run) -> list[str]:
     from avsreplay.report.compare import changed_settings
 
     given = load_config(run.job.config_file, {}, run.job.assignments)
-    stated = set(changed_settings(run.job.options, given))
-    all_of_run = changed_settings(run.job.options, run.config)
-    return [
-        text if text in stated else text.removesuffix(")") + "; by the log)" for text in all_of_run
-    ]
+    stated = changed_settings(run.job.options, given)
+    return changed_settings(run.job.options, run.config, stated=stated)
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
