@@ -43,6 +43,7 @@ from avsreplay.pipeline import planner_input
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.flights import (
     Ended,
+    Miss,
     Motion,
     closed_loop,
     closed_miss,
@@ -376,42 +377,44 @@ def _continued(
     flown = simulated(setup, log, state, belief)
     touched = _touched_by_draws(setup, log, belief.t_ns)
     before = np.zeros(len(flown), bool) if touched is None else np.resize(touched, len(flown))
-    tolerance, limits = setup.task.tolerance, setup.limits
     start_s = setup.at_s(belief.t_ns)
     ends = [start_s + each.at_s for each in flown]
-    good, why, sizes = [], Counter[str](), list[Array]()
-    for each, end_s, hit in zip(flown, ends, before, strict=True):
-        reason = ""
-        if each.miss is not None:
-            size = np.array([each.miss.distance_m, each.miss.speed_mps, each.miss.angle_deg])
-            sizes.append(size)
-            if not each.miss.inside(tolerance):
-                worst = int(np.nanargmax(size / limits))
-                reason = f"the {_QUANTITIES[worst]} when the gripper closes"
-        else:
-            reason = f"an end without capture ({_WHY.get(each.rule, each.rule)})"
-        reason = "contact with the body" if each.touched or hit else reason
-        reason = "the deadline" if not reason and end_s > setup.task.deadline_s else reason
-        good.append(not reason)
-        why[reason] += 1
-    found = _probability(np.array(good))
-    hits = float(np.mean([each.touched or hit for each, hit in zip(flown, before, strict=True)]))
+    hits = [each.touched or bool(hit) for each, hit in zip(flown, before, strict=True)]
+    why = [_why_not(setup, *each) for each in zip(flown, ends, hits, strict=True)]
+    found = _probability(np.array([not reason for reason in why]))
+    reasons = Counter(reason for reason in why if reason).most_common(1)
     cause = _predicted(setup, belief, _planned_s(setup, belief))[2]
-    reasons = [reason for reason, _ in why.most_common() if reason]
-    limit = reasons[0] if reasons else cause
+    limit = reasons[0][0] if reasons else cause
     closed = [end for end, each in zip(ends, flown, strict=True) if each.miss is not None]
-    miss = CaptureError(*np.quantile(sizes, 0.95, axis=0).tolist()) if sizes else None
-    more = {} if found["chance"] is Chance.LIKELY else {"known_s": start_s}
-    return {
+    sizes = [_sizes(each.miss) for each in flown if each.miss is not None]
+    done: dict[str, Any] = {
         **found,
-        **more,
         "basis": f"{len(flown)} simulated flights after the end of the log at {start_s:.1f} s",
         "at_s": float(np.median(closed)) if closed else None,
-        "miss": miss,
-        "contact": None if setup.contact is None else hits,
+        "miss": CaptureError(*np.quantile(sizes, 0.95, axis=0).tolist()) if sizes else None,
+        "contact": None if setup.contact is None else float(np.mean(hits)),
         "limit": limit,
-        "change": "" if found["chance"] is Chance.LIKELY else _change(limit if hits else cause),
     }
+    if found["chance"] is not Chance.LIKELY:
+        done |= {"known_s": start_s, "change": _change(limit if any(hits) else cause)}
+    return done
+
+
+def _sizes(miss: Miss) -> Array:
+    """Position error [m], speed [m/s] and angle [deg] (3,) when the gripper closes."""
+    return np.array([miss.distance_m, miss.speed_mps, miss.angle_deg])
+
+
+def _why_not(setup: Setup, flight: Ended, end_s: float, hit: bool) -> str:
+    """Why a simulated flight did not capture, "" where it did."""
+    if hit:
+        return "contact with the body"
+    if flight.miss is None:
+        return f"an end without capture ({_WHY.get(flight.rule, flight.rule)})"
+    if not flight.miss.inside(setup.task.tolerance):
+        worst = int(np.nanargmax(_sizes(flight.miss) / setup.limits))
+        return f"the {_QUANTITIES[worst]} when the gripper closes"
+    return "the deadline" if end_s > setup.task.deadline_s else ""
 
 
 def simulated(

@@ -13,13 +13,14 @@ import zipfile
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.read_budget import BadFile, ReadBudget, check_declared
+from avsreplay.spool import BLOCK_BYTES, Spool, SpoolFile
 
 _MAX_NPY_HEADER = 4096
 _NPY_HEADER = re.compile(
@@ -86,6 +87,27 @@ def parse_npy(data: bytes) -> NDArray[Any]:
     Raises:
         BadFile: the file is malformed, or is not an array of integers or floats.
     """
+    header = _npy_header(data)
+    check_declared(header.count, header.dtype.itemsize, len(data) - header.start, "numbers")
+    array = np.frombuffer(data, header.dtype, header.count, header.start)
+    return array.reshape(header.shape, order=header.order)
+
+
+@value_class
+class _NpyHeader:
+    """What the first bytes of a npy file state; ``start`` is the offset of the numbers."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    order: Literal["C", "F"]
+    start: int
+
+    @property
+    def count(self) -> int:
+        return math.prod(self.shape)
+
+
+def _npy_header(data: bytes) -> _NpyHeader:
     start = 12 if data[6:7] in (b"\x02", b"\x03") else 10
     size = int.from_bytes(data[8:start], "little")
     if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
@@ -94,10 +116,8 @@ def parse_npy(data: bytes) -> NDArray[Any]:
     if header is None or not _NPY_TYPE.fullmatch(header["descr"]):
         raise BadFile("an npy file that is not an array of numbers")
     shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
-    dtype, count = np.dtype(header["descr"]), math.prod(shape)
-    check_declared(count, dtype.itemsize, len(data) - start - size, "numbers")
-    array = np.frombuffer(data, dtype, count, start + size)
-    return array.reshape(shape, order="F" if header["fortran"] == "True" else "C")
+    order: Literal["C", "F"] = "F" if header["fortran"] == "True" else "C"
+    return _NpyHeader(np.dtype(header["descr"]), shape, order, start + size)
 
 
 def read_members(data: bytes, budget: ReadBudget) -> dict[str, bytes]:
@@ -132,47 +152,91 @@ def read_members(data: bytes, budget: ReadBudget) -> dict[str, bytes]:
 
 def read_npz(
     path: Path,
-    shapes: Mapping[str, tuple[str, tuple[int | None, ...]]],
+    shapes: Mapping[str, tuple[str, tuple[int, ...]]],
     *,
     limit: int,
     hint: str,
     optional: Collection[str] = (),
-) -> dict[str, NDArray[Any]]:
-    """Read a numpy archive of declared content.
+) -> dict[str, Spool]:
+    """Read a numpy archive of declared content, block by block.
 
     Args:
         path: the file.
-        shapes: for each array the kind of its numbers ("f" or "i") and its shape; None is any
-            length.
+        shapes: for each array the type of its numbers and the shape of each of its records; an
+            array of the same kind of numbers ("f" or "i") is converted.
         limit: largest size of the file [bytes].
         hint: what to do about an unusable file.
         optional: arrays that a file may lack.
 
     Returns:
-        The arrays by name, as float64 or int64.
+        The arrays by name.
 
     Raises:
         UnreadableInput: the file is missing, damaged, too large, or an array has another type or
             shape.
     """
-    data = read_limited(path, limit, hint)
+    size, file = _regular_size(path, limit, hint), SpoolFile()
     try:
-        members = read_members(data, ReadBudget(len(data)))
-        wanted = [name for name in shapes if name not in optional or f"{name}.npy" in members]
-        return {name: _declared(members, name, *shapes[name]) for name in wanted}
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+            found = {info.filename: info for info in archive.infolist()}
+            budget = ReadBudget(size)
+            budget.take_records(len(archive.infolist()), "arrays")
+            budget.take_bytes(sum(info.file_size for info in archive.infolist()), "arrays")
+            wanted = [name for name in shapes if name not in optional or f"{name}.npy" in found]
+            out: dict[str, Spool] = {}
+            for name in wanted:
+                if f"{name}.npy" not in found:
+                    raise BadFile(f"the array '{name}' is missing")
+                info, dtype, shape = found[f"{name}.npy"], *shapes[name]
+                with archive.open(info) as member:
+                    out[name] = Spool(dtype, shape, file)
+                    _read_array(member, info.file_size, name, out[name])
+            return out
     except BadFile as error:
         raise UnreadableInput(str(error), where=str(path), hint=hint) from None
+    except _ZIP_ERRORS as error:
+        what = f"not a valid npz file: {str(error)[:80]}"
+        raise UnreadableInput(what, where=str(path), hint=hint) from None
 
 
-def _declared(
-    members: Mapping[str, bytes], name: str, kind: str, shape: tuple[int | None, ...]
-) -> NDArray[Any]:
-    if f"{name}.npy" not in members:
-        raise BadFile(f"the array '{name}' is missing")
-    array = parse_npy(members[f"{name}.npy"])
-    fits = array.ndim == len(shape) and all(
-        n in (None, m) for n, m in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind != kind or not fits:
-        raise BadFile(f"the array '{name}' has the type {array.dtype} and the shape {array.shape}")
-    return array.astype(np.int64 if kind == "i" else np.float64)
+def _regular_size(path: Path, limit: int, hint: str) -> int:
+    """The size of a regular file."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
+    except OSError as error:
+        what = error.strerror or "cannot be read"
+        raise UnreadableInput(what, where=str(path), hint=hint) from None
+    if not stat.S_ISREG(found.st_mode):
+        raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
+    if found.st_size > limit:
+        raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
+    return found.st_size
+
+
+def _read_array(member: IO[bytes], size: int, name: str, out: Spool) -> None:
+    """Append the records of a member of an archive, which declares a size [bytes]."""
+    head = member.read(_MAX_NPY_HEADER + 12)
+    header = _npy_header(head)
+    same_kind = header.dtype.kind == out.dtype.kind
+    ordered = header.order == "C" or len(header.shape) == 1
+    if not (same_kind and ordered and header.shape[1:] == out.shape and header.shape):
+        raise BadFile(
+            f"the array '{name}' has the type {header.dtype} and the shape {header.shape}"
+        )
+    check_declared(header.count, header.dtype.itemsize, size - header.start, "numbers")
+    each = header.dtype.itemsize * math.prod(out.shape)
+    left, data = header.count * header.dtype.itemsize, head[header.start :]
+    while left:
+        whole = min(len(data) // each * each, left)
+        numbers = np.frombuffer(data[:whole], header.dtype).reshape(-1, *out.shape)
+        out.extend(numbers.astype(out.dtype))
+        left, data = left - whole, data[whole:]
+        if left:
+            more = member.read(BLOCK_BYTES)
+            if not more:
+                raise BadFile(f"the array '{name}' is shorter than it declares")
+            data += more
+    while member.read(BLOCK_BYTES):  # the checksum is compared at the end
+        pass

@@ -35,7 +35,7 @@ from avsreplay.binary_files import parse_npy, read_limited, read_members
 from avsreplay.errors import UnreadableInput
 from avsreplay.read_budget import BadFile, ReadBudget
 
-VERSION = 1  # of the format of the document; a file of another version is not read
+VERSION = 2  # of the format of the document; a file of another version is not read
 TRANSIENT = {"transient": True}
 """Metadata of a field that is not stored: the continued run begins with its default."""
 

@@ -116,11 +116,30 @@ def compare_sizes(
         other = groups and _unit_advice({unit: [], **groups}, clouds, surface, options, said)
         return other or [_agreeing(said, ratio)]
     whole = _units(ratio, unit)
-    left = ratio < _LEFT_OVER or not whole  # background, not a wrong unit, explains the size
-    if ratio > MOST_OF_MODEL and left and (found := _located(clouds, surface, registrar)):
+    left = ratio > MOST_OF_MODEL and (ratio < _LEFT_OVER or not whole)  # not a wrong unit
+    if left and (found := _located(clouds, surface, registrar)):
         why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
         among = Advice("ok", "size", f"{said}; {why}, among other points")
         return [_crop_advice(clouds, found, why) or among]
+    return (
+        _background_advice(clouds, model_m, ratio, said)
+        or _unit_advice(
+            {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)},
+            clouds,
+            surface,
+            options,
+            said,
+        )
+        or [_unexplained(said, ratio)]
+    )
+
+
+def _background_advice(
+    clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, said: str
+) -> list[Advice]:
+    """What the size of the scans, ``ratio`` times that of the model, says of points around the
+    target; empty where another unit explains it.
+    """
     targets = (
         [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds]
         if ratio > MOST_OF_MODEL
@@ -144,8 +163,7 @@ def compare_sizes(
             " --crop-range removes them"
         )
         return [Advice("check", "background", text)]
-    units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
-    return _unit_advice(units, clouds, surface, options, said) or [_unexplained(said, ratio)]
+    return []
 
 
 def _unexplained(said: str, ratio: float) -> Advice:
@@ -404,7 +422,16 @@ def _crop_advice(
     """The crop that keeps the target in all examined scans; None if hardly any point lies
     outside it.
     """
-    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
+    size_m = max(diameter(points, trimmed=False) for points in targets)
+    centres = np.array([points.mean(axis=0) for points in targets])
+    if len(targets) < len(clouds) and np.ptp(centres, axis=0).max() > size_m:
+        at = ", ".join(f"{v:.1f}" for v in centres[0])
+        text = (
+            f"{why} in {len(targets)} of {len(clouds)} examined scans, first at ({at}) m, and moves"
+            f" by {_metres(float(np.ptp(centres, axis=0).max()))}: no fixed crop keeps it"
+        )
+        return Advice("check", "background", text, "--region X,Y,Z")
+    margin = _MARGIN * size_m
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = (
         max(min(r.min() for r in ranges) - margin, 0.0),

@@ -8,6 +8,7 @@ fit. Nothing here has access to ground truth.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -272,6 +273,7 @@ class PipelineState:
         followed: the target, where a region follows it.
         start_ns: instant of the first scan.
         following: the target whatever moves it.
+        content: digest of the points or the pose of the last scan that had any.
     """
 
     monitors: MonitorState
@@ -283,6 +285,7 @@ class PipelineState:
     failed: tuple[Array, ...] = ()
     followed: Followed | None = None
     following: Following = Following()
+    content: str = ""
 
     @property
     def captured_ns(self) -> int | None:
@@ -301,19 +304,21 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     Returns:
         The state after the scan and the outcome of the scan.
     """
+    content = _content(scan)
+    repeated = bool(content) and content == state.content
     scan, followed = _in_region(stages, state, scan)
     state, track, acquired = _track(stages, state, scan)
     errors, predicted = track.errors, stages.estimator.predict(track, scan.t_ns)
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+    prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
     if acquired is None and not verdict.gamma and lost:
         measurement = _acquire(
             stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired"
         )
-        prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+        prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     track, verdict = stages.estimator.step(
         track, prior, innovation, verdict, state.monitors.convergence.converged
     )
@@ -373,6 +378,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
             failed,
             followed,
             following,
+            content or state.content,
         ),
         outcome,
     )
@@ -559,6 +565,16 @@ def _effort(state: PipelineState, scan: Scan) -> Effort:
     return effort_for(shown(scan.points), state.failed)
 
 
+def _content(scan: Scan) -> str:
+    """Digest of the points or the pose of a scan, empty where it has none."""
+    if scan.pose is not None:
+        T_ac = scan.pose.T_ac
+        return T_ac.q.tobytes().hex() + T_ac.t.tobytes().hex()
+    if not len(scan.points):
+        return ""
+    return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).hexdigest()
+
+
 def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:
     """What the scans without an accepted pose showed whose searches found none, with this scan."""
     seen = shown(scan.points)
@@ -578,7 +594,11 @@ def _measurement(
 
 
 def _judge(
-    stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
+    stages: Stages,
+    scan: Scan,
+    predicted: Prediction,
+    measurement: Measurement,
+    repeated: bool,
 ) -> tuple[Prediction, Innovation | None, Verdict]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured)
     and the verdict.
@@ -591,7 +611,7 @@ def _judge(
     return (
         predicted,
         innovation,
-        stages.faults.judge(scan.status, alignment, innovation, predicted.belief),
+        stages.faults.judge(scan.status, alignment, innovation, predicted.belief, repeated),
     )
 
 

@@ -78,6 +78,7 @@ class Reason(Enum):
 
     OK = "ok"
     NO_SCAN = "no_scan"  # empty or damaged scan
+    FROZEN = "frozen"  # the sensor repeats the scan before although the target moves
     NOT_ALIGNED = "not_aligned"  # no overlap, failed, ambiguous
     NOT_CONVERGED = "not_converged"
     FEW_INLIERS = "few_inliers"

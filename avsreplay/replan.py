@@ -43,6 +43,7 @@ from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
 from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
+from avsreplay.tables import column_of
 from avsreplay.task import target_at, task_of
 
 FLIGHT_INSTANTS = 401  # instants of the flight on its page
@@ -272,11 +273,13 @@ class Replanning:
         """
         out: list[tuple[float, Plan, Miss | None]] = []
         due_s = 0.0
-        for k, row in enumerate(self.saved.rows):
-            if row.converged and row.t_s >= due_s - 1e-6:
+        rows = self.saved.rows
+        known = zip(column_of(rows, "t_s"), column_of(rows, "converged"), strict=True)
+        for k, (t_s, converged) in enumerate(known):
+            if converged and t_s >= due_s - 1e-6:
                 made = self.plan_at(k)
-                out.append((row.t_s, made, self.miss_at(k, made)))
-                due_s = row.t_s + period_s
+                out.append((t_s, made, self.miss_at(k, made)))
+                due_s = t_s + period_s
         return out
 
     def flights(self, index: int, count: int, seed: int) -> list[Ended]:
@@ -289,8 +292,7 @@ class Replanning:
             seed: of draws and errors.
         """
         log = FlightLog()
-        log.stamps = [row.t_ns for row in self.saved.rows]
-        log.gammas = [row.gamma for row in self.saved.rows]
+        log.stamps, log.gammas = (column_of(self.saved.rows, name) for name in ("t_ns", "gamma"))
         return simulated(self._setup(count, seed), log, None, self.belief(index))
 
     def assess(self, index: int, flights: int = FLIGHTS, seed: int = 0) -> Assessment:
@@ -326,14 +328,16 @@ class Replanning:
 
     def _inputs(self) -> Iterator[PlannerInput]:
         """What was known after each scan of the result."""
-        for k, row in enumerate(self.saved.rows):
+        rows = self.saved.rows
+        known = zip(column_of(rows, "gamma"), column_of(rows, "converged"), strict=True)
+        for k, (gamma, converged) in enumerate(known):
             belief = self.belief(k)
             yield planner_input(
                 self.saved.estimator,
                 belief,
                 self._target,
-                row.gamma,
-                row.converged,
+                gamma,
+                converged,
                 self._forecast(belief),
             )
 
@@ -347,8 +351,11 @@ class Replanning:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
         if self.truth is None:
             return None
-        beliefs = {row.t_ns: self.belief(k) for k, row in enumerate(self.saved.rows)}
-        turned = lambda known, after_s: self.attitude(beliefs[known.t_ns], after_s)  # noqa: E731
+        places = {t_ns: k for k, t_ns in enumerate(column_of(self.saved.rows, "t_ns"))}
+
+        def turned(known: PlannerInput, after_s: float) -> Array:
+            return self.attitude(self.belief(places[known.t_ns]), after_s)
+
         return plan_execute(
             self._guidance(), self._inputs(), self.truth, turned, self.saved.since_ns
         )

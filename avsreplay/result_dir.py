@@ -9,13 +9,14 @@ An interrupted run also leaves its checkpoint, ``resume.npz``.
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -23,15 +24,25 @@ from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.files import check_output, output_folder
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array
 from avsreplay.records import Belief, State, Surface
 from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.result import load_result, write_manifest
-from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_surface, write_view
+from avsreplay.report.view import (
+    CloudTable,
+    CloudView,
+    PathView,
+    View,
+    thin_cloud,
+    thin_surface,
+    write_view,
+)
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.settings import dump
+from avsreplay.spool import Spool, SpoolFile, write_npz
+from avsreplay.tables import PoseTable, column_of
 from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
 CHECKPOINT = "resume.npz"  # checkpoint of an interrupted run
@@ -59,14 +70,14 @@ _DRIVEN = (
     "P_u",
     "cross",
 )  # arrays of beliefs.npz about beliefs with a constant acceleration
-_SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
-    "t_ns": ("i", (None,)),
-    "x": ("f", (None, len(MEAN_COLUMNS))),
-    "P": ("f", (None, 20, 20)),
-    "driven": ("i", (None,)),
-    "u": ("f", (None, 6)),
-    "P_u": ("f", (None, 6, 6)),
-    "cross": ("f", (None, 20, 6)),
+_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "t_ns": ("i8", ()),
+    "x": ("f8", (len(MEAN_COLUMNS),)),
+    "P": ("f8", (20, 20)),
+    "driven": ("i8", ()),
+    "u": ("f8", (6,)),
+    "P_u": ("f8", (6, 6)),
+    "cross": ("f8", (20, 6)),
 }
 
 
@@ -79,7 +90,87 @@ def mean_vector(x: State) -> Array:
     return x.flat
 
 
-def read_beliefs(path: Path) -> list[Belief]:
+class BeliefTable(Sequence[Belief]):
+    """Beliefs, of which only the last ones are in memory."""
+
+    def __init__(self, arrays: Mapping[str, Spool] | None = None) -> None:
+        """Start without beliefs.
+
+        Args:
+            arrays: those of ``beliefs.npz`` in place of empty ones.
+        """
+        file = SpoolFile()
+        self._parts = {name: Spool(*kind, file) for name, kind in _SHAPES.items()}
+        self._parts |= arrays or {}
+
+    def __len__(self) -> int:
+        return len(self._parts["t_ns"])
+
+    @overload
+    def __getitem__(self, place: int) -> Belief: ...
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[Belief]: ...
+    def __getitem__(self, place: int | slice) -> Belief | Sequence[Belief]:
+        """Return a belief, or a list of some."""
+        if isinstance(place, slice):
+            return [self[k] for k in range(*place.indices(len(self)))]
+        t_ns, x, P = (self._parts[name][place] for name in ("t_ns", "x", "P"))
+        ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
+        plain = Belief(int(t_ns), State(*(x[a:b] for a, b in pairwise(ends))), P)
+        driven, at = self._parts["driven"], range(len(self))[place]
+        k = bisect_left(range(len(driven)), at, key=lambda each: int(driven[each]))
+        if k == len(driven) or driven[k] != at:
+            return plain
+        return DrivenBelief(
+            plain.t_ns, plain.x, plain.P, *(self._parts[name][k] for name in _DRIVEN[1:])
+        )
+
+    def append(self, belief: Belief) -> None:
+        """Append a belief.
+
+        Args:
+            belief: the belief.
+        """
+        if isinstance(belief, DrivenBelief):
+            self._parts["driven"].append(len(self))
+            for name in _DRIVEN[1:]:
+                self._parts[name].append(getattr(belief, name))
+        self._parts["t_ns"].append(belief.t_ns)
+        self._parts["x"].append(mean_vector(belief.x))
+        self._parts["P"].append(belief.P)
+
+    def check(self) -> None:
+        """Raise ValueError where the arrays are not those of beliefs."""
+        parts = self._parts
+        if len({len(parts[name]) for name in ("t_ns", "x", "P")}) > 1:
+            raise ValueError("its arrays differ in length")
+        if len({len(parts[name]) for name in _DRIVEN}) > 1:
+            raise ValueError("its arrays differ in length")
+        before = -1
+        for block in parts["driven"].blocks():
+            for at in block.tolist():
+                if not before < at < len(self):
+                    raise ValueError(f"it has no belief {at}, to which an acceleration belongs")
+                before = at
+        for k, belief in enumerate(self):
+            if defect := _defect(belief):
+                raise ValueError(f"the belief after scan {k} {defect}")
+
+    def write(self, path: Path) -> None:
+        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20), and of those with a constant
+        acceleration more.
+
+        For k scans with one: driven (k,) their numbers, u (k, 6), P_u (k, 6, 6) and cross (k, 20,
+        6), see :class:`~avsreplay.estimate.driven.DrivenBelief`.
+
+        Args:
+            path: the file.
+        """
+        names = ("t_ns", "x", "P", *(_DRIVEN if len(self._parts["driven"]) else ()))
+        write_npz(path, {name: self._parts[name] for name in names})
+
+
+def read_beliefs(path: Path) -> BeliefTable:
     """Read ``beliefs.npz`` of a result directory.
 
     Args:
@@ -89,28 +180,13 @@ def read_beliefs(path: Path) -> list[Belief]:
         UnreadableInput: the file is missing or not as a run writes it.
     """
     hint = "name a directory written by run -o"
-    data = read_npz(path, _SHAPES, limit=_MOST_BELIEF_BYTES, hint=hint, optional=_DRIVEN)
-    ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
+    arrays = read_npz(path, _SHAPES, limit=_MOST_BELIEF_BYTES, hint=hint, optional=_DRIVEN)
+    found = BeliefTable(arrays)
     try:
-        beliefs = [
-            Belief(int(t), State(*(x[a:b] for a, b in pairwise(ends))), P)
-            for t, x, P in zip(data["t_ns"], data["x"], data["P"], strict=True)
-        ]
-        for k, u, P_u, cross in zip(*(data.get(name, ()) for name in _DRIVEN), strict=True):
-            if not 0 <= k < len(beliefs):
-                raise UnreadableInput(
-                    f"it has no belief {k}, to which an acceleration belongs",
-                    where=str(path),
-                    hint=hint,
-                )
-            plain = beliefs[k]
-            beliefs[k] = DrivenBelief(plain.t_ns, plain.x, plain.P, u, P_u, cross)
-    except ValueError:
-        raise UnreadableInput("its arrays differ in length", where=str(path), hint=hint) from None
-    for k, belief in enumerate(beliefs):
-        if defect := _defect(belief):
-            raise UnreadableInput(f"the belief after scan {k} {defect}", where=str(path), hint=hint)
-    return beliefs
+        found.check()
+    except ValueError as error:
+        raise UnreadableInput(str(error), where=str(path), hint=hint) from None
+    return found
 
 
 def _defect(belief: Belief) -> str:
@@ -137,48 +213,35 @@ def _defect(belief: Belief) -> str:
 class Beliefs:
     """A listener that keeps the belief after each scan, and the true poses."""
 
-    def __init__(self) -> None:
-        self.t_ns: list[int] = []
-        self.x: list[Array] = []
-        self.P: list[Array] = []
-        self.driven: list[tuple[int, Array, Array, Array]] = []
-        self.truth: list[tuple[int, Pose]] = []
+    def __init__(self, beliefs: BeliefTable | None = None) -> None:
+        """Start without scans.
+
+        Args:
+            beliefs: those of the scans before; None: there are none.
+        """
+        self.table, self.truth = beliefs or BeliefTable(), PoseTable()
 
     def __call__(self, scan: ReplayedScan) -> None:
         """Take one scan of a run."""
-        belief = scan.outcome.belief
-        self.t_ns.append(belief.t_ns)
-        self.x.append(mean_vector(belief.x))
-        self.P.append(belief.P)
-        if isinstance(belief, DrivenBelief):
-            self.driven.append((len(self.P) - 1, belief.u, belief.P_u, belief.cross))
+        self.table.append(scan.outcome.belief)
         if scan.truth.pose is not None:
-            self.truth.append((scan.row.t_ns, scan.truth.pose))
-
-    def write(self, path: Path) -> None:
-        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20), and of those with a constant
-        acceleration more.
-
-        For k scans with one: driven (k,) their numbers, u (k, 6), P_u (k, 6, 6) and cross (k, 20,
-        6), see :class:`~avsreplay.estimate.driven.DrivenBelief`.
-        """
-        arrays: dict[str, Any] = {
-            "t_ns": np.array(self.t_ns, np.int64),
-            "x": np.array(self.x),
-            "P": np.array(self.P),
-        }
-        for name, values in zip(_DRIVEN, zip(*self.driven, strict=True), strict=False):
-            arrays[name] = np.array(values)
-        np.savez(path, **arrays)
+            self.truth.append(scan.row.t_ns, scan.truth.pose)
 
 
 class ViewWriter:
     """Keeps a thinned model, thinned clouds and planned paths for the report page."""
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: Surface, before: View | None = None) -> None:
+        """Start without scans.
+
+        Args:
+            surface: model of the target.
+            before: what the scans before gave; None: there are none.
+        """
         self._surface = surface
-        self._clouds: list[CloudView] = []
-        self._plans: list[PathView] = []
+        clouds = () if before is None else before.clouds
+        self._clouds = clouds if isinstance(clouds, CloudTable) else CloudTable(clouds)
+        self._plans: list[PathView] = [] if before is None else list(before.paths)
 
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
         """Take one scan: the points that are shown; times and positions of a new flight, if any."""
@@ -190,13 +253,13 @@ class ViewWriter:
 
     def correct(self, rows: Sequence[Row]) -> None:
         """Take the errors of the plans from corrected rows."""
-        misses = {row.t_ns: row.plan_miss_m for row in rows}
+        misses = dict(zip(column_of(rows, "t_ns"), column_of(rows, "plan_miss_m"), strict=True))
         self._plans = [replace(plan, miss_m=misses[plan.t_ns]) for plan in self._plans]
 
     def view(self) -> View:
         """Return everything kept so far."""
         vertices, faces = thin_surface(self._surface)
-        return View(vertices, faces, tuple(self._clouds), tuple(self._plans))
+        return View(vertices, faces, self._clouds, tuple(self._plans))
 
 
 class ResultDirectory:
@@ -255,9 +318,9 @@ class ResultDirectory:
         write_rows(self._part / "rows.jsonl", rows)
         write_tum(self._part / "estimate.tum", row_poses(rows, "estimate"))
         write_tum(self._part / "registration.tum", row_poses(rows, "registration"))
-        if beliefs.truth:
+        if len(beliefs.truth):
             write_tum(self._part / "truth.tum", beliefs.truth)
-        beliefs.write(self._part / "beliefs.npz")
+        beliefs.table.write(self._part / "beliefs.npz")
 
     def file(self, name: str) -> Path:
         """Return where a further file of the result is to be written, inside the ``with`` block."""
@@ -309,8 +372,8 @@ class ResultWriter:
         self._view.take(scan, *shown)
         self._log.take(scan, *shown)
 
-    def resume(self, facts: Mapping[str, Any]) -> list[Row]:
-        """Continue the interrupted run whose result the directory holds; return its rows.
+    def resume(self, facts: Mapping[str, Any]) -> None:
+        """Continue the interrupted run whose result the directory holds, with its files.
 
         Args:
             facts: what ``run.json`` must state: the same log, model, settings and versions.
@@ -323,7 +386,8 @@ class ResultWriter:
         if not (folder / CHECKPOINT).is_file():
             hint = "leave out --resume; only a run that was interrupted can be resumed"
             raise UsageError("no interrupted run", where=f"--resume {folder}", hint=hint)
-        record = load_result(folder).header
+        found = load_result(folder)
+        record = found.header
         different = [
             name
             for name, value in facts.items()
@@ -333,10 +397,16 @@ class ResultWriter:
             hint = "give the same options as at first, or start anew with --overwrite"
             what = f"the interrupted run differs in: {', '.join(different)}"
             raise UsageError(what, where=f"--resume {folder}", hint=hint)
-        more: Any = ([], self._beliefs, self._view, self._paths)
-        rows, self._beliefs, self._view, self._paths = self._run.restore(folder / CHECKPOINT, more)
-        self._log.take_over(folder / "result.mcap", rows)
-        return list(rows)
+        stamps, poses = PoseTable().arrays()
+        more: Any = (stamps, poses, self._paths)
+        stamps, poses, self._paths = self._run.restore(folder / CHECKPOINT, found.rows, more)
+        self._beliefs = Beliefs(read_beliefs(folder / "beliefs.npz"))
+        self._beliefs.truth.extend(stamps, poses)
+        self._view = ViewWriter(self._run.surface, found.view)
+        if not len(found.rows) == len(self._beliefs.table) == self._run.done:
+            hint = "start the run anew with --overwrite"
+            raise UnreadableInput("its files hold other scans", where=str(folder), hint=hint)
+        self._log.take_over(folder / "result.mcap", found.rows)
 
     def correct(self, rows: Sequence[Row], changed: Sequence[int]) -> None:
         """Replace rows whose scans were taken before the true poses after them were recorded.
@@ -354,22 +424,19 @@ class ResultWriter:
         first.unlink()
         self._view.correct(rows)
 
-    def finish(
-        self, rows: Sequence[Row], record: Mapping[str, Any], *, resumable: bool = False
-    ) -> None:
+    def finish(self, record: Mapping[str, Any], *, resumable: bool = False) -> None:
         """Write what needs the whole run.
 
         Args:
-            rows: one per scan.
             record: content of ``run.json``.
             resumable: the run was interrupted: write the checkpoint, too, from which ``resume``
                 continues.
         """
         self._log.close()
-        self._directory.write(rows, self._beliefs)
+        self._directory.write(self._run.taken, self._beliefs)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
         if resumable:
-            more = (list(rows), self._beliefs, self._view, self._paths)
+            more = (*self._beliefs.truth.arrays(), self._paths)
             self._directory.file(CHECKPOINT).write_bytes(self._run.checkpoint(more))
-        write_manifest(self._directory.file("run.json").parent, record, len(rows))
+        write_manifest(self._directory.file("run.json").parent, record, self._run.done)

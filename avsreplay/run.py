@@ -36,9 +36,10 @@ from avsreplay.register.backend import POSES
 from avsreplay.register.interrupt import shielded
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.registrar import Registrar
-from avsreplay.report.summary import Summary, SummaryFold
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
+from avsreplay.tables import RowTable
 from avsreplay.toml_document import own_settings
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ class Run:
         registrar: registers scans against that model.
         model_check: check of the model by the rows so far.
         done: number of scans processed so far.
+        taken: their rows.
         task: what is to be grasped, compared with the model.
         flight: the flight of guidance so far, for the assessment of the capture.
         acceleration: fitted to the poses, None where it is given.
@@ -151,7 +153,8 @@ class Run:
             self.source.close()
             raise
         labelled = bool(header.labels) or header.seed is not None
-        self._fold = SummaryFold(labels=header.labels if labelled else None, truth=header.truth)
+        self._labels = header.labels if labelled else None
+        self.taken = RowTable()
         self._reference: Reference | None = None
         self._fixes: list[PoseFix] = []  # poses of the reference motion
         self._reference_instants: list[int] = []
@@ -240,7 +243,6 @@ class Run:
             with shielded():
                 self.model_check.add(outcome.scan, outcome.alignment)
             row = Row.of(outcome, self._scored.score(state, outcome, truth))
-            self._fold.add(row)
             if truth.state is not None:
                 self._end = outcome.belief, truth.state
             scan = ReplayedScan(outcome, state, truth, row)
@@ -253,19 +255,15 @@ class Run:
                 outcome.monitors.converged,
                 None if outcome.innovation is None else outcome.innovation.R,
             )
+            self.taken.append(row)
             self._state, self.done = state, self.done + 1
             yield row
 
-    def rescore(self, rows: list[Row]) -> list[int]:
-        """Score the plans of a log that grew with all its true poses; return the indices of the
-        rows that changed.
-
-        Args:
-            rows: of all scans; those whose score changes are replaced.
+    def rescore(self) -> list[int]:
+        """Score the plans of a log that grew with all its true poses; replace the rows that change
+        and return their indices.
         """
-        changed = [] if self._scored is None else self._scored.rescore(rows, self._true_poses())
-        self._fold = self._fold.anew(rows)
-        return changed
+        return [] if self._scored is None else self._scored.rescore(self.taken, self._true_poses())
 
     def checkpoint(self, more: Any) -> bytes:
         """Return the state after the last row, from which ``restore`` continues with the same bits.
@@ -274,17 +272,18 @@ class Run:
             more: further state to store with it, such as what listeners have collected.
         """
         own = (
-            *(self._state, self.done, self._fold, self.model_check, self._end, self._scored),
+            *(self._state, self.done, self.model_check, self._end, self._scored),
             self.flight,
         )
         motion = None if self._scored is None else self._scored.motion
         return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
-    def restore(self, path: Path, more: Any = None) -> Any:
+    def restore(self, path: Path, rows: RowTable, more: Any = None) -> Any:
         """Continue from a checkpoint; returns what was stored with it.
 
         Args:
             path: file with the bytes of ``checkpoint``.
+            rows: of the scans processed before.
             more: what is stored with it must have the structure of this.
 
         Raises:
@@ -292,10 +291,11 @@ class Run:
         """
         scored = self._scorer()
         motion, scored.motion = scored.motion, None  # it is named and not stored
-        judged = self._fold, self.model_check, None, scored, self.flight
+        judged = self.model_check, None, scored, self.flight
         like: Any = (self._state, 0, *judged, [], [], more)
         found = unpack(path, self._named(None), like)
-        self._state, self.done, self._fold, self.model_check, self._end, *rest = found
+        self._state, self.done, self.model_check, self._end, *rest = found
+        self.taken = rows
         self._scored, self.flight, *rest = rest
         self._fixes, self._reference_instants, stored = rest
         if self._fixes:
@@ -341,8 +341,9 @@ class Run:
         }
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         text = acceleration_text(self.config.estimator, self.acceleration)
-        found = self._fold.result(self.truth)
-        return replace(found, counts=counts, acceleration=text, assessment=self.assessment)
+        truth = self.truth or self.header.truth
+        found = Summary.fold(self.taken, labels=self._labels, truth=truth, counts=counts)
+        return replace(found, acceleration=text, assessment=self.assessment)
 
     @property
     def assessment(self) -> Assessment:

@@ -26,6 +26,7 @@ from avsreplay.report.result import load_result, motion_samples, result_path
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
+from avsreplay.tables import column_of
 from avsreplay.task import TaskParams
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class Saved:
             UsageError: the time is outside the result, or the estimate never converged.
         """
         if at_s is None:
-            converged = [k for k, row in enumerate(self.rows) if row.converged]
+            converged = [k for k, flag in enumerate(column_of(self.rows, "converged")) if flag]
             if not converged:
                 raise UsageError(
                     "the estimate never converged",
@@ -112,7 +113,7 @@ class Saved:
                     hint="plan all the same with --at T",
                 )
             return converged[0]
-        before = [k for k, row in enumerate(self.rows) if row.t_s <= at_s + 1e-9]
+        before = [k for k, t_s in enumerate(column_of(self.rows, "t_s")) if t_s <= at_s + 1e-9]
         if not before or at_s > self.rows[-1].t_s + 1e-9:
             last = self.rows[-1].t_s
             raise UsageError(

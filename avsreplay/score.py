@@ -23,7 +23,7 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.flights import Motion, interpolated, miss
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Truth
-from avsreplay.rows import Row
+from avsreplay.tables import RowTable
 
 
 class Scorer:
@@ -74,7 +74,7 @@ class Scorer:
         """
         return (t_ns - self._epoch_ns) * 1e-9
 
-    def rescore(self, rows: list[Row], poses: Sequence[tuple[int, Pose]]) -> list[int]:
+    def rescore(self, rows: RowTable, poses: Sequence[tuple[int, Pose]]) -> list[int]:
         """Compare the flights of a log that grew with all its true poses.
 
         Args:

@@ -29,6 +29,8 @@ Closest = Callable[[Array], tuple[Array, Array]]
 
 PATCHES = 3  # grasp points that are proposed
 _LINE_POINTS = 801  # points of the straight approach at which the distance to the body is taken
+_PAST = 1.2  # length of a corridor over the distance at which the clearance begins
+_LEAST_CORRIDOR = 0.06  # shorter ones are not needed, over the target's extent
 _WIDEST = 0.04  # largest half opening that is assumed for a gripper, over the target's extent
 _FLAT_COS = math.cos(math.radians(8.0))  # faces of a patch have normals within this angle
 _FLAT_OFFSET = 0.003  # and lie within this distance of its plane, over the target's extent
@@ -259,35 +261,21 @@ def task_of(
     """
     grasp, axis = params.grasp_m or (0.0, 0.0, 0.0), params.axis or axis_c
     if params.patch is not None:
-        found = {patch.name: patch for patch in patches(surface, closest)}
-        if params.patch not in found:
-            known = ", ".join(found) or "none"
-            raise SettingError("patch", f"patch is '{params.patch}', the model has: {known}")
-        grasp, axis = found[params.patch].point, found[params.patch].axis
+        patch = _named_patch(params.patch, surface, closest)
+        grasp, axis = patch.point, patch.axis
     extent = surface.extent if extent_m is None else extent_m
     watched = params.with_tolerance(supervisor).resolved(extent)
     tolerance = Tolerance(
         given(watched.capture_pos_m), given(watched.capture_speed_mps), watched.capture_angle_deg
     )
     radius = params.with_gripper(robot).radius_m
-    names = ("grasp point", params.patch or params.grasp_m), ("axis", params.patch or params.axis)
-    sizes = ("position", "speed", "angle", "opening", "radius")
-    units = ("position_m", "speed_mps", "angle_deg", "opening_m", "radius_m")
-    assumed = [name for name, value in names if value is None]
-    assumed += [
-        size
-        for size, name in zip(sizes, units, strict=True)
-        if getattr(params, name) is None
-        and not (name == "position_m" and supervisor.capture_pos_m is not None)
-        and not (name == "radius_m" and robot.radius_m > 0.0)
-    ]
     point, out = frozen(np.array(grasp, float), 3), np.array(axis, float)
     out = frozen(out / np.linalg.norm(out), 3)
     clearance = radius if limits is None else (limits.clearance_m or 0.0) + radius
     half, mouth, begin, problem = _access(
         point, out, surface, closest, params.opening_m, tolerance.position_m, clearance, extent
     )
-    least = 0.06 * extent
+    corridor = _PAST * begin
     return Task(
         point,
         out,
@@ -296,10 +284,34 @@ def task_of(
         radius,
         mouth,
         math.inf if params.deadline_s is None else params.deadline_s,
-        1.2 * begin if 1.2 * begin > least else 0.0,
-        tuple(assumed),
+        corridor if corridor > _LEAST_CORRIDOR * extent else 0.0,
+        _assumed(params, supervisor, robot),
         problem,
     )
+
+
+def _named_patch(name: str, surface: Surface, closest: Closest) -> Patch:
+    found = {patch.name: patch for patch in patches(surface, closest)}
+    if name not in found:
+        known = ", ".join(found) or "none"
+        raise SettingError("patch", f"patch is '{name}', the model has: {known}")
+    return found[name]
+
+
+def _assumed(
+    params: TaskParams, supervisor: SupervisorParams, robot: RobotParams
+) -> tuple[str, ...]:
+    """Names of the values that neither the task nor the settings of the robot give."""
+    values = {
+        "grasp point": params.patch or params.grasp_m,
+        "axis": params.patch or params.axis,
+        "position": params.position_m or supervisor.capture_pos_m,
+        "speed": params.speed_mps,
+        "angle": params.angle_deg,
+        "opening": params.opening_m,
+        "radius": robot.radius_m or None if params.radius_m is None else params.radius_m,
+    }
+    return tuple(name for name, value in values.items() if value is None)
 
 
 def _access(

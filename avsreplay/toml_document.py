@@ -30,6 +30,7 @@ _SIMILAR = 0.7  # similarity from which a known key is suggested in place of an 
 _LONGEST = 200  # characters of an unknown key that are compared with the known ones
 _BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
 # Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
+_LARGEST_INTEGER = 1 << 1023  # that is taken for a float
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
@@ -215,6 +216,12 @@ def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T
     return typing.cast(T, _Builder(cls, document, tuple(path)).table(cls, table, tuple(path)))
 
 
+def _is_of(value: Any, hint: Any) -> bool:
+    """Whether a plain value has the declared type; a truth value is no number."""
+    same = isinstance(hint, type) and isinstance(value, hint)
+    return same and isinstance(value, bool) == (hint is bool)
+
+
 class _Builder:
     """Builds one object; uses the document for line numbers and all keys for suggestions."""
 
@@ -232,6 +239,20 @@ class _Builder:
         own = {f.name: self.parts(f, table, path) for f in of_parts}
         taken = {name for tables in own.values() for name, _ in tables.given}
         table = {key: value for key, value in table.items() if key not in taken}
+        self._check_keys(table, known, path)
+        values = {key: self.value(hints[key], value, (*path, key)) for key, value in table.items()}
+        try:
+            return cls(**values, **own)
+        except SettingError as error:
+            prefix = f"{_dotted(path)}." if path else ""
+            raise self.error((*path, error.name), f"{prefix}{error}", "correct the value") from None
+        except ValueError as error:
+            raise self.error(path, str(error), "correct the value") from None
+
+    def _check_keys(
+        self, table: Mapping[str, Any], known: Mapping[str, dataclasses.Field[Any]], path: _Path
+    ) -> None:
+        """Raise UsageError for a key that is unknown or missing."""
         unknown = next((key for key in table if key not in known), None)
         if unknown is not None:
             hint = self.nearest(path, unknown, table[unknown], known)
@@ -242,14 +263,6 @@ class _Builder:
         missing = next((name for name in required if name not in table), None)
         if missing:
             raise self.error(path, f"missing key '{_dotted((*path, missing))}'", "add it")
-        values = {key: self.value(hints[key], value, (*path, key)) for key, value in table.items()}
-        try:
-            return cls(**values, **own)
-        except SettingError as error:
-            prefix = f"{_dotted(path)}." if path else ""
-            raise self.error((*path, error.name), f"{prefix}{error}", "correct the value") from None
-        except ValueError as error:
-            raise self.error(path, str(error), "correct the value") from None
 
     def parts(self, field: dataclasses.Field[Any], table: Mapping[str, Any], path: _Path) -> Tables:
         """The tables of a field that belong to installed parts."""
@@ -266,31 +279,19 @@ class _Builder:
         """A value of the type that a field declares."""
         origin, args = typing.get_origin(hint), typing.get_args(hint)
         if origin in (typing.Union, types.UnionType):
-            return (
-                None
-                if value is None
-                else self.value(next(a for a in args if a is not type(None)), value, path)
-            )
+            inner = next(each for each in args if each is not type(None))
+            return None if value is None else self.value(inner, value, path)
         if dataclasses.is_dataclass(hint):
             return self.table(hint, value, path)
         if origin is tuple and isinstance(value, (list, tuple)):
             return self._tuple(args, value, path)
         if isinstance(hint, type) and issubclass(hint, enum.Enum):
             return self._member(hint, value, path)
-        if (
-            hint is float
-            and isinstance(value, int)
-            and not isinstance(value, bool)
-            and abs(value) <= 1 << 1023
-        ):
+        if hint is float and type(value) is int and abs(value) <= _LARGEST_INTEGER:
             return float(value)
         if hint is Path and isinstance(value, str):
             return Path(value)
-        if hint is Any or (
-            isinstance(hint, type)
-            and isinstance(value, hint)
-            and isinstance(value, bool) == (hint is bool)
-        ):
+        if hint is Any or _is_of(value, hint):
             return value
         shown = repr(value) if len(repr(value)) <= 60 else f"{repr(value)[:57]}..."
         raise self.error(

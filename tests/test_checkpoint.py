@@ -39,10 +39,13 @@ def replay(work, folder, count=None, resume=False):
     number of rows in it.
     """
     with Run(work) as run, ResultWriter(ResultDirectory(folder, overwrite=resume), run) as writer:
-        rows = writer.resume({"config": run.facts()["config"]}) if resume else []
-        rows += islice(run.rows(writer.listeners), count)
-        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, resumable=count is not None)
-    return len(rows)
+        if resume:
+            writer.resume({"config": run.facts()["config"]})
+        for _ in islice(run.rows(writer.listeners), count):
+            pass
+        record = {**run.facts(), "rows so far": len(run.taken)}
+        writer.finish(record, resumable=count is not None)
+    return len(run.taken)
 
 
 def files(folder):
@@ -89,7 +92,8 @@ def test_a_run_that_is_ended_within_a_scan_is_continued_with_the_same_bytes(
             rows.extend(found)
         request_stop(False)
         assert 5 <= len(rows) < 12
-        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, resumable=True)
+        assert run.taken == rows
+        writer.finish({**run.facts(), "rows so far": len(rows)}, resumable=True)
     assert replay(work, tmp_path / "r", resume=True) == 12
     assert files(tmp_path / "r") == files(tmp_path / "whole")
 
@@ -136,6 +140,7 @@ def test_ctrl_c_takes_effect_between_two_scans(make_rows):
             if k == 2:
                 signal.raise_signal(signal.SIGINT)
                 finished.append("the work of this scan")
+            kept.append(row)
             yield row
 
     kept = []
@@ -273,7 +278,7 @@ def test_a_document_that_no_run_writes_is_refused(tmp_path, node):
         unpack(stored(tmp_path / "c.npz", nodes=[node], root=[0]), {})
 
 
-@pytest.mark.parametrize("change", [{"version": 2}, {"more": 1}, {"root": [9]}, {"root": [-1]}])
+@pytest.mark.parametrize("change", [{"version": 0}, {"more": 1}, {"root": [9]}, {"root": [-1]}])
 def test_another_version_or_root_is_refused(tmp_path, change):
     with pytest.raises(UnreadableInput, match="the checkpoint cannot be read"):
         unpack(stored(tmp_path / "c.npz", **change), {})
@@ -289,7 +294,7 @@ def test_a_field_of_another_type_is_refused(tmp_path):
         unpack(path, {})
 
 
-@pytest.mark.parametrize("name", ["_taken", "_unmatched", "_captured_ns", "_clouds", "_known"])
+@pytest.mark.parametrize("name", ["_unmatched", "_captured_ns", "_known"])
 def test_a_checkpoint_with_another_attribute_is_one_line(fixtures_folder, tmp_path, name):
     """The bytes of one name are changed, and the SHA-256 of the file is made to fit."""
     work = job(fixtures_folder / "tumble.mcap", n_scans=4)

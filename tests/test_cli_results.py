@@ -110,7 +110,7 @@ def pairs() -> list[tuple[str, str, str]]:
     return found
 
 
-FOLDERS = {("run", "-o"), ("sweep", "-o")}
+FOLDERS = {("run", "-o"), ("sweep", "-o"), ("benchmark", "-o")}
 
 
 @pytest.mark.parametrize(("command", "output", "other"), pairs())

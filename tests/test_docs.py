@@ -56,6 +56,12 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay model $D/stanford-bunny": "test_reconstruct.py::test_scans_of_the_bunny_that",
     "avsreplay run milk": "test_real.py::test_a_carton_in_a_depth_scene",
     "avsreplay run $D/ros1-bags": "test_real.py::test_raw_packets_are_named",
+    "avsreplay benchmark --quick -o quick/": (
+        "test_benchmark_run.py::test_one_table_shows_each_entry_and_the_scenario_without_data"
+    ),
+    "pip install docs/examples/own_entry": (
+        "test_docs.py::test_the_entry_of_the_tutorial_has_60_lines_and_gets_rows_in_the_table"
+    ),
     "pip install docs/examples/own_backend": (
         "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract"
     ),
@@ -322,6 +328,29 @@ def _checks(tmp_path, example, command, name):
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_the_entry_of_the_tutorial_has_60_lines_and_gets_rows_in_the_table(tmp_path):
+    package = ROOT / "docs" / "examples" / "own_entry"
+    texts = [path.read_text(encoding="utf-8") for path in sorted(package.iterdir())]
+    assert sum(bool(line.strip()) for text in texts for line in text.splitlines()) <= 60
+    _checks(tmp_path, "own_entry", "backends", "mine")
+    words = "benchmark --quick -o out --backend mine,horn --estimator smooth,own --workers 0"
+    done = subprocess.run(
+        [sys.executable, "-m", "avsreplay", *words.split(), "--only=clean-fast", "--n-scans=12"],
+        env={**_environment(), "PYTHONPATH": str(tmp_path / "site")},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "out" / "benchmark.json").read_text(encoding="utf-8"))
+    used = {run["entry"]: run["used"] for run in found["runs"]}
+    assert set(used) == {"mine+smooth", "mine+own", "horn+smooth", "horn+own"}
+    assert min(used.values()) > 6
 
 
 def _command_lines(page):

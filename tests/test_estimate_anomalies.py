@@ -167,12 +167,12 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
     )  # 99.9 % of chi-square with 6 degrees of freedom
     at = result.t.index(45.5)
     assert found.detected_ns * 1e-9 <= 47.0  # the fourth scan after it
-    assert max(result.ratio[at + 10 :]) < 4.0
+    assert np.max(result.pose[at + 10 :]) < surprises.LIMIT
     doubtful = [k for k, reason in enumerate(result.reason) if reason == "doubtful"]
     assert not any(result.converged[k] for k in doubtful)
     assert not any(
-        claimed and ratio > 4.0
-        for claimed, ratio in zip(result.converged, result.ratio, strict=True)
+        claimed and ratio > surprises.LIMIT
+        for claimed, ratio in zip(result.converged, result.pose, strict=True)
     )
 
 
@@ -220,7 +220,7 @@ def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> Non
     assert result.track is not None
     assert len(result.track.manoeuvres) == 1
     assert result.violations == []
-    assert max(result.ratio[result.t.index(45.5) + 10 :]) < 4.0
+    assert np.max(result.pose[result.t.index(45.5) + 10 :]) < surprises.LIMIT
 
 
 @pytest.mark.slow
@@ -312,7 +312,7 @@ def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None
     later = [k for k, t in enumerate(result.t) if t >= 15.0]
     assert 0.65 < np.mean([result.gamma[k] for k in later]) < 0.9
     assert np.quantile([result.error[k][0] for k in later], 0.95) < 0.01
-    assert not any(result.converged[k] and result.ratio[k] > 4.0 for k in later)
+    assert not any(result.converged[k] and result.pose[k] > surprises.LIMIT for k in later)
 
 
 def test_three_poses_that_agree_replace_the_first_ones() -> None:
@@ -455,7 +455,8 @@ def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoe
         result.true_velocity, abs=4.0 * float(np.sqrt(found.P[3:, 3:].max()))
     )
     assert not any(
-        c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True)
+        c and ratio > surprises.LIMIT
+        for c, ratio in zip(result.converged, result.pose, strict=True)
     )
 
 
@@ -471,7 +472,7 @@ def test_a_small_bias_is_flagged_until_its_end(seed: int) -> None:
     assert not any(result.gamma[first:after])
     assert set(result.reason[first + 3 : after]) == {"sensor_bias"}
     assert all(result.gamma[after:])
-    assert max(result.ratio[first:]) < 4.0
+    assert np.max(result.pose[first:]) < surprises.LIMIT
 
 
 @pytest.mark.slow
@@ -488,7 +489,8 @@ def test_a_bias_below_the_gate_of_a_single_scan_is_found(seed: int) -> None:
     assert result.reason[after - 1] == "sensor_bias"
     assert all(result.gamma[after + 2 :])
     assert not any(
-        c and ratio > 4.0 for c, ratio in zip(result.converged, result.ratio, strict=True)
+        c and ratio > surprises.LIMIT
+        for c, ratio in zip(result.converged, result.pose, strict=True)
     )
     assert result.error[-1][0] < 0.005
 
@@ -687,7 +689,7 @@ def test_random_disturbances_are_no_manoeuvre(monkeypatch: pytest.MonkeyPatch) -
     result = surprises.run(case, 3)
     assert result.track is not None
     assert result.track.manoeuvres == ()
-    assert max(r for t, r in zip(result.t, result.ratio, strict=True) if t > 20.0) < 4.0
+    assert max(r for t, r in zip(result.t, result.pose, strict=True) if t > 20.0) < surprises.LIMIT
 
 
 @pytest.mark.parametrize(("density", "kind"), [(3e-3, 0), (3e-2, 3)])

@@ -127,5 +127,7 @@ def test_noise_that_rises_unannounced_is_no_manoeuvre(
     assert result.track.manoeuvres == ()
     assert result.track.reinitialised == 0
     assert sum(not g for g in result.gamma) <= 4
-    assert not any(c and q > 4.0 for c, q in zip(result.converged, result.ratio, strict=True))
+    assert not any(
+        c and q > surprises.LIMIT for c, q in zip(result.converged, result.pose, strict=True)
+    )
     assert result.violations == []

@@ -179,7 +179,7 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
     assert abs(size - 1e-4) < 4.0 * np.sqrt(np.trace(drift.P[:3, :3]))
     assert abs(drift.t_ns * 1e-9) < 4.0 * drift.t_1s_s
     assert result.track.manoeuvres == ()
-    assert max(result.ratio[80:]) < 4.0
+    assert max(result.pose[80:]) < surprises.LIMIT
     assert result.violations == []
     assert all(result.converged[-10:])
     truth = surprises.world_of(case, 0)[1][-1]
@@ -211,7 +211,9 @@ def test_a_torque_is_found_in_precise_poses_that_free_motion_cannot_explain(
     assert drift.detected_ns < 45e9
     assert abs(float(np.linalg.norm(drift.rate)) - 1e-4) < 3.0 * np.sqrt(np.trace(drift.P[:3, :3]))
     assert drift.t_ns * 1e-9 < 4.0 * drift.t_1s_s
-    assert not any(c and r > 4.0 for c, r in zip(result.converged, result.ratio, strict=True))
+    assert not any(
+        c and r > surprises.LIMIT for c, r in zip(result.converged, result.pose, strict=True)
+    )
 
 
 @pytest.mark.parametrize(

@@ -170,5 +170,5 @@ def test_a_step_at_a_high_scan_rate_is_found_with_its_instant(
     assert (
         6.0 * surprises.size_error(result, found) ** 2 < 22.5
     )  # 99.9 % of chi-square with 6 degrees of freedom
-    assert max(result.ratio[-60:]) < 4.0
+    assert max(result.pose[-60:]) < surprises.LIMIT
     assert result.reason.count("sensor_bias") < 10

@@ -162,11 +162,12 @@ def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay
             missed = [row.plan_miss_m for row in rows]
             if run.job.growing:
                 assert not run.job.growing.outdated()
-                changed = run.rescore(rows)
+                changed = run.rescore()
+                rows = list(run.taken)
                 assert [row.plan_miss_m for row in rows] != missed
                 writer.correct(rows, changed)
             summary = dataclasses.asdict(run.summary())
-            writer.finish(rows, {"summary": repr(summary)})
+            writer.finish({"summary": repr(summary)})
     files = {path.name: path.read_bytes() for path in folders["whole"].iterdir()}
     assert {path.name: path.read_bytes() for path in folders["grown"].iterdir()} == files
     assert any(row.capture_miss_m is not None for row in rows)

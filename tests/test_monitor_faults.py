@@ -81,6 +81,20 @@ def test_missing_and_empty_scans_are_faults() -> None:
     )
 
 
+def test_a_scan_that_repeats_the_one_before_is_frozen_unless_its_pose_is_the_predicted_one() -> (
+    None
+):
+    detector, moved = FaultDetector(FaultParams(), 8.0), seen(0.001)
+    assert moved.chi2 > 6.0
+    judged = [
+        detector.judge(ScanStatus.OK, GOOD, innovation, PRIOR, repeated)
+        for innovation, repeated in ((moved, True), (moved, False), (seen(), True))
+    ]
+    assert [v.reason for v in judged] == [Reason.FROZEN, Reason.OK, Reason.OK]
+    printed = FaultDetector(FaultParams(policy=Policy.ALL), 8.0)
+    assert printed.judge(ScanStatus.OK, GOOD, moved, PRIOR, True).gamma == 1
+
+
 def test_a_degenerate_view_is_not_a_fault() -> None:
     assert judge(replace(GOOD, status=AlignStatus.DEGENERATE, covariance=None)).gamma == 1
 

@@ -25,9 +25,10 @@ from avsreplay.log import open_source
 from avsreplay.log.canonical import Meaning
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
+from avsreplay.model_size import compare_sizes
 from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus, Surface
-from avsreplay.register.contract import view
+from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.sampling import diameter
 from avsreplay.task import TaskParams
 
@@ -600,3 +601,21 @@ def test_scans_in_millimetres_are_named_with_the_option_and_the_crop_in_metres(s
     assert max(abs(float(v)) for v in crop.split(",")) < 100.0
     both = preflight(Log(clouds), scaled(surface, 1000.0))
     assert _found(both, "unit").option == "--model-unit mm --scan-unit mm"
+
+
+@pytest.mark.parametrize("approaches", [True, False])
+def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
+    """The target stands on a floor; in the first scan it has too few points for a group."""
+    surface, pose = boxes(), example_pose()
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    seen = pose.apply(view(surface, 600, pose.inverse().t)) - pose.t
+    x, y = np.meshgrid(np.linspace(-6, 6, 40), np.linspace(-6, 6, 40))
+    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -2.0)], axis=1) * size
+    clouds = []
+    for k in range(5):
+        at = np.array([(30.0 - 6.0 * k if approaches else 6.0) * size, 0.0, 0.0])
+        clouds.append(np.concatenate([seen[:: 120 if k == 0 else 1] + at, floor + at]))
+    (advice,) = compare_sizes(clouds, surface, None, SourceOptions())
+    assert advice.about == "background"
+    wanted = ("--region",) if approaches else ("--crop-box", "--crop-range")
+    assert advice.option.split()[0] in wanted

@@ -21,6 +21,7 @@ from avsreplay.log import SourceOptions, open_source
 from avsreplay.log.cdr import pose_stamped
 from avsreplay.preflight import preflight
 from avsreplay.records import ScanStatus
+from avsreplay.report.summary_parts import events
 from avsreplay.run import Job, Run
 
 POS_M, ROT_RAD, HZ, SECONDS = 0.002, 0.003, 3.0, 20.0
@@ -107,6 +108,27 @@ def test_a_pose_file_runs_through_the_whole_chain(tmp_path, motion) -> None:
     assert summary.violations == 0
     assert summary.nis is not None
     assert summary.nis.inside > 0.8
+
+
+def test_a_tracker_that_repeats_its_pose_is_frozen_and_the_estimate_goes_on(
+    tmp_path, motion
+) -> None:
+    times, true, noisy = motion
+    stuck = [*noisy[:30], *[noisy[29]] * 8, *noisy[38:]]
+    truth, log = tum(tmp_path / "truth.tum", times, true), tum(tmp_path / "log.tum", times, stuck)
+    found, _ = rows(log, truth_file=truth, extent_m=2.0)
+    assert [k for k, row in enumerate(found) if row.reason == "frozen"] == list(range(30, 38))
+    assert all(row.gamma for row in found[38:])
+    assert found[38].pos_err_m < 0.02
+    assert found[38].manoeuvres == 0
+    (said,) = (text for text in events(found, (), None) if "repeated" in text)
+    assert "8 times, first at 10.0 s" in said
+
+
+def test_a_target_at_rest_in_a_log_without_noise_is_not_a_frozen_sensor(tmp_path, motion) -> None:
+    times, true, _ = motion
+    found, _ = rows(tum(tmp_path / "rest.tum", times[:20], true[:1] * 20), extent_m=2.0)
+    assert {row.reason for row in found} == {"ok"}
 
 
 def test_all_formats_give_the_same_rows(tmp_path, motion) -> None:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from avsreplay.cli.compare import compare_command
-from avsreplay.config import RunConfig
+from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import ClockChoice, Unit
@@ -204,6 +204,14 @@ def test_the_gate_names_the_first_broken_rule():
         CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s: 11 > 10.*later is useless"
     ):
         check_gate(_outcomes())
+
+
+def test_a_setting_of_the_log_is_not_called_the_users():
+    of_log = load_config(None, {"faults": {"policy": "all"}}, ["register.gate_m=0.2"])
+    stated = changed_settings(load_config(None, {}, ["register.gate_m=0.2"]))
+    by_user, by_log = sorted(changed_settings(of_log, stated=stated), reverse=True)
+    assert by_user in stated
+    assert by_log == 'faults.policy = "all" (default "any"; by the log)'
 
 
 def test_every_reading_option_that_is_given_is_stated():

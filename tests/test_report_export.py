@@ -35,9 +35,9 @@ from avsreplay.report.export import (
     write_parquet,
     write_tum,
 )
-from avsreplay.report.jsonl import dump_row, field_types, parse_row, read_rows, write_rows
+from avsreplay.report.jsonl import dump_row, parse_row, read_rows, write_rows
 from avsreplay.report.summary import Summary
-from avsreplay.rows import Row, columns
+from avsreplay.rows import Row, columns, field_types
 
 ROOT = Path(__file__).parent.parent
 

@@ -158,7 +158,7 @@ def test_a_bare_cloud_is_thinned_by_its_vertices():
 
 
 def test_no_rows_is_one_line(tmp_path):
-    with pytest.raises(UnreadableInput, match=r"holds no rows\.jsonl; name a directory"):
+    with pytest.raises(UnreadableInput, match=r"holds no rows\.jsonl; name the directory"):
         load_result(tmp_path)
 
 

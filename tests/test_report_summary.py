@@ -16,9 +16,10 @@ from scipy.stats import chi2
 from avsreplay.estimate.chart import AXIS_PERMUTATIONS, permute_axes
 from avsreplay.geometry import exp, matrix
 from avsreplay.records import Label, State
-from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary, SummaryFold
+from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.summary_parts import Statistics, events
 from avsreplay.report.summary_tables import fact_lines, in_one_line, manoeuvre_table
+from avsreplay.tables import RowTable
 
 STEP = 200_000_000
 
@@ -70,12 +71,9 @@ def test_without_truth_there_are_no_errors_and_no_zeros(make_rows):
     assert summary.nees is None
 
 
-def test_row_by_row_is_the_same_as_all_at_once(make_rows):
+def test_a_table_gives_the_summary_of_its_rows(make_rows):
     rows = make_rows(40)
-    fold = SummaryFold()
-    for row in rows:
-        fold.add(row)
-    assert fold.result() == Summary.fold(rows)
+    assert Summary.fold(RowTable(rows)) == Summary.fold(rows)
 
 
 def test_no_rows_make_a_summary():

@@ -78,7 +78,7 @@ def test_beliefs_with_a_constant_acceleration_read_back_as_written(result, tmp_p
             outcome=SimpleNamespace(belief=belief), truth=SimpleNamespace(pose=None)
         )
         written(scan)
-    written.write(tmp_path / "beliefs.npz")
+    written.table.write(tmp_path / "beliefs.npz")
     for found, belief in zip(read_beliefs(tmp_path / "beliefs.npz"), beliefs, strict=True):
         assert type(found) is type(belief)
         if isinstance(belief, DrivenBelief):

@@ -29,7 +29,8 @@ def _write(out, prefetch, n_scans=15):
     with Run(Job(source=LOG, options=SourceOptions(n_scans=n_scans), prefetch=prefetch)) as run:
         writer = ResultWriter(ResultDirectory(out), run)
         with writer:
-            writer.finish(list(run.rows(writer.listeners)), {})
+            assert len(list(run.rows(writer.listeners))) == n_scans
+            writer.finish({})
 
 
 def test_one_thread_and_three_write_the_same_bytes(tmp_path):

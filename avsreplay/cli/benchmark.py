@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import Command
 from avsreplay.cli.options import PATH
 from avsreplay.errors import DataLost, UsageError, counted
 from avsreplay.files import check_output
@@ -39,7 +40,7 @@ def _names(_ctx: click.Context, _param: click.Parameter, text: str) -> tuple[str
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-@click.command("benchmark", epilog=EPILOG)
+@click.command("benchmark", cls=Command, epilog=EPILOG)
 @click.option("--suite", "suite_name", default="capture-1", show_default=True, help="The suite.")
 @click.option("--list", "listed", is_flag=True, help="Print the scenarios and exit.")
 @click.option("--quick", is_flag=True, help="One motion of each scenario; 15 minutes on two cores.")

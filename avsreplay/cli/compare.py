@@ -134,16 +134,7 @@ def compare_command(
         click.echo("\n".join(_markdown(groups, conclusions, outcomes)))
     else:
         _print(groups, conclusions, outcomes, show_all=show_all)
-    if junit:
-        with output_text(junit) as stream:
-            stream.write(gates.junit(outcomes))
-    if output:
-        from avsreplay.report.page import build_comparison
-
-        with output_text(output) as stream:
-            stream.write(
-                build_comparison([group.runs[0] for group in groups], conclusions, outcomes)
-            )
+    _write(junit, output, groups, conclusions, outcomes)
     for line in gates.github_lines(outcomes) if github else ():
         click.echo(line, err=as_json or as_markdown)
     gates.check_gate(outcomes)
@@ -175,6 +166,25 @@ def _compare_benchmarks(paths: Sequence[Path], as_json: bool, as_markdown: bool)
             console = make_console()
             print_line(console, sentence)
             print_table(console, table, tight=True)
+
+
+def _write(
+    junit: Path | None,
+    page: Path | None,
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
+) -> None:
+    """Write the files that are wanted: the outcomes of the rules, and the page."""
+    if junit:
+        with output_text(junit) as stream:
+            stream.write(gates.junit(outcomes))
+    if page:
+        from avsreplay.report.page import build_comparison
+
+        first = [group.runs[0] for group in groups]
+        with output_text(page) as stream:
+            stream.write(build_comparison(first, conclusions, outcomes))
 
 
 def _check_sources(runs: Sequence[Result]) -> None:

@@ -241,10 +241,12 @@ def _changes(
 ) -> list[PossibleChange]:
     """Return single changes with which a plan is found: of settings, then of the instant."""
     from dataclasses import replace
+    from itertools import islice
 
     from avsreplay.cli.plan_output import PossibleChange
     from avsreplay.errors import UsageError
     from avsreplay.saved_result import with_settings
+    from avsreplay.tables import column_of
 
     options = {p.name: p.opts[0] for p in click.get_current_context().command.params}
     params, limits = _given(saved, flags)
@@ -270,9 +272,9 @@ def _changes(
                 break
     for later_s in LATER_S:
         at_s = saved.rows[index].t_s + later_s
-        for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][
-            :1
-        ]:
+        known = zip(column_of(saved.rows, "t_s"), column_of(saved.rows, "converged"), strict=True)
+        later_ones = (k for k, (t_s, flag) in enumerate(known) if t_s >= at_s and flag)
+        for later in islice(later_ones, 1):
             made = planning.plan_at(later)
             if made.found:
                 return [

@@ -288,8 +288,8 @@ def report_command(result: Path, output: Path | None, title: str | None, overwri
     slider, tables, and the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
-    check_suffix(page, *HTML)
     check_output(page, overwrite=overwrite, inputs=[result])
+    check_suffix(page, *HTML)
     click.echo(write_page(result, page, title), err=page == STDOUT)
 
 
@@ -305,7 +305,7 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
         One line with the file and its size.
 
     Raises:
-        UnreadableInput: The result cannot be read or holds no row.
+        UnreadableInput: The result cannot be read or has no rows.
     """
     from avsreplay.files import output_text
     from avsreplay.report.page import build_page

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from avsreplay.result_dir import ResultDirectory, ResultWriter
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
+    from avsreplay.viewers import RerunStream
 
 GRADES = ("pass", "check", "any")
 EPILOG = """\b
@@ -346,68 +347,89 @@ def _replayed(
 
     An interrupt ends the replay and keeps what there is.
     """
-    from avsreplay.cli.options import tracked
     from avsreplay.report.verdict import verdict_of
     from avsreplay.result_dir import ResultWriter
     from avsreplay.viewers import RerunStream
 
     keeper = ResultWriter(target, run) if target else None
     viewer = RerunStream(run, wanted.to_rerun) if wanted.to_rerun else None
-    listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
-        rows = _resumed(run, keeper) if keeper and wanted.resume else []
-        kept = len(rows)
-        listeners += keeper.listeners if keeper else ()
-        if run.config.reference.value == "fit" and not kept:
-            run.fit_reference(tracked)
-        growing = run.job.growing
-        live = growing is not None and not wanted.as_json
-        interrupted = _collect(
-            run.rows(listeners, None if live else tracked), rows, growing, live=live
-        )
-        if growing and not interrupted and growing.outdated():
-            raise Outdated
-        changed = run.rescore(rows) if growing else []
-        for taker in (viewer, keeper) if changed else ():
-            if taker:
-                taker.correct(rows, changed)
+        if keeper and wanted.resume:
+            _resume(run, keeper)
+        rows, kept = run.taken, run.done
+        interrupted = _take_scans(run, keeper, viewer, live_allowed=not wanted.as_json)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
         summary = run.summary()
-        record = _record(run, summary)
-        record["capture"] = None if summary.assessment is None else summary.assessment.record()
-        record["measured_1s"] = None if run.flight.noise is None else list(run.flight.noise)
-        record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
-        grade = (
-            "check" if summary.healthy else "fail"
-        )  # a wrong model explains why no scan was used
-        record["preflight"] += [
-            {"grade": grade, "text": note} for note in _model_notes(run, advice)
-        ]
-        record["preflight"] += [
-            {"grade": "check", "text": note} for note in _untimed_notes(run, rows)
-        ]
+        record = _record(run, summary) | {"preflight": _findings(run, advice, rows, summary)}
         if interrupted:
             record["interrupted_after"] = len(rows)
-            how = "; add --resume to continue" if target and not growing else ""
-            text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
-            click.echo(f"avsreplay: {text}", err=True)
+            _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
-            keeper.finish(rows, record, resumable=interrupted and not growing)
+            keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
     )
 
 
-def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
-    """The rows of the interrupted run, whose state the open run continues from."""
+def _take_scans(
+    run: Run,
+    keeper: ResultWriter | None,
+    viewer: RerunStream | None,
+    *,
+    live_allowed: bool,
+) -> bool:
+    """Replay the scans that follow those taken; return whether this was interrupted.
+
+    Raises:
+        Outdated: the log has grown, and what was recorded later changes rows.
+    """
+    from avsreplay.cli.options import tracked
+
+    takers = [taker for taker in (viewer, keeper) if taker]
+    listeners: list[Listener] = [viewer] if viewer else []
+    listeners += keeper.listeners if keeper else ()
+    if run.config.reference.value == "fit" and not run.done:
+        run.fit_reference(tracked)
+    growing = run.job.growing
+    live = growing is not None and live_allowed
+    found = run.rows(listeners, None if live else tracked)
+    interrupted = _collect(found, run.taken, growing, live=live)
+    if growing and not interrupted and growing.outdated():
+        raise Outdated
+    changed = run.rescore() if growing else []
+    for taker in takers if changed else ():
+        taker.correct(run.taken, changed)
+    return interrupted
+
+
+def _findings(
+    run: Run, advice: list[Advice], rows: Sequence[Row], summary: Summary
+) -> list[dict[str, str]]:
+    """What the checks before and after the replay found, with grades."""
+    of_model = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
+    graded = [
+        *((each.grade, each.sentence) for each in advice),
+        *((of_model, note) for note in _model_notes(run, advice)),
+        *(("check", note) for note in _untimed_notes(run, rows)),
+    ]
+    return [{"grade": grade, "text": text} for grade, text in graded]
+
+
+def _say_interrupted(run: Run, rows: Sequence[Row], *, resumable: bool) -> None:
+    how = "; add --resume to continue" if resumable and not run.job.growing else ""
+    text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
+    click.echo(f"avsreplay: {text}", err=True)
+
+
+def _resume(run: Run, keeper: ResultWriter) -> None:
+    """Let the open run continue from the state of the interrupted one."""
     from avsreplay.cli.main import versions
 
-    rows = keeper.resume({**run.facts(), "versions": versions()})
-    click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
-    return rows
+    keeper.resume({**run.facts(), "versions": versions()})
+    click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
@@ -444,9 +466,13 @@ def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _collect(
-    found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False
+    found: Generator[Row],
+    rows: Sequence[Row],
+    growing: GrowingLog | None = None,
+    *,
+    live: bool = False,
 ) -> bool:
-    """Take all rows; True if the user interrupted the replay after at least one row.
+    """Take all rows, which the run keeps; True if the user interrupted after one or more.
 
     An interrupt takes effect between two scans, so that all results hold the same scans; a second
     one at once. With ``live`` a line is printed for each row.
@@ -461,7 +487,6 @@ def _collect(
             for row in found:
                 if live:
                     say_live(row)
-                rows.append(row)
                 if stopped() and not growing:
                     return True
             return stopped()
@@ -477,11 +502,8 @@ def _changed(run: Run) -> list[str]:
     from avsreplay.report.compare import changed_settings
 
     given = load_config(run.job.config_file, {}, run.job.assignments)
-    stated = set(changed_settings(run.job.options, given))
-    all_of_run = changed_settings(run.job.options, run.config)
-    return [
-        text if text in stated else text.removesuffix(")") + "; by the log)" for text in all_of_run
-    ]
+    stated = changed_settings(run.job.options, given)
+    return changed_settings(run.job.options, run.config, stated=stated)
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
@@ -499,6 +521,8 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
         "changed_settings": _changed(run),
         "facts": facts,
         "versions": versions(),
+        "capture": None if summary.assessment is None else summary.assessment.record(),
+        "measured_1s": None if run.flight.noise is None else list(run.flight.noise),
     }
 
 

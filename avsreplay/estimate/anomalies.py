@@ -188,7 +188,7 @@ class AnomalyTest:
         """
         bias, found = compared(bias, lambda window, first: self._explained(track, window, first))
         window, best = found or ((), None)
-        if best is not None and scans_after(window, best) >= FEWEST_TO_FIT:
+        if best is not None and best.changes and scans_after(window, best) >= FEWEST_TO_FIT:
             reported = self._reported(track.changed(bias=None), window, best)
             return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
         return track.changed(bias=bias), Verdict(0, Reason.SENSOR_BIAS)
@@ -209,7 +209,10 @@ class AnomalyTest:
         best, explained = ranked[0], ranked[0].explains
         if doubtful < _MOST and not certain(ranked):
             return in_doubt
-        if best.hypothesis is Hypothesis.MANOEUVRE and explained:
+        manoeuvre = best.hypothesis is Hypothesis.MANOEUVRE and explained
+        if manoeuvre and not best.changes and doubtful < 2 * _MOST:
+            return in_doubt
+        if manoeuvre and best.changes:
             reported = self._reported(track, window, best)
             if scans_after(window, best) >= FEWEST_TO_FIT:
                 return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
@@ -217,13 +220,12 @@ class AnomalyTest:
                 return reported, Verdict(0, Reason.DOUBTFUL)
         if doubtful < _FEWEST:
             return in_doubt
-        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis in _USED and explained):
+        free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
+        if free or (best.hypothesis in _USED and explained):
             return self._used(self._allowing(track, best), track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
             return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
-        if best.hypothesis is not Hypothesis.FROZEN or not explained:
-            return self._by_agreement(track)
-        return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
+        return self._by_agreement(track)
 
     def _allowing(self, track: Track, found: Explanation) -> Track:
         """The track before the doubtful scans with the disturbances or the noise that explain

@@ -1,5 +1,4 @@
-"""Errors of single scans: scans that are wrong, a sensor that repeats an old scan, and poses with
-larger errors.
+"""Errors of single scans: scans that are wrong, and poses with larger errors.
 
 Their density is that of the doubtful innovations given the accepted ones, with more noise on each.
 A noise level that rises without a larger covariance from the registration or the tracker gives
@@ -22,10 +21,8 @@ from avsreplay.estimate.scan_window import (
     Explanation,
     Hypothesis,
     Window,
-    log_density,
     log_mean,
     offsets,
-    pose_difference,
 )
 from avsreplay.geometry import Array, frozen
 
@@ -90,22 +87,6 @@ def bad_scans(window: Window, white: Array, priors: ChangePriors, first: int) ->
     return Explanation(
         Hypothesis.BAD_SCANS, value + log_mean(odds.tolist()) + PRIOR_ODDS, left, len(white), first
     )
-
-
-def frozen_sensor(window: Window, first: int) -> Explanation:
-    """The doubtful scans repeat the last accepted one: their poses equal its pose.
-
-    Args:
-        window: the scans.
-        first: index of the first doubtful scan.
-    """
-    n, a = len(window.R), 6 * window.points.before(first)
-    value, chi2 = log_density(window.y[:a], window.C[:a, :a])
-    for k in range(first, n):
-        away = pose_difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
-        part, size = log_density(away, 2.0 * window.R[k])
-        value, chi2 = value + part, chi2 + size
-    return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, len(window.y), first)
 
 
 def _given_accepted(window: Window, white: Array, first: int) -> tuple[float, Array, Array]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.estimate import _motion
-from avsreplay.estimate.bad_scans import bad_scans, frozen_sensor, noisier
+from avsreplay.estimate.bad_scans import bad_scans, noisier
 from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, impulses
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -60,7 +60,6 @@ _FINE, _REFINEMENTS, _NO_WEIGHT = (
 # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
 _TAIL = 0.05
 _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
-_A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (
     0.7,
@@ -131,7 +130,6 @@ def explain(
         _sensor_bias(window, white, free, priors),
         bad_scans(window, white, priors, first_doubtful),
         noisier(window, white, first_doubtful),
-        frozen_sensor(window, first_doubtful),
     ]
     return tuple(epochs), sorted(found, key=lambda e: -e.log_evidence)
 
@@ -398,7 +396,7 @@ def _thrust_like(instants: Array, u: Array, P: Array, net: Explanation) -> bool:
     Changes that cancel displace the target further than that, or leave no change of the velocity:
     they imitate a wrong pose.
     """
-    if net.size @ np.linalg.solve(net.P, net.size) < _A_CHANGE:
+    if not net.changes:
         return False
     v, acts = u.reshape(-1, 6)[:, 3:], instants[-1] - instants
     change, moved = v.sum(axis=0), acts @ v

@@ -29,7 +29,7 @@ from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.scan_points import ScanPoints, scan_points
 from avsreplay.estimate.track import NO_CHANGE, Epoch
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.records import Belief
+from avsreplay.records import UNLIKELY, Belief
 
 EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(
@@ -59,7 +59,6 @@ class Hypothesis(Enum):
     DISTURBED = "disturbed"  # the velocity changes all the time
     ACCELERATED = "accelerated"  # a constant torque or force
     SENSOR_BIAS = "sensor_bias"
-    FROZEN = "frozen"  # the sensor repeats an old scan
     BAD_SCANS = "bad_scans"
     NOISIER = "noisier"  # the errors of the poses are larger than their covariance
 
@@ -123,6 +122,11 @@ class Explanation:
     size: Array = field(default_factory=lambda: _ZERO)
     P: Array = field(default_factory=lambda: _NO_COVARIANCE)
     changes_s: tuple[float, ...] = ()
+
+    @property
+    def changes(self) -> bool:
+        """Whether the change of the velocities, its instant unknown, is not one by chance."""
+        return float(self.size @ np.linalg.solve(self.P, self.size)) >= UNLIKELY[6]
 
     @property
     def explains(self) -> bool:
@@ -291,21 +295,6 @@ def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[Arr
     """
     value, mean, P = _motion.evidence(M if M.ndim == 3 else M[None], white, scale)
     return (free + value, mean, P) if M.ndim == 3 else (free + value[0], mean[0], P[0])
-
-
-def pose_difference(a: Pose, b: Pose, R_ba: Array) -> Array:
-    """(6,) difference of two poses: metres in {A} and half angle in {B}."""
-    turn = (a @ b.inverse()).q
-    half = turn[:3] if turn[3] >= 0.0 else -turn[:3]
-    return np.concatenate([a.t - b.t, R_ba @ half])
-
-
-def log_density(y: Array, C: Array) -> tuple[float, float]:
-    """Log density of N(0, C) at y without its constant, and the squared whitened norm."""
-    root = cholesky_root(C)
-    white = _motion.lower_divided(root, y)
-    chi2 = float(white @ white)
-    return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
 
 
 def mixed(

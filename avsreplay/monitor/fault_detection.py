@@ -27,6 +27,10 @@ from avsreplay.records import (
 )
 from avsreplay.settings import Settings, given, setting
 
+# chi-square (6) of an innovation below which a repeated scan is that of a target at rest in a log
+# without noise; an error of the pose as large as claimed is above it in 99 % of the scans
+_EXACT_CHI2 = 1.0
+
 
 class Policy(Enum):
     """How the fit test and the pose test are combined."""
@@ -121,6 +125,7 @@ class ScanEvidence:
         seen: its innovation; None where nothing was measured.
         prior: the prediction at the scan.
         limits: of the run, with all lengths filled in.
+        repeated: the scan has the points, or the pose, of the one before.
     """
 
     status: ScanStatus
@@ -128,6 +133,7 @@ class ScanEvidence:
     seen: Innovation | None
     prior: Belief
     limits: FaultParams
+    repeated: bool = False
 
     @property
     def poor_fit(self) -> bool:
@@ -167,6 +173,10 @@ def _no_scan(scan: ScanEvidence) -> bool:
     return lost or (scan.alignment is not None and scan.alignment.status is AlignStatus.NO_POINTS)
 
 
+def _frozen(scan: ScanEvidence) -> bool:
+    return scan.repeated and scan.seen is not None and scan.seen.chi2 > _EXACT_CHI2
+
+
 def _not_aligned(scan: ScanEvidence) -> bool:
     found = scan.alignment
     if found is None or not found.measured or found.status is AlignStatus.AMBIGUOUS:
@@ -203,6 +213,12 @@ def _jumps(scan: ScanEvidence) -> bool:
 
 RULES = (
     Rule(Reason.NO_SCAN, "the scan has no point, or its message is damaged", _no_scan),
+    Rule(
+        Reason.FROZEN,
+        "the scan repeats the one before, and its pose is not the predicted one",
+        _frozen,
+        (Policy.ANY,),
+    ),
     Rule(Reason.NOT_ALIGNED, "the registration failed or is ambiguous", _not_aligned),
     Rule(
         Reason.FIT_ERROR,
@@ -267,6 +283,7 @@ class FaultDetector:
         alignment: Alignment | None,
         innovation: Innovation | None,
         prior: Belief,
+        repeated: bool = False,
     ) -> Verdict:
         """Return gamma and the reason of the first rule that holds.
 
@@ -275,8 +292,9 @@ class FaultDetector:
             alignment: the graded pose; None without one.
             innovation: of it; None where nothing was measured.
             prior: the prediction at the scan.
+            repeated: the scan has the points, or the pose, of the one before.
         """
-        scan = ScanEvidence(scan_status, alignment, innovation, prior, self.params)
+        scan = ScanEvidence(scan_status, alignment, innovation, prior, self.params, repeated)
         fitted = alignment is None or alignment.status is not AlignStatus.MEASURED
         policy = self.params.policy if fitted else Policy.ANY
         for rule in RULES:

@@ -390,8 +390,7 @@ class ModelCheck:
 
     def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""
-        finite = np.isfinite(scan.points).all(axis=1)
-        points = without_scattered_points(np.asarray(scan.points[finite], dtype=np.float64))
+        points = without_scattered_points(np.asarray(scan.points, dtype=np.float64))
         if len(points) and self._fits_mirrored(points, scan.sensor):
             return f"the scans fit the mirror image of the model, {_MIRRORED}"
         own, seen = diameter(self._surface.vertices, trimmed=False), diameter(points)
@@ -444,9 +443,8 @@ def _duration_note(found: Duration) -> str:
 
 
 def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:
-    """Numbers of about ``count`` finite points (n, 3), in their order."""
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    return finite[:: max(1, len(finite) // count)]
+    """Numbers of about ``count`` points (n, 3), in their order."""
+    return np.arange(0, len(points), max(1, len(points) // count))
 
 
 def _place_of_size(

@@ -12,9 +12,9 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
-from avsreplay.report.charts import values
 from avsreplay.report.view import View
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 WIDTH, HEIGHT, BORDER = 440, 380, 26  # of one panel [px]
 FLOWN = frozenset(
@@ -35,11 +35,15 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[tuple[int, Array]]:
         rows: one per scan.
         view: its paths.
     """
-    t = np.array([row.t_ns for row in rows], np.int64)
+    t = np.array(column_of(rows, "t_ns"), np.int64)
     r, q = (
-        np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE)
+        np.stack([numbers(rows, name) for name in names], axis=1)
+        for names in (_POSITION, _ATTITUDE)
     )
-    y, flown = np.full((len(rows), 3), np.nan), np.array([row.action in FLOWN for row in rows])
+    y, flown = (
+        np.full((len(rows), 3), np.nan),
+        np.array([a in FLOWN for a in column_of(rows, "action")]),
+    )
     begins = [path.t_ns for path in view.paths[1:]]
     for path, next_ns in zip(view.paths, [*begins, np.iinfo(np.int64).max], strict=False):
         k = int(np.searchsorted(t, path.t_ns))

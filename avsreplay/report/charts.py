@@ -9,7 +9,6 @@ import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ from avsreplay.parts import FAULTS
 from avsreplay.records import State
 from avsreplay.report.episodes import Episode
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
-from avsreplay.report.summary_parts import add_rows
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
 
@@ -30,11 +29,6 @@ def pack(array: ArrayLike, kind: str) -> dict[str, str]:
     """Return ``{"type", "data"}`` of a flattened array; ``kind`` is f8, f4, i4, i2, u4 or u1."""
     flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
     return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
-
-
-def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
-    """A column as floats (n,), NaN where a row has no value."""
-    return np.array(list(map(attrgetter(name), rows)), dtype=np.float64)
 
 
 def embed(value: Any) -> str:
@@ -57,7 +51,15 @@ _WINDOW = 10
 WIDE = 20.0  # largest over typical value from which an axis is logarithmic
 KINDS = {  # colour and pattern of each place
     "flagged": (
-        *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
+        *(
+            "not_aligned",
+            "fit_error",
+            "no_scan",
+            "frozen",
+            "pose_jump",
+            "few_inliers",
+            "not_converged",
+        ),
         "halves_differ",
         *("doubtful", "sensor_bias", "clock"),
     ),
@@ -79,25 +81,23 @@ _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 def derived(rows: Sequence[Row]) -> Columns:
     """Every column that a chart draws, (n,) each; empty ones are left out."""
-    taken: dict[str, list[Any]] = {name: [] for name in _DIRECT}
-    add_rows(taken, rows)
-    out = {name: np.array(column, dtype=np.float64) for name, column in taken.items()}
+    out = {name: numbers(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (
         ("sigma1", "sigma1_1s"),
         ("sigma2", "sigma2_1s"),
         *((f"c{a}_m", "c_1s_m") for a in "xyz"),
     ):
-        _band(out, name, values(rows, sigma))
+        _band(out, name, numbers(rows, sigma))
     for axis in "xyz":
-        _band(out, f"mu_{axis}_deg", values(rows, "mu_1s_deg"))
+        _band(out, f"mu_{axis}_deg", numbers(rows, "mu_1s_deg"))
     out["capture_time_s_lo"], out["capture_time_s_hi"] = _spread(out["capture_time_s"])
     return {name: column for name, column in out.items() if np.isfinite(column).any()}
 
 
 def _attitude(rows: Sequence[Row]) -> NDArray[np.float64]:
     """Attitude mu as a rotation vector [deg], (3, n)."""
-    q = np.stack([values(rows, f"mu{a}") for a in "xyzw"], axis=-1)
+    q = np.stack([numbers(rows, f"mu{a}") for a in "xyzw"], axis=-1)
     known = np.isfinite(q).all(axis=-1)
     out = np.full((len(rows), 3), np.nan)
     out[known] = np.degrees(geometry.log(q[known]))
@@ -450,12 +450,13 @@ def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[st
 
     Of ``episodes`` only those without any scan are drawn, over their window.
     """
-    flagged = [None if row.gamma == 1 else row.reason for row in rows]
+    gammas, reasons = column_of(rows, "gamma"), column_of(rows, "reason")
+    flagged = [None if gamma == 1 else why for gamma, why in zip(gammas, reasons, strict=True)]
     bare = [_bare(e, rows) for e in episodes if not e.scans and rows]
-    actions = _runs(rows, [row.action or None for row in rows], "action")
+    actions = _runs(rows, [action or None for action in column_of(rows, "action")], "action")
     found = (
         _runs(rows, flagged, "flagged")
-        + _runs(rows, [row.fault for row in rows], "injected")
+        + _runs(rows, column_of(rows, "fault"), "injected")
         + bare
         + actions
     )
@@ -470,7 +471,7 @@ def _style(lane: str, word: str) -> dict[str, int]:
 
 
 def _bare(episode: Episode, rows: Sequence[Row]) -> dict[str, Any]:
-    near = min(range(len(rows)), key=lambda k: abs(rows[k].t_s - episode.start_s))
+    near = int(np.argmin(np.abs(numbers(rows, "t_s") - episode.start_s)))
     window = {"from": episode.start_s, "to": episode.end_s, "first": near, "last": near}
     return {"lane": "injected", "word": episode.kind, **window}
 
@@ -499,12 +500,12 @@ def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> 
         return list(range(len(rows)))
     turns: set[int] = set()
     for name in ("gamma", "reason", "fault", "action"):
-        column = list(map(attrgetter(name), rows))
-        turns.update(k for k, (before, now) in enumerate(pairwise(column), 1) if now != before)
+        words = column_of(rows, name)
+        turns.update(k for k, (before, now) in enumerate(pairwise(words), 1) if now != before)
     kept = {0, len(rows) - 1, *always, *(turns if len(turns) <= most // 4 else ())}
     step = -(-len(rows) * 5 // (most - len(kept)))
     peaks = [
-        np.nan_to_num(values(rows, name), nan=-1.0)
+        np.nan_to_num(numbers(rows, name), nan=-1.0)
         for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")
     ]
     for begin in range(0, len(rows), step):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from avsreplay.assessment import Assessment
@@ -254,12 +254,14 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def changed_settings(*tables: Any) -> list[str]:
+def changed_settings(*tables: Any, stated: Collection[str] | None = None) -> list[str]:
     """Return the settings that differ from their defaults, each as ``key = value (default ...)``.
 
     Args:
         tables: dataclasses of settings, such as the configuration of a run and the options for
             reading its log.
+        stated: those that the user has given, as this function returns them; every other one is
+            marked as given by the log. None marks none.
     """
     found = []
     for table in tables:
@@ -267,9 +269,9 @@ def changed_settings(*tables: Any) -> list[str]:
             value, default = dump(value_of(table, entry.key)), dump(entry.default)
             if value != default:
                 unset = entry.declared.automatic or "off"
-                found.append(
-                    f"{entry.key} = {_value(value, unset)} (default {_value(default, unset)})"
-                )
+                text = f"{entry.key} = {_value(value, unset)} (default {_value(default, unset)}"
+                of_log = stated is not None and f"{text})" not in stated
+                found.append(f"{text}; by the log)" if of_log else f"{text})")
     return found
 
 

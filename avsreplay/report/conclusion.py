@@ -20,13 +20,13 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.report.charts import values
 from avsreplay.report.compare import METRICS, different_inputs, different_logs, metrics
 from avsreplay.report.golden import GoldenResult, compare_rows
 from avsreplay.report.intervals import interval_of_mean, interval_of_roots
 from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 HEADLINES = {  # the metrics of the conclusion: words, unit and factor
     "healthy_ratio": ("scans used", " %", 100.0),
@@ -85,8 +85,8 @@ def _scanwise(
     """
 
     def value(rows: Sequence[Row]) -> Array:
-        found = values(rows, column)
-        known = np.isfinite(found) & (values(rows, "gamma") == 1.0 if healthy else True)
+        found = numbers(rows, column)
+        known = np.isfinite(found) & (numbers(rows, "gamma") == 1.0 if healthy else True)
         figures = np.square(found) if band is None else (band[0] <= found) & (found <= band[1])
         return np.where(known, figures, np.nan)
 
@@ -102,9 +102,9 @@ _ROOTS = {  # metrics that are the root of a mean over scans
     "reg_rot_rmse_deg": _scanwise("reg_rot_err_deg", healthy=True),
 }
 _MEANS = {  # metrics that are a mean over scans
-    "healthy_ratio": lambda rows: values(rows, "gamma"),
+    "healthy_ratio": lambda rows: numbers(rows, "gamma"),
     "false_alarm_rate": lambda rows: np.where(
-        [bool(r.fault) for r in rows], np.nan, 1.0 - values(rows, "gamma")
+        list(map(bool, column_of(rows, "fault"))), np.nan, 1.0 - numbers(rows, "gamma")
     ),
     "nis_inside": _scanwise("nis", NIS_BAND, healthy=True),
     "nees_inside": _scanwise("nees", NEES_BAND),
@@ -221,11 +221,11 @@ def _change(
     paired: bool,
 ) -> Change | None:
     values = [(base[name], other[name]) for base, other in figures]
-    if all(base is None and other is None for base, other in values):
-        return None
     base, other = (_mean([pair[side] for pair in values]) for side in (0, 1))
-    lost = sum(a is not None and b is None for a, b in values)
-    new = sum(a is None and b is not None for a, b in values)
+    if base is None and other is None:
+        return None
+    missing = [(a is None, b is None) for a, b in values]
+    lost, new = missing.count((False, True)), missing.count((True, False))
     if lost or new:
         word = _word_of_loss(name, lost - new) if paired else "changed"
         return Change(name, base, other, None, None, word, "lost" if lost else "new")
@@ -289,7 +289,7 @@ def _blocks(
     for run in pair:
         figures = value(run.rows)
         known = np.flatnonzero(np.isfinite(figures))
-        stamps.append(np.array([row.t_ns for row in run.rows])[known])
+        stamps.append(np.array(column_of(run.rows, "t_ns"))[known])
         found.append(figures[known])
     shared, *places = np.intersect1d(stamps[0], stamps[1], return_indices=True)
     count = min(_BLOCKS, len(shared) // _IN_BLOCK)

@@ -14,7 +14,7 @@ scans, its used scans and the scans after it.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import field
 from itertools import pairwise, takewhile
 from typing import NamedTuple
@@ -253,10 +253,7 @@ def _episode(
     def after() -> Iterator[Mark]:
         return (marks[k] for k in range(behind, len(marks)))
 
-    recover_scans, recover_s = _first((m for m in after() if m.fault is None), gamma=1)
-    lost = recover_scans is None and any(m.fault is None for m in after())
-    if not flagged and not missing and recover_scans == 0:
-        recover_scans = recover_s = None  # there was nothing to recover from
+    recover_scans, recover_s, lost = _recovery(after, disturbed=bool(flagged) or missing)
     delay_scans, delay_s = _first(own, gamma=0)
     return Episode(
         kind=label.kind,
@@ -276,6 +273,18 @@ def _episode(
         peak_used=Peak.of(m for m in own if m.gamma == 1),
         peak_after=Peak.of(m for m in _until_next(after(), next_ns) if m.gamma == 1),
     )
+
+
+def _recovery(
+    after: Callable[[], Iterator[Mark]], *, disturbed: bool
+) -> tuple[int | None, float | None, bool]:
+    """Scans and seconds from the first scan without a fault to the first healthy one, None where
+    there was nothing to recover from, and whether no such scan was healthy.
+    """
+    scans, seconds = _first((m for m in after() if m.fault is None), gamma=1)
+    if scans is None:
+        return None, None, any(m.fault is None for m in after())
+    return (scans, seconds, False) if disturbed or scans else (None, None, False)
 
 
 def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:

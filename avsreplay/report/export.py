@@ -20,10 +20,10 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Array, Pose
-from avsreplay.report.jsonl import field_types, plain
+from avsreplay.report.jsonl import plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
-from avsreplay.rows import Column, Row, columns
+from avsreplay.rows import Column, Row, columns, field_types
 from avsreplay.settings import dump
 
 FORMAT = "avsreplay-run/1"

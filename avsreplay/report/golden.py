@@ -18,9 +18,9 @@ import numpy as np
 
 from avsreplay.errors import CheckFailed, UnreadableInput, value_class
 from avsreplay.report.jsonl import plain, read_records, write_rows
-from avsreplay.report.summary_parts import add_rows
 from avsreplay.report.table import Table, number
 from avsreplay.rows import Column, Row, columns
+from avsreplay.tables import Columns
 
 ABSENT = "(absent)"
 _Cells = Mapping[str, Sequence[Any]]  # column -> its values, ABSENT where a row has none
@@ -79,7 +79,7 @@ class GoldenResult:
 
 
 def compare_golden(
-    expected_path: str | Path, rows: Iterable[Row], *, first: int = 20
+    expected_path: str | Path, rows: Sequence[Row], *, first: int = 20
 ) -> GoldenResult:
     """Compare rows with a golden file; ``first`` differences are kept, all are counted.
 
@@ -89,7 +89,8 @@ def compare_golden(
     expected = read_golden(Path(expected_path))
     names = dict.fromkeys(name for record in expected.values() for name in record)
     table = {name: [record.get(name, ABSENT) for record in expected.values()] for name in names}
-    return _compare({**table, "seq": list(expected)}, _table(list(rows)), first)
+    lacking = [c.name for c in columns() if ABSENT in table.get(c.name, [ABSENT] * len(expected))]
+    return _compare({**table, "seq": list(expected)}, Columns(rows), first, lacking)
 
 
 def read_golden(path: Path) -> dict[int, dict[str, Any]]:
@@ -112,13 +113,7 @@ def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20
     """Compare the rows of two runs by the tolerances of golden files; ``first`` differences
     are kept.
     """
-    return _compare(_table(expected), _table(got), first)
-
-
-def _table(rows: Sequence[Row]) -> _Cells:
-    table: dict[str, list[Any]] = {c.name: [] for c in columns()}
-    add_rows(table, rows)
-    return table
+    return _compare(Columns(expected), Columns(got), first)
 
 
 def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str, Any]]:
@@ -139,8 +134,11 @@ def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str
     return out
 
 
-def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
-    """Compare two tables column by column; ``got`` has every column.
+def _compare(
+    expected: _Cells, got: _Cells, first: int, lacking: Sequence[str] = ()
+) -> GoldenResult:
+    """Compare two tables column by column; ``got`` has every column, and ``expected`` has those
+    that are lacking not in every row.
 
     The differences of the first scans are kept.
     """
@@ -151,7 +149,6 @@ def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
         places = [range(len(shared))] * 2
     alone = sorted(left.keys() ^ right.keys())
     declared = {c.name: c for c in columns()}
-    lacking = [name for name in declared if ABSENT in expected.get(name, [ABSENT] * len(left))]
     counts = {"row": len(alone)} | dict.fromkeys(lacking, 1)
     kept = [(seq, 0, Difference(seq, "row", *_stated(seq in left))) for seq in alone[:first]]
     for order, name in enumerate((*sorted(expected.keys() - declared.keys()), *declared), 1):
@@ -215,11 +212,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def update_golden(path: str | Path, rows: Iterable[Row], *, first: int = 20) -> GoldenResult | None:
+def update_golden(path: str | Path, rows: Sequence[Row], *, first: int = 20) -> GoldenResult | None:
     """Replace the golden file and return the differences from the previous one (None if there was
     none).
     """
-    rows = list(rows)
     former = compare_golden(path, rows, first=first) if Path(path).is_file() else None
     write_rows(path, rows)
     return former

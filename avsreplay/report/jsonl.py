@@ -11,20 +11,20 @@ import dataclasses
 import gc
 import json
 import math
-import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import TracebackType
 from typing import Annotated, Any
 
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_text, refuse_pointer
-from avsreplay.rows import Row
+from avsreplay.rows import Row, field_types
+from avsreplay.tables import RowTable
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _VALUES = attrgetter(*_NAMES)
@@ -34,18 +34,6 @@ _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
 _BLOCK = 1 << 20
 _MAX_JSON = 64 << 20
 _LARGEST = 1e100  # sums of squares of larger values are not finite
-
-
-@cache
-def field_types() -> Mapping[str, tuple[type, bool]]:
-    """Column name -> (str, int, float or bool; whether it may be null)."""
-    hints = typing.get_type_hints(Row)
-    return MappingProxyType({name: _split(hints[name]) for name in _NAMES})
-
-
-def _split(hint: Any) -> tuple[type, bool]:
-    args = typing.get_args(hint)
-    return (next(a for a in args if a is not type(None)), True) if args else (hint, False)
 
 
 def plain(value: Any) -> Any:
@@ -206,20 +194,20 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
     raise UnreadableInput(what, where=where, hint=f"it must be {kind.__name__}")
 
 
-def read_rows(path: str | Path) -> list[Row]:
+def read_rows(path: str | Path) -> RowTable:
     """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending
     order.
 
     Whole blocks of lines are decoded and checked at once. A block in which anything differs from
     what a run writes is read cell by cell, which accepts it or names line and column.
     """
-    rows: list[Row] = []
+    rows = RowTable()
     for first, ends, block in _blocks(Path(path)):
         found = _checked_at_once(block, ends + (not block.endswith(b"\n")))
         if found is None or any(a.seq >= b.seq for a, b in pairwise([*rows[-1:], *found])):
             _add_cell_by_cell(rows, block, path, first)
         else:
-            rows += found
+            rows.extend(found)
     return rows
 
 
@@ -238,7 +226,7 @@ def without_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _add_cell_by_cell(rows: list[Row], block: bytes, path: str | Path, first: int) -> None:
+def _add_cell_by_cell(rows: RowTable, block: bytes, path: str | Path, first: int) -> None:
     for where, record in _records(block, path, first):
         row = parse_row(record, where)
         if rows and row.seq <= rows[-1].seq:

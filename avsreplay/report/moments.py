@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.report.charts import values
 from avsreplay.report.summary import NIS_LIMIT
 from avsreplay.report.summary_parts import length_text
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers
 
 MOMENTS = 5
 
@@ -55,24 +55,28 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
     """Candidates with a weight: flagged intervals and single scans whose error or NIS stands
     out.
     """
-    for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
+    gammas, errors = column_of(rows, "gamma"), np.nan_to_num(numbers(rows, "pos_err_m"))
+    for flagged, group in groupby(range(len(rows)), key=lambda k: gammas[k] == 0):
         places = list(group)
         if flagged:
-            yield _flagged_moment(rows, places)
-    used = values(rows, "gamma") != 0.0  # the others belong to their interval
+            yield _flagged_moment(rows, gammas, places, errors)
+    used = np.array(gammas) != 0  # the others belong to their interval
     for column, name in (("pos_err_m", "position error"), ("rot_err_deg", "attitude error")):
-        typical = median_of(figures := values(rows, column))
+        typical = median_of(figures := numbers(rows, column))
         for value, k in _largest(figures, used):
             if typical and value > 3.0 * typical:
                 size = length_text(value) if column == "pos_err_m" else f"{value:.3g} deg"
                 text = f"{name} {size}, {value / typical:.0f} times the median"
-                yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
-    for value, k in _largest(values(rows, "nis"), used):
+                yield (
+                    value / typical,
+                    Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, gammas, k)),
+                )
+    for value, k in _largest(numbers(rows, "nis"), used):
         if value > NIS_LIMIT:
             text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
             yield (
                 3.0 * value / NIS_LIMIT,
-                Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k)),
+                Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, gammas, k)),
             )
 
 
@@ -82,34 +86,52 @@ def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]
     return list(zip(figures[chosen].tolist(), chosen.tolist(), strict=True))
 
 
-def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
-    worst = max(places, key=lambda k: rows[k].pos_err_m or 0.0)
+def _flagged_moment(
+    rows: Sequence[Row], gammas: Sequence[int], places: Sequence[int], errors: Array
+) -> tuple[float, Moment]:
+    """The moment of scans that were not used one after the other."""
+    worst = places[int(np.argmax(errors[places[0] : places[-1] + 1]))]
     largest = rows[worst].pos_err_m
     error = "" if largest is None else f", position error up to {length_text(largest)}"
     count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
     span = rows[places[0]].t_s, rows[places[-1]].t_s
     return 3.0 * len(places), Moment(
-        worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1])
+        worst, *span, f"{count} not used{error}", _cause(rows, gammas, places[0], places[-1])
     )
 
 
-def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
+def _cause(rows: Sequence[Row], gammas: Sequence[int], k: int, last: int | None = None) -> str:
     """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or
     at k.
     """
     row, end = rows[k], rows[k if last is None else last]
-    before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
+    before = next((rows[j] for j in range(k - 1, -1, -1) if gammas[j] != 0), None)
     if row.fault:
         return f"injected: {plain(row.fault)}"
-    moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
-    manoeuvre = "manoeuvre of the target" + (
-        "" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s"
-    )
+    manoeuvre = _manoeuvre(before, end)
     if row.gamma == 0:
-        return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
-    if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
-        return manoeuvre if moved else "the estimate was reinitialised"
-    if k and rows[k - 1].gamma == 0:
+        return f"rejected: {plain(row.reason)}" + (f"; {manoeuvre}" if manoeuvre else "")
+    if manoeuvre:
+        return manoeuvre
+    return _cause_in_estimate(rows, gammas, k, before)
+
+
+def _manoeuvre(before: Row | None, end: Row) -> str:
+    """The manoeuvre that was found between two rows, in words; "" without one."""
+    if before is None or (end.manoeuvres or 0) <= (before.manoeuvres or 0):
+        return ""
+    when = "" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s"
+    return f"manoeuvre of the target{when}"
+
+
+def _cause_in_estimate(
+    rows: Sequence[Row], gammas: Sequence[int], k: int, before: Row | None
+) -> str:
+    """Why the estimate of a used scan has a large error; ``before`` is the last used row."""
+    row = rows[k]
+    if before is not None and (row.reinitialised or 0) > (before.reinitialised or 0):
+        return "the estimate was reinitialised"
+    if k and gammas[k - 1] == 0:
         return "first used scan after rejected scans"
     if row.guess == "acquired":
         return "pose found by a search"

@@ -38,6 +38,7 @@ from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of
 from avsreplay.report.view import View, cone_lines, scene, thin_surface
 from avsreplay.rows import Row
+from avsreplay.tables import chosen, column_of, numbers
 
 MOST_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
@@ -174,9 +175,11 @@ def build_page(
     """
     verdict = verdict_of(rows, summary, header)
     kept = charts.most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
-    place, all_rows, rows = {k: n for n, k in enumerate(kept)}, rows, [rows[k] for k in kept]
+    place, all_rows = {k: n for n, k in enumerate(kept)}, rows
+    rows = chosen(rows, np.array(kept, int))
+    stamps = set(column_of(rows, "t_ns"))
     columns = charts.derived(rows)
-    used = np.array([row.gamma == 1 for row in rows])
+    used = numbers(rows, "gamma") == 1.0
     t1 = summary.convergence.t1_s
     flown = [] if view is None else flown_parts(rows, view)
     data = {
@@ -184,9 +187,15 @@ def build_page(
         "charts": charts.charts(columns, truth, (header or {}).get("limits"), used),
         "spans": charts.spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
-        "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
-        "scans": [row.seq for row in rows],
-        "scene": scene(rows, dict(poses), view) | {"flown": _flown_data(flown)},
+        "states": [
+            [gamma, reason, fault or ""]
+            for gamma, reason, fault in zip(
+                *(column_of(rows, name) for name in ("gamma", "reason", "fault")), strict=True
+            )
+        ],
+        "scans": column_of(rows, "seq"),
+        "scene": scene(rows, {t_ns: pose for t_ns, pose in poses if t_ns in stamps}, view)
+        | {"flown": _flown_data(flown)},
         "chosen": flown[-1][0] + len(flown[-1][1]) - 1 if flown else 0,
     }
     errors, faults, manoeuvres, *others = summary_tables(summary, rows)
@@ -222,9 +231,9 @@ def _run_data(name: str, rows: Sequence[Row], columns: charts.Columns) -> dict[s
     """Times, columns and gamma of one run."""
     return {
         "name": name,
-        "t": charts.pack(charts.values(rows, "t_s"), "f8"),
+        "t": charts.pack(numbers(rows, "t_s"), "f8"),
         "columns": _packed(columns),
-        "used": charts.pack([row.gamma for row in rows], "u1"),
+        "used": charts.pack(column_of(rows, "gamma"), "u1"),
     }
 
 

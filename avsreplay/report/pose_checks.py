@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avsreplay.report.charts import values
 from avsreplay.report.moments import median_of
 from avsreplay.rows import Row
+from avsreplay.tables import column_of, numbers, used_rows
 
 MOST_SIGMAS = 5.0  # median error of the pose over its own 1 sigma from which it is reported
 _LEAST_ROWS = 10  # used scans with a true pose from which the median is judged
@@ -26,19 +26,19 @@ def error_over_sigma(rows: Sequence[Row]) -> str:
     Returns:
         The finding, "" if there is none.
     """
-    used = [row for row in rows if row.gamma == 1]
+    used = used_rows(rows)
     said = []
     for name, error, sigma in (
         ("position", "pos_err_m", "pos_1s_m"),
         ("attitude", "rot_err_deg", "rot_1s_deg"),
     ):
-        stated = values(used, sigma)
+        stated = numbers(used, sigma)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(stated > 0.0, values(used, error) / stated, np.nan)
+            ratio = np.where(stated > 0.0, numbers(used, error) / stated, np.nan)
         ratio = ratio[np.isfinite(ratio)]
         if len(ratio) >= _LEAST_ROWS and (typical := median_of(ratio) or 0.0) > MOST_SIGMAS:
             said.append(f"{name} {typical:.2g}")
-    if not said or any(row.nees is not None for row in used):
+    if not said or any(nees is not None for nees in column_of(used, "nees")):
         return ""
     return (
         f"the error of the pose is many times the 1 sigma that is stated of it (median:"
@@ -59,11 +59,11 @@ def times_may_matter(rows: Sequence[Row], extent_m: float, period_s: float) -> s
     Returns:
         The finding, "" if times cannot matter.
     """
-    used = [row for row in rows if row.gamma == 1]
-    rate = np.linalg.norm([values(used, f"w{axis}_radps") for axis in "xyz"], axis=0)
-    speed = np.linalg.norm([values(used, f"v{axis}_mps") for axis in "xyz"], axis=0)
+    used = used_rows(rows)
+    rate = np.linalg.norm([numbers(used, f"w{axis}_radps") for axis in "xyz"], axis=0)
+    speed = np.linalg.norm([numbers(used, f"v{axis}_mps") for axis in "xyz"], axis=0)
     motion = median_of(np.asarray(speed + 0.5 * extent_m * rate))
-    sigma = median_of(values(used, "pos_1s_m"))
+    sigma = median_of(numbers(used, "pos_1s_m"))
     if motion is None or sigma is None or 0.5 * motion * period_s <= _SIGNIFICANT * sigma:
         return ""
     return (

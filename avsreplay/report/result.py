@@ -7,6 +7,7 @@ optional.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -26,8 +27,8 @@ from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
-from avsreplay.rows import Row
 from avsreplay.settings import dump
+from avsreplay.tables import PoseTable, RowTable
 
 _STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
@@ -50,7 +51,7 @@ class Result:
     """
 
     name: str
-    rows: list[Row]
+    rows: RowTable
     summary: Summary
     header: Mapping[str, Any] = field(default_factory=dict)
     truth: State | None = None
@@ -194,7 +195,7 @@ def load_result(path: str | Path) -> Result:
         unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
     with without_garbage_collection():
         rows = read_rows(rows_path)
-        if not rows:
+        if not len(rows):
             raise UnreadableInput("has no rows", where=str(rows_path), hint=_RUN_AGAIN)
         if not unverified and len(rows) != header.get("rows"):
             what = f"{len(rows)} rows, run.json states {header.get('rows')}"
@@ -299,17 +300,17 @@ def _state(values: Mapping[str, Any]) -> State:
     return State(**arrays)
 
 
-def read_tum(path: str | Path) -> list[StampedPose]:
+def read_tum(path: str | Path) -> PoseTable:
     """Read a TUM file: (t_ns, pose) with times exact to the nanosecond.
 
     Raises UnreadableInput with the line.
     """
     hint = "name a TUM trajectory"
     text = read_limited(Path(path), _MAX_TUM, hint).decode("utf-8", "backslashreplace")
-    out: list[StampedPose] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    out = PoseTable()
+    for number, line in enumerate(io.StringIO(text), 1):
         if line.strip() and not line.startswith("#"):
-            out.append(_stamped(line, f"{path}:{number}"))
+            out.append(*_stamped(line, f"{path}:{number}"))
     return out
 
 

@@ -8,11 +8,10 @@ scans per second is not part of it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from itertools import compress, pairwise
 from operator import not_
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +27,10 @@ from avsreplay.report.summary_parts import (
     Drifting,
     Statistics,
     VelocityChange,
-    add_rows,
     median,
 )
 from avsreplay.rows import Row
+from avsreplay.tables import Columns
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
@@ -51,19 +50,6 @@ _BY_STATE = (
     "iterations",
 )
 _OF_ALL = ("nees", *(f"nees_{name}" for name in BLOCKS))
-_STATES = (
-    "t_ns",
-    "t_s",
-    "gamma",
-    "fault",
-    "status",
-    "reason",
-    "cauchy_weight",
-    "reference",
-    "ogm_rank",
-    "converged",
-)
-_TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL, *Capture.COLUMNS, *VelocityChange.COLUMNS)
 
 
 @value_class(eq=True)
@@ -174,80 +160,30 @@ class Summary:
     @classmethod
     def fold(
         cls,
-        rows: Iterable[Row],
+        rows: Sequence[Row],
         *,
         labels: Sequence[Label] | None = None,
         truth: State | None = None,
         counts: Mapping[str, int] | None = None,
     ) -> Summary:
-        """Summarise rows in their order; the arguments are those of SummaryFold."""
-        fold = SummaryFold(labels=labels, truth=truth, counts=counts)
-        fold.extend(list(rows))
-        return fold.result()
+        """Summarise rows, column by column.
 
-    @property
-    def longest_coast(self) -> Coast | None:
-        """The longest interval without a measurement (the first of equals)."""
-        return max(self.coasts, key=lambda c: c.duration_s, default=None)
-
-
-class SummaryFold:
-    """Takes rows one by one and keeps a few numbers of each.
-
-    Args:
-        labels: injected faults; None where the log does not state them.
-        truth: the true state, with the principal axes in the order of the estimate's.
-        counts: losses and clock problems by name.
-    """
-
-    def __init__(
-        self,
-        *,
-        labels: Sequence[Label] | None = None,
-        truth: State | None = None,
-        counts: Mapping[str, int] | None = None,
-    ) -> None:
-        self._labels, self._truth, self._counts = labels, truth, dict(counts or {})
-        self._taken: dict[str, list[Any]] = {name: [] for name in _TAKEN}
-        self._last: Row | None = None
-
-    def anew(self, rows: Sequence[Row]) -> SummaryFold:
-        """A fold with the same labels and truth over other rows."""
-        fold = SummaryFold(labels=self._labels, truth=self._truth, counts=self._counts)
-        fold.extend(rows)
-        return fold
-
-    def add(self, row: Row) -> None:
-        """Take the next row."""
-        for name, column in self._taken.items():
-            column.append(getattr(row, name))
-        self._last = row
-
-    def extend(self, rows: Sequence[Row]) -> None:
-        """Take the next rows."""
-        add_rows(self._taken, rows)
-        self._last = rows[-1] if rows else self._last
-
-    def result(self, truth: State | None = None) -> Summary:
-        """The summary of all rows so far; ``truth`` in place of the one given at the start."""
-        taken = self._taken
-        marks = list(
-            map(
-                Mark,
-                *(taken[name] for name in ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg")),
-            )
-        )
-        stamps, times_s, flagged = (
-            taken["t_ns"],
-            taken["t_s"],
-            [gamma == 0 for gamma in taken["gamma"]],
-        )
+        Args:
+            rows: one per scan, in their order.
+            labels: injected faults; None where the log does not state them.
+            truth: the true state, with the principal axes in the order of the estimate's.
+            counts: losses and clock problems by name.
+        """
+        taken = Columns(rows)
+        names = ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg")
+        marks = list(map(Mark, *(taken[name] for name in names)))
+        stamps, times_s, gammas = taken["t_ns"], taken["t_s"], taken["gamma"]
+        flagged = [gamma == 0 for gamma in gammas]
         steps = [b - a for a, b in pairwise(stamps) if b > a]
         full = [rank == STATES for rank in taken["ogm_rank"]]
-        last = self._last
-        healthy = taken["gamma"].count(1)
+        last, healthy, converged = rows[-1] if rows else None, gammas.count(1), taken["converged"]
         figures = _figures(taken)
-        return Summary(
+        return cls(
             scans=len(stamps),
             duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0,
             interval_s=median(steps) * 1e-9 if steps else None,
@@ -263,43 +199,48 @@ class SummaryFold:
             registration_flagged=_errors(figures, "reg_", "coasting"),
             fit_error_m=Statistics.of(figures["rms_m/healthy"]),
             iterations=Statistics.of(figures["iterations/healthy"]),
-            faults=account(marks, self._labels),
+            faults=account(marks, labels),
             coasts=tuple(coasts(marks)),
-            parameters=parameters(last, truth or self._truth) if last else (),
-            sigma_hits=last.sigma_hits if last else None,
-            r_floors=last.r_floors if last else None,
+            parameters=parameters(last, truth) if last else (),
+            **{name: getattr(last, name, None) for name in _COUNTED},
             weighed_down=sum(
                 w is not None and w < 1.0
                 for w in compress(taken["cauchy_weight"], map(not_, flagged))
             ),
-            reinitialised=last.reinitialised if last else None,
-            manoeuvres=last.manoeuvres if last else None,
             velocity_changes=VelocityChange.of(taken),
             drift=Drifting.of(last) if last else None,
-            violations=last.violations if last else None,
             nis=_share(figures["nis/healthy"], NIS_BAND),
             nees=_share(figures["nees"], NEES_BAND),
             nees_blocks=_blocks(figures),
             reference=next(filter(None, reversed(taken["reference"])), None),
             observability=_observability(last, next(compress(times_s, full), None)),
             convergence=ConvergenceSummary(
-                t1_s=next(compress(times_s, taken["converged"]), None),
+                t1_s=next(compress(times_s, converged), None),
                 at_end=bool(last and last.converged),
-                withdrawn=sum(a and not b for a, b in pairwise(taken["converged"])),
+                withdrawn=sum(a and not b for a, b in pairwise(converged)),
             ),
             capture=Capture.of(taken),
-            counts=self._counts,
+            counts=dict(counts or {}),
         )
 
+    @property
+    def longest_coast(self) -> Coast | None:
+        """The longest interval without a measurement (the first of equals)."""
+        return max(self.coasts, key=lambda c: c.duration_s, default=None)
 
-def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
+
+_COUNTED = ("sigma_hits", "r_floors", "reinitialised", "manoeuvres", "violations")
+"""Columns that count since the first scan: those of the last row are those of the run."""
+
+
+def _figures(taken: Columns) -> dict[str, Array]:
     """The finite values of each figure, of those in ``_BY_STATE`` apart for healthy and coasting
     scans.
     """
     healthy, out = np.equal(taken["gamma"], 1), {}
     claimed = _since_convergence(taken["converged"])
     for name in (*_BY_STATE, *_OF_ALL):
-        column = np.array(taken[name], dtype=np.float64)
+        column = taken.numbers(name)
         known = np.isfinite(column)
         if name == "nis" or name in _OF_ALL:
             known = known & claimed

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from itertools import groupby
-from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,21 +17,11 @@ from numpy.typing import ArrayLike
 
 from avsreplay.errors import value_class
 from avsreplay.rows import Row
+from avsreplay.tables import column_of
 
-_BLOCK = 256  # rows whose values are taken together, so that they are read from the cache
-
-
-def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
-    """Append the values of some rows to columns.
-
-    Args:
-        table: column name -> its values so far.
-        rows: the next rows.
-    """
-    for begin in range(0, len(rows), _BLOCK):
-        block = rows[begin : begin + _BLOCK]
-        for name, column in table.items():
-            column.extend(map(attrgetter(name), block))
+# changes of the velocity from which a motion is not called free: a free target is pushed, or
+# manoeuvres, once or twice in a log; one that is towed, on a cable or in strong drag changes always
+_NOT_FREE = 3
 
 
 @value_class(eq=True)
@@ -159,7 +148,7 @@ def times(count: int) -> str:
 def events(
     rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None
 ) -> Iterator[str]:
-    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
+    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, errors.
 
     Args:
         rows: all rows of the run.
@@ -169,11 +158,16 @@ def events(
     if manoeuvres:
         clearest = max(manoeuvres, key=lambda m: m.significance)
         count = "" if len(manoeuvres) == 1 else f" {times(len(manoeuvres))}, most significantly"
-        yield f"the target's velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
+        often = len(manoeuvres) >= _NOT_FREE
+        whose = "the target does not move freely: its" if often else "the target's"
+        yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
-    if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:
+    stated = list(zip(column_of(rows, "t_s"), column_of(rows, "reason"), strict=True))
+    if biased := [t_s for t_s, reason in stated if reason == "sensor_bias"]:
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
+    if frozen := [t_s for t_s, reason in stated if reason == "frozen"]:
+        yield f"the sensor repeated a scan {times(len(frozen))}, first at {frozen[0]:.1f} s"
 
 
 @value_class(eq=True)

@@ -205,7 +205,7 @@ def error_table(summary: Summary) -> Table:
     rows = tuple(
         _error_row(name, unit, spread) for name, unit, spread in found if spread is not None
     )
-    note = "poses are compared at equal times and without an alignment; sse: sum of squares"
+    note = "poses are compared at equal times and without an alignment; sse is the sum of squares"
     return Table(title, ("of", "unit", "n", *_STATISTICS), rows, align="llr", note=note)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import IO, Any, Literal
 
 from rich import box
@@ -20,6 +21,7 @@ from rich.text import Text
 
 from avsreplay.errors import printable, value_class
 from avsreplay.rows import Column, Row, columns
+from avsreplay.tables import column_of
 
 PLAIN_WIDTH, _WRAPPED = (
     80,
@@ -271,7 +273,7 @@ def choose_rows(
     if every is not None:
         return list(rows[:: max(every, 1)]), f"every {_ordinal(max(every, 1))} of {len(rows)} scans"
     step = -(-len(rows) // FEW)
-    turns = {k for k in range(1, len(rows)) if rows[k].gamma != rows[k - 1].gamma}
+    turns = {k for k, (a, b) in enumerate(pairwise(column_of(rows, "gamma")), 1) if a != b}
     turns = turns if len(turns) <= FEW else set()
     kept = sorted(set(range(0, len(rows), step)) | {len(rows) - 1} | turns)
     words = f"every {_ordinal(step)} of {len(rows)} scans" + (
@@ -413,14 +415,12 @@ def print_sparks(console: Console, rows: Sequence[Row]) -> None:
         ("position error", "mm", "pos_err_m", 1000.0),
         ("attitude error", "deg", "rot_err_deg", 1.0),
     )
-    for name, unit, column, scale in shown:
-        values = [None if (v := getattr(row, column)) is None else scale * v for row in rows]
+    for name, unit, wanted, scale in shown:
+        values = [None if v is None else scale * v for v in column_of(rows, wanted)]
         if known := [v for v in values if v is not None]:
             label = f"{name} to {max(known):.3g} {unit}"
             console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
-    flags = "".join(
-        "✗" if any(row.gamma == 0 for row in rows[a:b]) else "·"
-        for a, b in _parts(len(rows), width)
-    )
+    gammas = column_of(rows, "gamma")
+    flags = "".join("✗" if 0 in gammas[a:b] else "·" for a, b in _parts(len(rows), width))
     console.print(Text(f"{'flagged':{_LABEL}}").append(flags, style="#D55E00"))
     console.print()

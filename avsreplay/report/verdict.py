@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
-from itertools import chain
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 
 from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
-from avsreplay.report.charts import values
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
 from avsreplay.report.pose_checks import error_over_sigma
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
+from avsreplay.tables import chosen, column_of, numbers, used_rows
 
 USED_FAIL, USED_CHECK = (
     0.5,
@@ -194,7 +194,7 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
         text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {plain(common)})"
         yield Concern(grade, text)
-    last = next((k for k in range(len(rows) - 1, -1, -1) if rows[k].gamma == 1), 0)
+    last = int(np.flatnonzero(numbers(rows, "gamma") == 1.0).max(initial=0))
     if rows[-1].t_s - rows[last].t_s > 0.1 * (rows[-1].t_s - rows[0].t_s) and len(rows) - last > 3:
         yield Concern(
             Grade.FAIL,
@@ -204,26 +204,20 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
-    position, turn = median_of(values(rows, "pos_err_m")), median_of(values(rows, "rot_err_deg"))
-    share = position / extent_m if position is not None and extent_m else 0.0
-    if share > ERROR_CHECK or (turn or 0.0) > TURN_CHECK:
-        yield from _frame(
-            rows,
-            extent_m,
-            Grade.FAIL if share > ERROR_FAIL or (turn or 0.0) > TURN_FAIL else Grade.CHECK,
-        )
-    if position is not None and extent_m and position > ERROR_CHECK * extent_m:
-        grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
-        share = 100 * position / extent_m
-        yield Concern(
-            grade,
-            f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the"
-            " model",
-        )
-    if turn is not None and turn > TURN_CHECK:
-        grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
-        yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
-    fit = median_of(values([row for row in rows if row.gamma == 1], "rms_m"))
+    position = median_of(numbers(rows, "pos_err_m")) or 0.0
+    turn = median_of(numbers(rows, "rot_err_deg")) or 0.0
+    share = position / extent_m if extent_m else 0.0
+    of_position = _graded(share, ERROR_CHECK, ERROR_FAIL)
+    of_turn = _graded(turn, TURN_CHECK, TURN_FAIL)
+    grades = [grade for grade in (of_position, of_turn) if grade]
+    if grades:
+        yield from _frame(rows, extent_m, Grade.FAIL if Grade.FAIL in grades else Grade.CHECK)
+    if of_position:
+        size = f"{position:.3g} m, {100 * share:.1f} % of the model"
+        yield Concern(of_position, f"the median position error of all scans is {size}")
+    if of_turn:
+        yield Concern(of_turn, f"the median attitude error of all scans is {turn:.3g} deg")
+    fit = median_of(numbers(used_rows(rows), "rms_m"))
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
         text = (
@@ -231,6 +225,13 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
             " extent"
         )
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
+
+
+def _graded(size: float, check: float, fail: float) -> Grade | None:
+    """The grade of a size by its two limits; None where it is within both."""
+    if size <= check:
+        return None
+    return Grade.FAIL if size > fail else Grade.CHECK
 
 
 def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterator[Concern]:
@@ -241,11 +242,8 @@ def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterato
     attitude. An equivalent pose of a symmetric body has such an X, too. Either of the two may be
     small.
     """
-    used = [
-        row
-        for row in rows
-        if row.gamma == 1 and row.pos_err_m is not None and row.rot_err_deg is not None
-    ]
+    known = np.isfinite(numbers(rows, "pos_err_m")) & np.isfinite(numbers(rows, "rot_err_deg"))
+    used = chosen(rows, known & (numbers(rows, "gamma") == 1.0))
     if len(used) < GROWTH_SCANS:
         return
     same, small = list[bool](), list[bool]()
@@ -253,7 +251,7 @@ def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterato
         ("pos_err_m", ERROR_CHECK * (extent_m or 0.0)),
         ("rot_err_deg", TURN_CHECK),
     ):
-        low, middle, high = np.quantile(values(used, column), (0.05, 0.5, 0.95))
+        low, middle, high = np.quantile(numbers(used, column), (0.05, 0.5, 0.95))
         same.append(bool(middle > limit and high - low < SAME_ERROR * middle))
         small.append(bool(middle <= limit))
     if any(same) and all(a or b for a, b in zip(same, small, strict=True)):
@@ -266,7 +264,7 @@ def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterato
 
 def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors of the used scans that are larger at the end than at the beginning."""
-    used = [row for row in rows if row.gamma == 1]
+    used = used_rows(rows)
     third = len(used) // 3
     if third < GROWTH_SCANS:
         return
@@ -274,7 +272,7 @@ def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
         ("pos_err_m", "position", GROWN_LEAST * (extent_m or 0.0)),
         ("rot_err_deg", "attitude", TURNED_LEAST),
     ):
-        first, last = (median_of(values(part, column)) for part in (used[:third], used[-third:]))
+        first, last = (median_of(numbers(part, column)) for part in (used[:third], used[-third:]))
         if first is None or last is None or not least or last < max(GROWTH * first, least):
             continue
         sizes = [length_text(v) if column == "pos_err_m" else f"{v:.3g} deg" for v in (first, last)]
@@ -317,7 +315,20 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
 
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
-    """Consistency and reinitialisation."""
+    """Consistency, changes of the motion and new starts of the estimate, what it determines."""
+    yield from _consistency(rows, summary)
+    yield from _new_starts(rows, summary)
+    if (used := column_of(used_rows(rows), "free_directions")) and all(used):
+        yield Concern(
+            Grade.CHECK,
+            f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
+        )
+    if summary.assessment is None:  # else it states whether the estimate suffices
+        yield from _convergence(rows, summary)
+
+
+def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Errors and innovations against their covariances."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
             low = (
@@ -335,15 +346,20 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             yield Concern(Grade.CHECK, f"{where}only {shares}")
     if text := error_over_sigma(rows):
         yield Concern(Grade.CHECK, text)
-    if len(inconsistent := [row.t_s for row in rows if row.consistent is False]) > 0.1 * len(rows):
+    consistent = zip(column_of(rows, "t_s"), column_of(rows, "consistent"), strict=True)
+    if len(inconsistent := [t_s for t_s, flag in consistent if flag is False]) > 0.1 * len(rows):
         begin = inconsistent[0]
         text = (
             f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first"
             f" at {begin:.1f} s"
         )
         yield Concern(Grade.CHECK, text)
+
+
+def _new_starts(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Where the estimate began again, changed its motion, or its pose was searched again."""
     if summary.reinitialised:
-        when = next(row.t_s for row in rows if row.reinitialised)
+        when = next(compress(column_of(rows, "t_s"), column_of(rows, "reinitialised")))
         text = (
             f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
         )
@@ -352,25 +368,22 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift)
     )
     if summary.violations:
-        when = next(row.t_s for row in rows if row.violations)
+        when = next(compress(column_of(rows, "t_s"), column_of(rows, "violations")))
         text = (
             f"the estimate failed {summary.violations} consistency checks, the first at"
             f" {when:.1f} s"
         )
         yield Concern(Grade.CHECK, text)
-    searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
+    searches = [
+        t_s
+        for t_s, guess, gamma in zip(
+            *(column_of(rows, name)[1:] for name in ("t_s", "guess", "gamma")), strict=True
+        )
+        if guess == "acquired" and gamma == 1
+    ]
     if searches and rows[0].gamma == 1:
-        text = (
-            f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
-        )
+        text = f"the pose was searched again {times(len(searches))}, first at {searches[0]:.1f} s"
         yield Concern(Grade.CHECK, text)
-    if (used := [row.free_directions for row in rows if row.gamma == 1]) and all(used):
-        yield Concern(
-            Grade.CHECK,
-            f"no scan determines all directions of the pose (last scan: the model {used[-1]})",
-        )
-    if summary.assessment is None:  # else it states whether the estimate suffices
-        yield from _convergence(rows, summary)
 
 
 def _convergence(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
@@ -387,7 +400,9 @@ def _convergence(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         )
     elif (
         rows
-        and rows[-1].t_s - (held := max(row.t_s for row in rows if row.converged)) > SHORT_LAPSE_S
+        and rows[-1].t_s
+        - (held := max(compress(column_of(rows, "t_s"), column_of(rows, "converged"))))
+        > SHORT_LAPSE_S
     ):
         yield Concern(
             Grade.CHECK,
@@ -399,14 +414,15 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
     """Damaged scans, errors of the back end, losses, and clock problems that the checks before the
     run did not name.
     """
-    damaged = [row for row in rows if row.status == "damaged"]
+    status = np.array(column_of(rows, "status"))
+    damaged = chosen(rows, status == "damaged")
     if damaged:
         text = (
             f"{len(damaged)} of {len(rows)} scans cannot be used, the first at"
             f" {damaged[0].t_s:.1f} s"
         )
         yield Concern(Grade.CHECK, f"{text}: {damaged[0].message}" if damaged[0].message else text)
-    failed = [row for row in rows if row.status == "failed"]
+    failed = chosen(rows, status == "failed")
     if failed:
         grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK
         yield Concern(

@@ -8,9 +8,9 @@ grid.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,19 +21,23 @@ from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.files import output_path
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.report.charts import pack, values
+from avsreplay.report.charts import pack
 from avsreplay.rows import Row
+from avsreplay.spool import Spool, SpoolFile, write_npz
+from avsreplay.tables import column_of, numbers
 
 CLOUD_POINTS = 300
 MOST_FACES = 4000
 _MOST_BYTES, _LARGEST = 1 << 30, 1e15
-_ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
-    **dict.fromkeys(("vertices", "cloud_points", "path_points"), ("f", (None, 3))),
-    **dict.fromkeys(("cloud_seq", "cloud_size", "path_t_ns", "path_size"), ("i", (None,))),
-    **dict.fromkeys(("cloud_residual", "cloud_intensity", "path_miss"), ("f", (None,))),
-    "faces": ("i", (None, 3)),
+_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    **dict.fromkeys(("vertices", "cloud_points", "path_points"), ("f4", (3,))),
+    **dict.fromkeys(("cloud_seq", "cloud_size", "path_t_ns", "path_size"), ("i8", ())),
+    **dict.fromkeys(("cloud_residual", "cloud_intensity"), ("f4", ())),
+    "path_miss": ("f8", ()),
+    "faces": ("i4", (3,)),
 }
-_SINGLE = ("vertices", "cloud_points", "path_points", "cloud_residual", "cloud_intensity")
+
+_CLOUDS = ("cloud_seq", "cloud_size", "cloud_points", "cloud_residual", "cloud_intensity")
 
 Floats = NDArray[np.float32]
 Faces = NDArray[np.int32]
@@ -49,6 +53,71 @@ class CloudView:
     points: Floats
     residual_m: Floats | None = None
     intensity: Floats | None = None
+
+
+class CloudTable(Sequence[CloudView]):
+    """Clouds, of which only the last ones are in memory."""
+
+    def __init__(self, clouds: Iterable[CloudView] = (), arrays: Mapping[str, Spool] | None = None):
+        """Take clouds.
+
+        Args:
+            clouds: the first ones.
+            arrays: those of an earlier table in place of empty ones: cloud_seq, cloud_size,
+                cloud_points, cloud_residual and cloud_intensity.
+        """
+        file = SpoolFile()
+        self._arrays = arrays or {name: Spool(*_ARRAYS[name], file) for name in _CLOUDS}
+        self._ends: list[NDArray[np.int64]] = []  # place after the points of each cloud, if known
+        for cloud in clouds:
+            self.append(cloud)
+
+    @property
+    def arrays(self) -> Mapping[str, Spool]:
+        """The arrays of the table by name."""
+        return self._arrays
+
+    def append(self, cloud: CloudView) -> None:
+        """Append a cloud; a value that its points do not have is NaN.
+
+        Args:
+            cloud: the cloud.
+        """
+        count, parts = len(cloud.points), self._arrays
+        parts["cloud_seq"].append(cloud.seq)
+        parts["cloud_size"].append(count)
+        parts["cloud_points"].extend(cloud.points)
+        for name, known in (("residual", cloud.residual_m), ("intensity", cloud.intensity)):
+            values = np.full(count, np.nan, np.float32) if known is None else known
+            parts[f"cloud_{name}"].extend(values)
+        self._ends = []
+
+    def __len__(self) -> int:
+        return len(self._arrays["cloud_seq"])
+
+    @overload
+    def __getitem__(self, place: int) -> CloudView: ...
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[CloudView]: ...
+    def __getitem__(self, place: int | slice) -> CloudView | Sequence[CloudView]:
+        """Return a cloud, or a list of some."""
+        if isinstance(place, slice):
+            return [self[k] for k in range(*place.indices(len(self)))]
+        sizes = self._arrays["cloud_size"]
+        size = int(sizes[place])
+        if not self._ends:
+            self._ends = [np.cumsum(sizes.read(0, len(sizes)))]
+        end = int(self._ends[0][place])
+        points, residual, seen = (
+            self._arrays[f"cloud_{name}"].read(end - size, end)
+            for name in ("points", "residual", "intensity")
+        )
+        return CloudView(
+            int(self._arrays["cloud_seq"][place]),
+            points,
+            None if np.isnan(residual).any() or not size else residual,
+            None if np.isnan(seen).all() else seen,
+        )
 
 
 @value_class
@@ -68,8 +137,8 @@ class View:
 
     vertices: Floats
     faces: Faces
-    clouds: tuple[CloudView, ...] = ()
-    paths: tuple[PathView, ...] = ()
+    clouds: Sequence[CloudView] = ()
+    paths: Sequence[PathView] = ()
 
 
 def thin_cloud(
@@ -137,23 +206,19 @@ def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def write_view(path: str | Path, view: View) -> None:
     """Write one npz file atomically; the same view gives the same bytes."""
-    arrays = {
+    clouds = view.clouds if isinstance(view.clouds, CloudTable) else CloudTable(view.clouds)
+    misses = [np.nan if p.miss_m is None else p.miss_m for p in view.paths]
+    arrays: dict[str, NDArray[Any] | Spool] = {
         "vertices": view.vertices,
         "faces": view.faces,
-        "cloud_seq": np.array([c.seq for c in view.clouds], dtype=np.int64),
-        "cloud_size": np.array([len(c.points) for c in view.clouds], dtype=np.int64),
-        "cloud_points": _joined([c.points for c in view.clouds]),
-        "cloud_residual": _each_point([(c, c.residual_m) for c in view.clouds]),
-        "cloud_intensity": _each_point([(c, c.intensity) for c in view.clouds]),
+        **{name: clouds.arrays[name] for name in _CLOUDS},
         "path_t_ns": np.array([p.t_ns for p in view.paths], dtype=np.int64),
         "path_size": np.array([len(p.points) for p in view.paths], dtype=np.int64),
         "path_points": _joined([p.points for p in view.paths]),
-        "path_miss": np.array(
-            [np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64
-        ),
+        "path_miss": np.array(misses, dtype=np.float64),
     }
-    with output_path(path) as part, part.open("wb") as stream:
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
+    with output_path(path) as part:
+        write_npz(part, arrays)
 
 
 def _joined(parts: Sequence[Floats]) -> Floats:
@@ -178,53 +243,57 @@ def read_view(path: str | Path) -> View:
     path, hint = Path(path), "run again with -o"
     arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint, optional=("cloud_intensity",))
     try:
-        return _view(
-            {name: a.astype(np.float32) if name in _SINGLE else a for name, a in arrays.items()}
-        )
+        return _view(arrays)
     except ValueError as error:
         raise UnreadableInput(f"not a view file: {error}", where=str(path), hint=hint) from None
 
 
-def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
-    points = _split(arrays["cloud_points"], arrays["cloud_size"])
-    arrays.setdefault(
-        "cloud_intensity", np.full(len(arrays["cloud_residual"]), np.nan, np.float32)
-    )  # earlier versions
-    residuals, seen = (
-        _split(arrays[f"cloud_{name}"], arrays["cloud_size"]) for name in ("residual", "intensity")
-    )
-    clouds = tuple(
-        CloudView(
-            int(seq),
-            p,
-            None if np.isnan(r).any() or not len(r) else r,
-            None if np.isnan(i).all() else i,
-        )
-        for seq, p, r, i in zip(arrays["cloud_seq"], points, residuals, seen, strict=True)
-    )
-    lines = _split(arrays["path_points"], arrays["path_size"])
-    paths = tuple(
-        PathView(int(t), p, None if np.isnan(miss) else float(miss))
-        for t, p, miss in zip(arrays["path_t_ns"], lines, arrays["path_miss"], strict=True)
-    )
-    vertices, faces = arrays["vertices"], arrays["faces"]
-    if not all(
-        (np.abs(arrays[name]) < _LARGEST).all()
-        for name in ("vertices", "cloud_points", "path_points")
-    ):
-        raise ValueError("points that are not finite or too far away")
+def _view(arrays: dict[str, Spool]) -> View:
+    if "cloud_intensity" not in arrays:  # earlier versions
+        arrays["cloud_intensity"] = Spool("f4")
+        for block in arrays["cloud_residual"].blocks():
+            arrays["cloud_intensity"].extend(np.full(len(block), np.nan, np.float32))
+    for name in ("vertices", "cloud_points", "path_points"):
+        if not all((np.abs(block) < _LARGEST).all() for block in arrays[name].blocks()):
+            raise ValueError("points that are not finite or too far away")
+    values = ("cloud_points", "cloud_residual", "cloud_intensity")
+    for name, sizes in (*((each, "cloud_size") for each in values), ("path_points", "path_size")):
+        _check_sizes(arrays[sizes], len(arrays[name]))
+    if len(arrays["cloud_seq"]) != len(arrays["cloud_size"]):
+        raise ValueError("sizes of other clouds")
+    whole = {
+        name: each.read(0, len(each))
+        for name, each in arrays.items()
+        if not name.startswith("cloud_")
+    }
+    vertices, faces = whole["vertices"], whole["faces"]
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError("faces refer to vertices that do not exist")
-    return View(vertices, faces.astype(np.int32), clouds, paths)
+    lines = np.split(whole["path_points"], np.cumsum(whole["path_size"])[:-1])
+    paths = tuple(
+        PathView(int(t), p, None if np.isnan(miss) else float(miss))
+        for t, p, miss in zip(
+            whole["path_t_ns"],
+            lines if len(whole["path_size"]) else (),
+            whole["path_miss"],
+            strict=True,
+        )
+    )
+    clouds = {name: arrays[name] for name in _CLOUDS}
+    return View(vertices, faces, CloudTable((), clouds), paths)
 
 
-def _split(joined: NDArray[np.float32], sizes: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    if (sizes < 0).any() or (sizes > len(joined)).any():
-        raise ValueError("sizes out of range")
-    ends = np.cumsum(sizes.astype(np.int64))
-    if (ends[-1] if len(ends) else 0) != len(joined):
+def _check_sizes(sizes: Spool, count: int) -> None:
+    """Raise ValueError unless sizes are those of the parts of an array of ``count`` values."""
+    total = 0
+    for block in sizes.blocks():
+        if (block < 0).any() or (block > count).any():
+            raise ValueError("sizes out of range")
+        total += int(block.sum())  # no overflow: a block has fewer than 2^18 sizes
+        if total > count:
+            break
+    if total != count:
         raise ValueError("sizes do not add up")
-    return np.split(joined, ends[:-1]) if len(ends) else []
 
 
 PAGE_POINTS = 200_000
@@ -240,7 +309,7 @@ def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dic
     """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack(
-        [values(rows, n) for n in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=1
+        [numbers(rows, n) for n in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=1
     )
     return {
         "vertices": pack(view.vertices, "f4"),
@@ -248,7 +317,8 @@ def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dic
         "estimate": pack(estimate, "f4"),
         "truth": pack(_true_poses(rows, truth), "f4"),
         "clouds": _clouds(
-            _at_most(view.clouds, MOST_CLOUDS), {row.seq: k for k, row in enumerate(rows)}
+            _at_most(view.clouds, MOST_CLOUDS),
+            {seq: k for k, seq in enumerate(column_of(rows, "seq"))},
         ),
         "paths": _paths(_at_most(view.paths, MOST_PATHS), rows[0].t_ns if rows else 0),
     }
@@ -256,8 +326,8 @@ def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dic
 
 def _true_poses(rows: Sequence[Row], truth: dict[int, Pose]) -> NDArray[np.float64]:
     out = np.full((len(rows), 7), np.nan)
-    for k, row in enumerate(rows):
-        pose = truth.get(row.t_ns)
+    for k, t_ns in enumerate(column_of(rows, "t_ns")):
+        pose = truth.get(t_ns)
         if pose is not None:
             out[k] = [*pose.t, *pose.q]
     return out

@@ -17,11 +17,10 @@ import numpy as np
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Surface
-from avsreplay.report.jsonl import field_types
 from avsreplay.report.page import build_page
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, thin_cloud, thin_surface
-from avsreplay.rows import Row
+from avsreplay.rows import Row, field_types
 from avsreplay.simulate.target import builtin_surface
 
 STEP_NS = 200_000_000

@@ -73,7 +73,7 @@ def timed(log: Path, n_scans: int | None, prefetch: int) -> tuple[int, float, fl
         ):
             begun, elapsed = time.process_time(), time.perf_counter()
             rows = list(run.rows(writer.listeners))
-            writer.finish(rows, {})
+            writer.finish({})
             return (
                 len(rows),
                 time.process_time() - begun,
