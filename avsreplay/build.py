@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.fault_detection import FaultDetector
 from avsreplay.parts import OWN
 from avsreplay.pipeline import Monitors, PipelineState, Stages
-from avsreplay.plan._cone import Winding, winding
+from avsreplay.plan._cone import Body
 from avsreplay.plan.arm import with_arm
 from avsreplay.plan.guidance import Guidance
 from avsreplay.plan.limits import TargetGeometry, hull_vertices
@@ -28,12 +27,9 @@ from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.region import Region
 from avsreplay.register.backend import POSES
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.settings import SettingError
 from avsreplay.task import Patch, Task, patches, target_at, task_of
 from avsreplay.tracker import Tracker
-
-INSIDE = 0.5 + 0.02  # winding number above which a point is inside; 0.01 is its largest error
 
 
 def stages(
@@ -138,34 +134,17 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
         axis_c: outward axis of the fixture in {C}.
     """
     return TargetGeometry(
-        np.array(axis_c), hull_vertices(surface.vertices), _signed_distance(surface)
+        np.array(axis_c),
+        hull_vertices(surface.vertices),
+        _body(surface),
     )
 
 
-def _signed_distance(surface: Surface) -> Callable[[Array], tuple[Array, Array]]:
-    """Closest points (n, 3) and signed distances (n,) of points (n, 3) in {C}.
-
-    A point is inside where the winding number of the faces is above one half: also where closed
-    parts overlap and the nearest face is inside another part. An open sheet has no inside.
-    """
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-
-    @cache
-    def indexed() -> tuple[SurfaceIndex, Winding]:
-        return SurfaceIndex.build(surface, surface.extent), winding(
-            surface.vertices, np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3)
-        )
-
-    def closest(y: Array) -> tuple[Array, Array]:
-        index, turns = indexed()
-        found = index.closest(y)
-        distance = np.sqrt(found.d2)
-        within = np.flatnonzero(np.all((y > low) & (y < high), axis=1))
-        inside = turns.inside(np.ascontiguousarray(y[within]), distance[within], INSIDE)
-        distance[within[inside]] *= -1.0
-        return found.foot, distance
-
-    return closest
+def _body(surface: Surface) -> Body:
+    return Body(
+        np.ascontiguousarray(surface.vertices, float),
+        np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
+    )
 
 
 def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
@@ -174,7 +153,7 @@ def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
     Args:
         surface: model of the target in {C}.
     """
-    return patches(surface, _signed_distance(surface))
+    return patches(surface, _body(surface))
 
 
 def grasp_advice(task: Task, surface: Surface) -> str:

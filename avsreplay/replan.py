@@ -86,12 +86,12 @@ class Replanning:
         target = (
             target_geometry(surface, axis)
             if saved.surface is not None
-            else TargetGeometry(np.array(axis), np.zeros((1, 3)), lambda y: (y, np.zeros(len(y))))
+            else TargetGeometry(np.array(axis), np.zeros((1, 3)))
         )
-        assert target.surface is not None
+        closest = target.surface or (lambda y: (y, np.zeros(len(y))))
         self.task = task_of(
             saved.task,
-            *(supervisor, saved.robot, axis, surface, target.surface, limits, saved.extent_m),
+            *(supervisor, saved.robot, axis, surface, closest, limits, saved.extent_m),
         )
         self.limits = self.task.corridor(self.robot.limited(limits)).resolved(saved.extent_m)
         target = replace(target, axis_c=self.task.axis_c)

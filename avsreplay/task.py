@@ -414,13 +414,8 @@ def target_at(target: TargetGeometry, grasp_c: Array) -> TargetGeometry:
         target: with the origin of {C}.
         grasp_c: (3,) grasp point in {C} [m].
     """
-    closest = target.surface
     if not np.any(grasp_c):
         return target
-
-    def moved(y: Array) -> tuple[Array, Array]:
-        assert closest is not None
-        foot, gap = closest(y + grasp_c)
-        return foot - grasp_c, gap
-
-    return TargetGeometry(target.axis_c, target.hull_c - grasp_c, closest and moved)
+    x, y, z = (float(value) for value in grasp_c)
+    surface = target.surface and target.surface.moved((x, y, z))
+    return TargetGeometry(target.axis_c, target.hull_c - grasp_c, surface)

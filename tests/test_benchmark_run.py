@@ -2,13 +2,21 @@
 
 import json
 import xml.etree.ElementTree as ElementTree
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from avsreplay.assessment import Assessment, Chance, InFact
 from avsreplay.benchmark import results
+from avsreplay.benchmark.prepared import Prepared
 from avsreplay.benchmark.scores import MEASURES, difference, scores
-from avsreplay.benchmark.work import capture_of
+from avsreplay.benchmark.work import capture_of, events_of, pose_nees
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import IDENTITY_QUAT, Pose, exp
+from avsreplay.outcome import CaptureError
+from avsreplay.records import Belief, State
+from avsreplay.report.summary_parts import VelocityChange
 
 SHORT = ("benchmark", "--quick", "--only", "clean-fast,real-tosses", "--n-scans", 6)
 
@@ -56,6 +64,18 @@ def test_the_same_command_makes_nothing_again_and_gives_the_same_bytes(made, cli
     assert done.out == text
     assert (folder / "out" / "benchmark.json").read_bytes() == before
     assert (folder / "out" / "journal.txt").read_bytes() == journal
+
+
+@pytest.mark.slow
+def test_workers_give_the_bytes_of_one_process(made, cli):
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    folder, _ = made
+    asked = (*SHORT, "--workers", 2, "--data", folder / "nothing", "-o", folder / "two")
+    done = cli(*asked, "--backend", "horn", "--estimator", "own,ekf", "--details")
+    assert done.code == 0, done.err
+    assert "Runs of horn+ekf" in done.out
+    one, two = (folder / name / "benchmark.json" for name in ("out", "two"))
+    assert one.read_bytes() == two.read_bytes()
 
 
 @pytest.mark.slow
@@ -144,3 +164,64 @@ def test_a_file_that_is_no_result_is_named(tmp_path):
 
 def test_where_the_motion_is_not_free_no_capture_is_judged():
     assert set(capture_of(None).values()) == {None}
+
+
+def change(t_s, sigma_s=0.1):
+    return VelocityChange(t_s + 1.0, t_s, sigma_s, 0.01, 0.001, 0.0, 0.0)
+
+
+def summary(changes=(), detected=(), drift=None):
+    faults = [SimpleNamespace(harmful=True, detected=each) for each in detected]
+    faults.append(SimpleNamespace(harmful=False, detected=True))
+    account = SimpleNamespace(episodes=faults)
+    return SimpleNamespace(faults=account, velocity_changes=changes, drift=drift)
+
+
+@pytest.mark.parametrize(
+    ("pushes", "loaded", "found", "wanted"),
+    [
+        ((32.0,), False, summary([change(32.4)]), (1, 1, 0)),
+        ((32.0,), False, summary([change(40.0)]), (1, 0, 1)),
+        ((32.0,), False, summary([change(40.0, 3.0)]), (1, 1, 0)),
+        ((10.0, 11.0), False, summary([change(10.1), change(10.9), change(30.0)]), (2, 2, 1)),
+        ((), True, summary(drift=object()), (1, 1, 0)),
+        ((), False, summary(drift=object()), (0, 0, 1)),
+        ((), True, summary(), (1, 0, 0)),
+        ((), False, summary(detected=[True, False]), (2, 1, 0)),
+    ],
+)
+def test_an_event_is_named_by_a_report_of_its_kind_near_its_instant(pushes, loaded, found, wanted):
+    log = Prepared("a", "moved", 0, pushes_s=pushes, loaded=loaded)
+    assert tuple(events_of(found, log).values()) == wanted
+
+
+@pytest.mark.parametrize(
+    ("chance", "captured", "probability", "brier"),
+    [
+        (Chance.LIKELY, True, 0.9, 0.01),
+        (Chance.LIKELY, False, 0.9, 0.81),
+        (Chance.LIKELY, None, 0.9, None),
+        (Chance.NONE, None, 0.0, 0.0),
+    ],
+)
+def test_a_probability_is_compared_where_the_outcome_is_known(chance, captured, probability, brier):
+    fact = None if captured is None else InFact(captured, None, False, "")
+    tolerance = CaptureError(0.01, 0.005, 2.0)
+    given = Assessment(chance=chance, probability=probability, tolerance=tolerance, in_fact=fact)
+    found = capture_of(given)
+    assert found["captured"] == bool(captured)
+    assert found["brier"] == (None if brier is None else pytest.approx(brier))
+
+
+def test_the_nees_of_a_pose_is_that_of_its_error_and_covariance():
+    """With a covariance of attitude and position alone the pose of the fixture at the mass centre
+    is the state itself.
+    """
+    x = State(IDENTITY_QUAT, np.zeros(3), np.zeros(3), np.zeros(3), *THREE, IDENTITY_QUAT)
+    P = np.zeros((20, 20))
+    P[:3, :3], P[6:9, 6:9] = 0.01**2 * np.eye(3), 0.1**2 * np.eye(3)
+    off = Pose(exp(np.array([0.04, 0.0, 0.0])), np.array([0.0, 0.3, 0.0]))
+    assert pose_nees(Belief(0, x, P), off) == pytest.approx(2.0**2 + 3.0**2, rel=1e-3)
+
+
+THREE = np.zeros(2), np.zeros(3)

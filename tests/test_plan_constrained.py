@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
+from avsreplay.plan._cone import Body
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import SampledScene, Scene, margin
@@ -263,11 +265,16 @@ def test_a_warm_start_gives_the_same_plan():
     assert later.violation_m == 0.0
 
 
-def ball(y):
-    """Surface of a ball of 0.8 m about the centre of mass, 1 m behind the grasp point."""
-    q = y + np.array([1.0, 0, 0])
-    size = np.linalg.norm(q, axis=1)
-    return q * (0.8 / size)[:, None] - np.array([1.0, 0, 0]), size - 0.8
+def _ball():
+    """A mesh about a ball of 0.8 m, 1 m behind the grasp point: it contains the ball and is at most
+    0.2 mm away from it.
+    """
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
+    mesh.apply_scale(0.8 / np.sum(mesh.face_normals * mesh.triangles[:, 0], axis=1).min())
+    return Body(mesh.vertices - np.array([1.0, 0, 0]), np.asarray(mesh.faces, np.int32))
+
+
+ball = _ball()
 
 
 @pytest.mark.parametrize("phase", [0.5, 1.8, 3.1, 4.5])

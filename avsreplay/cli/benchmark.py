@@ -90,7 +90,11 @@ def _names(_ctx: click.Context, _param: click.Parameter, text: str) -> tuple[str
 @click.option(
     "-o", "--output", type=PATH, help="Directory of the results; an existing one is continued."
 )
-@click.option("--groups", is_flag=True, help="Also print the table of each group.")
+@click.option(
+    "--details",
+    is_flag=True,
+    help="Also print the table of each group, and every run of each entry.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
 def benchmark_command(
@@ -105,7 +109,7 @@ def benchmark_command(
     n_scans: int | None,
     data: Path,
     output: Path | None,
-    groups: bool,
+    details: bool,
     as_json: bool,
     as_markdown: bool,
 ) -> None:
@@ -151,9 +155,9 @@ def benchmark_command(
     if as_json:
         click.echo(json.dumps(found, indent=1, allow_nan=False))
     elif as_markdown:
-        click.echo(_markdown(found, times, groups))
+        click.echo(_markdown(found, times, details))
     else:
-        _print(found, times, groups)
+        _print(found, times, details)
     _report_failures(found, output)
 
 
@@ -202,26 +206,29 @@ def _described(suite: Suite, chosen: tuple[SuiteScenario, ...]) -> str:
     return "\n".join(lines)
 
 
-def _print(found: Record, times: dict[str, float], groups: bool) -> None:
+def _print(found: Record, times: dict[str, float], details: bool) -> None:
     from avsreplay.report.table import make_console, print_table
 
     console = make_console()
-    for table in _tables(found, times, groups):
+    for table in _tables(found, times, details):
         print_table(console, table, tight=True)
 
 
-def _markdown(found: Record, times: dict[str, float], groups: bool) -> str:
+def _markdown(found: Record, times: dict[str, float], details: bool) -> str:
     from avsreplay.report.table import markdown
 
-    return "\n".join(markdown(table) for table in _tables(found, times, groups) if table.rows)
+    return "\n".join(markdown(table) for table in _tables(found, times, details) if table.rows)
 
 
-def _tables(found: Record, times: dict[str, float], groups: bool) -> list[Any]:
+def _tables(found: Record, times: dict[str, float], details: bool) -> list[Any]:
     from avsreplay.benchmark import results
 
-    names = list(dict.fromkeys(line["group"] for line in found["table"][:] if groups))
     tables = [results.score_table(found, times=times)]
-    tables += [results.score_table(found, name) for name in names if name != "all"]
+    if details:
+        names = list(dict.fromkeys(line["group"] for line in found["table"]))
+        tables += [results.score_table(found, name) for name in names if name != "all"]
+        entries = [entry["name"] for entry in found["entries"] if not entry["missing"]]
+        tables += [results.scenario_table(found, name) for name in entries]
     return [*tables, results.missing_table(found)]
 
 

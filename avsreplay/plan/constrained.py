@@ -10,14 +10,14 @@ accepted only after the true constraints hold at sixteen instants of every inter
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan.cone_programme import PointRows, solve
+from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
     BETWEEN,
     BUFFER_OF_EXTENT,
@@ -58,7 +58,6 @@ LATER, LATER_S = (
     1.02,
     0.1,
 )  # a renewed plan that is later than the earlier one by more starts the full search
-KEPT = 1  # earlier sets of withdrawals that are required too: the worst moment may alternate
 NEAR_REFERENCE = (
     0.02  # relative change of the end time below which the excess tightens the constraints
 )
@@ -71,6 +70,7 @@ RETRIED = 3
 TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
 SHORT_S_PER_M = 20.0  # time that a shortage of withdrawals costs when paths are compared
+IDLE = 3  # the iterations end when the best path has not become better in as many
 STUCK = (
     4  # from this iteration on an initial path without a plan ends where the slack does not shrink
 )
@@ -301,16 +301,12 @@ def _improved(
     arrival.
     """
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
-    for draft in sorted(drafts, key=_duration):
+    for draft in _different(drafts):
         for trust in (TRUST, CAREFUL):
-            if best is None or best.t_go_s > (
-                draft.t_go_s if trust == TRUST else LATER * draft.t_go_s
-            ):
-                best = min(
-                    filter(None, (best, _refined(case, draft, trust=trust))),
-                    key=_safest,
-                    default=None,
-                )
+            unsafe = best is None or best.short_m > 0.0
+            if best is None or unsafe or (trust == TRUST and best.t_go_s > draft.t_go_s):
+                found = filter(None, (best, _refined(case, draft, trust=trust)))
+                best = min(found, key=_safest, default=None)
     return best
 
 
@@ -374,23 +370,79 @@ def _refined(
     """Iterate from the rest of an earlier path, whose withdrawals the first iteration
     requires.
     """
-    rows = withdrawn(case, path, Tried.first(), since_s).rows
-    return _converged(case, warm_reference(case, path, since_s), latest_s, trust, rough, rows)
+    known = path.escapes if isinstance(path, StepPath) else None
+    away = withdrawn(case, path, Tried.near(known, since_s + case.wait_s, path.t_go_s), since_s)
+    reference = warm_reference(case, path, since_s)
+    return _converged(case, reference, latest_s, trust, rough, away)
 
 
-def _accepted(
-    case: Case, path: StepPath, over: Array, away: Withdrawn
-) -> tuple[StepPath, Withdrawn] | None:
-    """Return the path without terminal errors, with its withdrawals, and whether these are proven;
-    None where another constraint does not hold.
+@dataclass
+class _Search:
+    """What the iterations from one reference have found.
+
+    Attributes:
+        best: The best path.
+        away: Withdrawals from the latest path.
+        off: (2 n, 4) tightening of the constraints.
+        gain: Share of an excess by which they are tightened, doubled where an excess remains: it
+            reacts weakly.
+        slack: Slack of the latest programme [m].
+        idle: Iterations since the best path became better.
+    """
+
+    away: Withdrawn
+    off: Array
+    best: StepPath | None = None
+    gain: Array = field(default_factory=lambda: np.array(0.6))
+    slack: float = math.inf
+    idle: int = 0
+
+    def take(self, path: StepPath, tolerance_s: float) -> None:
+        """Take a path that satisfies the constraints."""
+        best = self.best
+        if best is None or _safest(path) < _safest(best):
+            better = best is None or _safest(path)[1] < _safest(best)[1] - tolerance_s
+            self.best, self.idle = (
+                path,
+                0 if better or best is None or path.short_m < best.short_m else self.idle,
+            )
+
+    def done(self, settled: bool) -> bool:
+        """Return whether the best path is the latest one and moves no more, or is safe and has not
+        become better in ``IDLE`` iterations.
+        """
+        if self.best is None:
+            return False
+        idle = self.idle >= IDLE and self.best.short_m <= 0.0
+        return idle or (settled and self.idle == 0)
+
+    def tighten(self, over: Array, buffer_m: float, near: bool) -> None:
+        """Subtract the excess ``over`` from the constraints where the path is near its reference;
+        less where the programme cannot keep as much although all hold.
+        """
+        if self.slack > buffer_m and over.max() == 0.0:
+            self.off *= 0.5
+        elif near:
+            self.gain = np.where(over > 0.0, np.minimum(2.0 * self.gain, 4.8), 0.6)
+            self.off += self.gain * over + np.where(over > 0.0, buffer_m, 0.0)
+
+
+def _accepted(case: Case, path: StepPath, over: Array, search: _Search) -> None:
+    """Take the path without terminal errors where the other constraints hold, with its
+    withdrawals, which are proven where it would be the best path.
     """
     path = path.ending_at(case.scene.goal)
     allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
     if not feasible(case, path, over.max(), allowed):
-        return None
-    away = proven(case, path, away)
-    escapes = away.tried.table(case.wait_s, path.t_go_s)
-    return replace(path, escapes=escapes, short_m=away.short_m), away
+        return
+    rows, best = search.away.rows, search.best
+    if best is None or best.short_m > 0.0 or path.t_go_s < best.t_go_s:
+        search.away = proven(case, path, search.away)
+        search.away = replace(search.away, rows=(*search.away.rows, *rows))
+    elif search.away.short_m == 0.0:
+        return
+    away = search.away
+    search.take(replace(path, escapes=away.escapes, short_m=away.short_m), TIME_TOLERANCE_S)
 
 
 def _converged(
@@ -399,63 +451,66 @@ def _converged(
     latest_s: float = math.inf,
     trust: float = TRUST,
     rough: bool = False,
-    rows: tuple[PointRows, ...] = (),
+    away: Withdrawn | None = None,
 ) -> StepPath | None:
-    """Iterate from a reference until the end time converges; return the earliest feasible path
-    seen.
+    """Iterate from a reference until the best feasible path seen no longer becomes better, and
+    return it.
 
     The iterations end without a result where the end time remains later than ``latest_s``. The
-    first iteration requires ``rows``, the withdrawals of an earlier path.
+    first iteration requires ``away``, the withdrawals of an earlier path.
     """
-    best: StepPath | None = None
-    tried = Tried.first()
-    n, tolerance = (
-        case.limits.nodes,
-        ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE,
-    )
+    n = case.limits.nodes
+    tolerance = ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
-    off, gain = (
-        np.zeros((2 * n, len(CONSTRAINTS))),
-        np.array(0.6),
-    )  # doubled where an excess remains: it reacts weakly
-    change, slack, settled = largest_change(case, reference, trust), math.inf, 0
+    rows = () if away is None else away.rows
+    search = _Search(Withdrawn(rows=rows), np.zeros((2 * n, len(CONSTRAINTS))))
+    change = largest_change(case, reference, trust)
     for iteration in range(ITERATIONS):
-        found = solve(convex_subproblem(case, reference, off, change, rows))
-        if found is None:
-            return best
+        problem = convex_subproblem(case, reference, search.off, change, search.away.rows)
+        if (found := solve(problem)) is None:
+            break
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
         over = excess(case, path)
-        if found.slack > case.buffer_m:  # the programme cannot keep as much
-            tried = replace(tried, reserve_m=tried.reserve_m - found.slack)
-        away = withdrawn(case, path, tried, improve=found.slack > case.buffer_m)
-        tried = away.tried
-        rows = (*away.rows, *rows[:KEPT])
-        done = _accepted(case, path, over, away) if found.slack <= case.allowed_slack_m else None
-        if done is not None:
-            path, tried = done[0], done[1].tried
-            rows = (*done[1].rows, *rows)
-            best = path if best is None else min(best, path, key=_safest)
-        settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
-        if settled and best is not None and (settled > 1 or path is best):
-            return best
-        if case.entry is not None and t > latest_s and found.slack <= case.buffer_m:
-            return best
-        stuck = best is None and found.slack > 0.9 * slack
-        late = path.t_go_s > (latest_s if iteration >= 3 else HOPELESS * latest_s)
-        hopeless = iteration >= 1 and (late or (stuck and iteration >= STUCK))
-        if hopeless or t > case.params.horizon_s - case.wait_s:
-            return best
-        if found.slack > case.buffer_m and over.max() == 0.0:
-            off *= 0.5
-        elif abs(t - reference.t) <= NEAR_REFERENCE * t:
-            gain = np.where(over > 0.0, np.minimum(2.0 * gain, 4.8), 0.6)
-            off += gain * over + np.where(over > 0.0, case.buffer_m, 0.0)
-        slack, reference = (
-            found.slack,
-            ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0]),
-        )
-        change = (
-            max(0.5 * change, 1e-3) if iteration >= 6 else largest_change(case, reference, trust)
-        )
-    return best
+        stuck, search.slack = found.slack > 0.9 * search.slack, found.slack
+        _withdraw(case, path, search)
+        search.idle += 1
+        if found.slack <= case.allowed_slack_m:
+            _accepted(case, path, over, search)
+        moved = abs(t - reference.t)
+        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t)):
+            break
+        if _hopeless(case, search, path, iteration, latest_s, stuck):
+            break
+        search.tighten(over, case.buffer_m, moved <= NEAR_REFERENCE * t)
+        reference = ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
+        small = iteration >= 6
+        change = max(0.5 * change, 1e-3) if small else largest_change(case, reference, trust)
+    return search.best
+
+
+def _withdraw(case: Case, path: StepPath, search: _Search) -> None:
+    """Find the withdrawals from a path."""
+    tried = search.away.tried
+    lacks = search.slack > case.buffer_m  # the programme cannot keep as much
+    if lacks:
+        tried = replace(tried, reserve_m=tried.reserve_m - search.slack)
+    search.away = withdrawn(case, path, tried, improve=lacks)
+
+
+def _hopeless(
+    case: Case,
+    search: _Search,
+    path: StepPath,
+    iteration: int,
+    latest_s: float,
+    stuck: bool,
+) -> bool:
+    """Return whether the iterations end because the path remains too late or without a plan."""
+    kept = search.slack <= case.buffer_m
+    if case.entry is not None and kept and path.t_go_s - case.wait_s > latest_s:
+        return True
+    if path.t_go_s > case.params.horizon_s:
+        return True
+    late = path.t_go_s > (latest_s if iteration >= 3 else HOPELESS * latest_s)
+    return iteration >= 1 and (late or (stuck and search.best is None and iteration >= STUCK))

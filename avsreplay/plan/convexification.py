@@ -29,7 +29,16 @@ from avsreplay.plan.limits import (
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
-from avsreplay.plan.withdrawal import STARTS, Certificate, Space, Tried, certified, sampled
+from avsreplay.plan.withdrawal import (
+    COMPARED,
+    DENSER,
+    STARTS,
+    Certificate,
+    Space,
+    Tried,
+    certified,
+    sampled,
+)
 
 COARSE_NODES = 16  # least number of thrust intervals while initial paths are compared
 COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
@@ -62,7 +71,7 @@ class Case:
             reference decides.
         begin_c: (3,) position in {C} where the thrust begins.
         start: (5,) margins there.
-        space: What a withdrawal has to keep clear of; None where no clearance is required.
+        space: What a planned withdrawal keeps clear of; None where no clearance is required.
     """
 
     sampled: SampledScene
@@ -86,9 +95,15 @@ class Case:
         object.__setattr__(self, "start", found.values[0])
         space = None
         if self.limits.clearance_m is not None and self.scene.surface is not None:
-            extent_m = self.buffer_m / BUFFER_OF_EXTENT
-            space = Space(self.sampled, self.limits, self.params.a_max_mps2, extent_m)
+            space = Space(
+                self.sampled, self.limits, self.params.a_max_mps2, self.extent_m, planned=True
+            )
         object.__setattr__(self, "space", space)
+
+    @property
+    def extent_m(self) -> float:
+        """Diagonal of the target's bounding box [m]."""
+        return self.buffer_m / BUFFER_OF_EXTENT
 
     @property
     def wait_s(self) -> float:
@@ -342,12 +357,15 @@ class Withdrawn:
             withdrawals are not required [m].
         rows: Rows that require the margin; empty where they are not needed.
         tried: The instants.
+        escapes: (m, 4) start instants [s] in time order and directions of the withdrawals; None
+            where they are not known.
     """
 
     margin_m: float = math.nan
     short_m: float = 0.0
     rows: tuple[PointRows, ...] = ()
     tried: Tried = field(default_factory=Tried.first)
+    escapes: Array | None = None
 
 
 def withdrawn(
@@ -364,11 +382,12 @@ def withdrawn(
     """
     if case.space is None or case.coarse or not case.limits.abort:
         return Withdrawn()
-    found, tried = sampled(case.space, path, tried, case.wait_s, since_s, improve)
+    below = FAR * case.buffer_m
+    found, tried = sampled(case.space, path, tried, case.wait_s, since_s, improve, below)
     least = _accepted(case.space, found)
     short = max(least - found.margin_m, 0.0)
     rows = _withdrawal_rows(case, case.space, path.t_go_s - since_s, found, least, tried.reserve_m)
-    return Withdrawn(found.margin_m, short, (rows,), tried)
+    return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
 
 
 def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
@@ -390,7 +409,7 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
     share = (found.worst.t[poor] - case.wait_s) / length
     tried = away.tried.also(share, found.worst.push[poor] / case.space.a_max, short)
     rows = _withdrawal_rows(case, case.space, path.t_go_s, found, least, tried.reserve_m)
-    return Withdrawn(found.margin_m, short, (rows,), tried)
+    return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
 
 
 def withdrawal_margin(case: Case, path: RobotPath) -> float:
@@ -399,40 +418,48 @@ def withdrawal_margin(case: Case, path: RobotPath) -> float:
     """
     if case.space is None:
         return math.nan
+    space = Space(case.sampled, case.limits, case.params.a_max_mps2, case.extent_m)
     escapes = path.escapes if isinstance(path, StepPath) else None
     tried = Tried.of(escapes, case.wait_s, path.t_go_s)
-    return certified(case.space, path, case.wait_s, tried).margin_m
+    return certified(space, path, case.wait_s, tried).margin_m
 
 
 def _accepted(space: Space, found: Certificate) -> float:
     """The margin that is required: what the withdrawal from the start itself lacks is accepted."""
-    return min(0.0, float(found.margins_m[0]) - space.resolution_m)
+    first = found.worst.t == found.worst.t.min()
+    return min(0.0, float(found.margins_m[first].min())) - space.resolution_m
 
 
 def _withdrawal_rows(
     case: Case, space: Space, end_s: float, found: Certificate, least_m: float, reserve_m: float
 ) -> PointRows:
-    """Rows that keep the worst moments of withdrawals at a margin; of those from about the same
-    instant and about the same time after it the worst.
+    """Rows that keep withdrawals at a margin; of those from about the same instant and about the
+    same time after it the worst.
     """
     limits, length = case.limits, end_s - case.wait_s
-    reserve = least_m + max(case.reserve_m + reserve_m, 2.0 * space.resolution_m)
+    reserve = least_m + max(case.reserve_m + reserve_m, space.resolution_m)
     near = np.flatnonzero(found.margins_m < max(FAR * case.buffer_m, reserve))
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
-    late = found.at[near] > 0.5 * found.worst.span[near]
+    after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
+    late = np.round(after ** (1.0 / DENSER) * COMPARED)
     order = np.lexsort((found.margins_m[near], late, part))
-    key = (2.0 * part + late)[order]
+    key = ((COMPARED + 1.0) * part + late)[order]
     k = near[order][np.r_[True, np.diff(key) > 0.0]] if len(order) else near
     m, lead = found.worst.of(k), found.at[k]
     t, r, v = m.t + lead, m.r, m.v
-    rho, R = case.sampled.at(t) if len(k) else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    after = r + lead[:, None] * (v + 0.5 * lead[:, None] * m.push)
-    slope = space.gradient(in_fixture_axes(R, after - rho), t, m.most) if len(k) else rho
+    if not len(k):
+        t, r, v, lead = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    rho, R = case.sampled.at(t)
+    drho, dR = case.sampled.at(t, 1)
+    q = r + lead[:, None] * (v + 0.5 * lead[:, None] * m.push) - rho
+    slope = space.gradient(in_fixture_axes(R, q), t, m.most)
+    turned = np.sum(slope * (in_fixture_axes(dR, q) - in_fixture_axes(R, drho)), axis=1)
     in_a = (R @ slope[:, :, None])[:, :, 0]
     at = (m.t - case.wait_s) * limits.nodes / length
     interval = np.clip(at.astype(np.int64), 0, limits.nodes - 1)
     coast = np.sum(in_a * (r + lead[:, None] * v), axis=1)
-    rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
+    # the velocity for given h v changes with h, and the target turns until the later instant
+    rate = (m.t - case.wait_s) * turned - lead * np.sum(in_a * v, axis=1)
     return PointRows(
         interval,
         np.clip(at - interval, 0.0, 1.0),

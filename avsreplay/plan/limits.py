@@ -42,7 +42,7 @@ class Scene:
             are limited.
         axis_c: (3,) outward axis of the fixture in {C}, unit; cone and corridor open along it.
         centre_c: (3,) centre of mass in {C} [m], the centre of the sphere; None where unknown.
-        surface: Points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see
+        surface: The body: points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see
             ``Margins``); None: unknown.
         sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad]
             of {C}, each (n,).
@@ -54,7 +54,7 @@ class Scene:
     attitude: Callable[[Array], Array] | None = None
     axis_c: Array | None = None
     centre_c: Array | None = None
-    surface: Callable[[Array], tuple[Array, Array]] | None = None
+    surface: _cone.Body | None = None
     sigma: Callable[[Array], tuple[Array, Array]] | None = None
     hull_c: Array | None = None
 
@@ -140,7 +140,7 @@ class TargetGeometry:
 
     axis_c: Array
     hull_c: Array
-    surface: Callable[[Array], tuple[Array, Array]] | None = None
+    surface: _cone.Body | None = None
 
 
 def hull_vertices(vertices: Array) -> Array:
@@ -330,11 +330,16 @@ class SampledScene:
         """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,)
         [s].
         """
-        last = float(times.max())
-        if last > self._end_s:
-            self._end_s = min(max(1.5 * last, self._span_s), max(self._horizon_s, last))
+        return _cone.motion(*self.pieces(float(times.max())), times, order)
+
+    def pieces(self, last_s: float) -> tuple[Array, Array]:
+        """Return coefficients (4, n, 12), highest power first, of the pieces of rho and R_ac, and
+        their limits (n + 1,), until at least ``last_s`` [s].
+        """
+        if last_s > self._end_s:
+            self._end_s = min(max(1.5 * last_s, self._span_s), max(self._horizon_s, last_s))
             self._pieces = self._joined(self._end_s)
-        return _cone.motion(*self._pieces, times, order)
+        return self._pieces
 
     def coordinates(self, times: Array, r: Array) -> Array:
         """Return the coordinates in {C} (n, 3) of positions r (n, 3) in {A}."""
@@ -345,13 +350,21 @@ class SampledScene:
         """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None
         where unknown.
         """
-        if self.scene.sigma is None:
+        table = self.sigma_table
+        if table is None:
             return None
-        if self._sigma is None:
+        grid, position, attitude = table
+        return np.interp(times, grid, position), np.interp(times, grid, attitude)
+
+    @property
+    def sigma_table(self) -> tuple[Array, Array, Array] | None:
+        """Equally spaced times (n,) from 0 [s] and the predicted 1 sigma of position [m] and
+        attitude [rad] there; None where unknown.
+        """
+        if self._sigma is None and self.scene.sigma is not None:
             grid = np.linspace(0.0, self._horizon_s, 49)
             self._sigma = (grid, *self.scene.sigma(grid))
-        grid, position, attitude = self._sigma
-        return np.interp(times, grid, position), np.interp(times, grid, attitude)
+        return self._sigma
 
     def _joined(self, end_s: float) -> tuple[Array, Array]:
         times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)

@@ -77,7 +77,7 @@ class Limits(Settings):
         " withdraws.",
         unit="m",
         above=0.0,
-        unset="half of clearance_m",
+        unset="clearance_m",
     )
     clearance_sigmas: float = setting(
         3.0,
@@ -136,7 +136,7 @@ class Limits(Settings):
         """Distance to the surface that a withdrawal keeps [m]."""
         if self.withdrawal_clearance_m is not None:
             return self.withdrawal_clearance_m
-        return 0.5 * (self.clearance_m or 0.0)
+        return self.clearance_m or 0.0
 
     @property
     def any(self) -> bool:

@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
+from avsreplay.plan import _cone
 from avsreplay.plan.limits import (
     SampledScene,
-    corridor_margin,
-    in_fixture_axes,
-    required_clearance,
 )
 from avsreplay.plan.path import MOTION_FACTOR, BurnPath, RobotPath, StepPath
 from avsreplay.plan.robot import Limits
@@ -39,31 +37,17 @@ from avsreplay.plan.robot import Limits
 COAST_S = 30.0  # time after a cut of the thrust over which the coasting robot is checked
 ENOUGH_OF_EXTENT = 0.025  # margin that counts as enough: no larger one is looked for or stated
 RESOLUTION_OF_EXTENT = 5e-4  # uncertainty of a certified margin, and reserve of plans for it
-TILTS_RAD = tuple(math.radians(tilt) for tilt in (20.0, 40.0, 60.0))  # around the fixture's axis
-# tilts that improve a direction, one after the other
-REFINED_RAD = (math.radians(10.0), math.radians(5.0), math.radians(2.0))
 RANGES = 48  # ranges of start instants of a path whose thrust is not constant over intervals
-COMPARED = 24  # instants at which the directions of an escape are compared
-INTERVALS = 6  # intervals of a manoeuvre at the begin
-HALVINGS = 16  # largest number of halvings of an interval, and of a range of start instants
+DENSER = 1.3  # power of the share of a manoeuvre: instants are denser at the begin
+COMPARED = 32  # instants at which margins of an escape are evaluated for the planner
+HALVINGS = 16  # largest number of halvings of a range of start instants
 COAST_HALVINGS = 6  # the same for coasting, whose margin is only stated
 MOST_RANGES = 4000  # of start instants; more are bounded without being halved
 KEPT_SHARE = 0.4  # of the distance to the surface that a withdrawal from the corridor keeps
+PLANNED_SHARE = 0.5  # the share at which plans aim
 STARTS = 32  # instants of a path from which withdrawals are tried in every iteration
-FIELDS = ("t", "half", "r", "v", "push", "span", "other", "most")  # of ``Manoeuvres``
-# towards the faces and the corners of a cube
-_CUBE = np.array([d for d in np.ndindex(3, 3, 3) if abs(np.array(d) - 1).sum() in (1, 3)]) - 1.0
-DIRECTIONS = _CUBE / np.linalg.norm(_CUBE, axis=1, keepdims=True)
-_SIDES = np.array([(math.cos(k * math.pi / 3.0), math.sin(k * math.pi / 3.0)) for k in range(6)])
-
-
-def _tilted(d: Array, angle: float) -> Array:
-    """Directions (m, 7, 3): those of d (m, 3) and six around each, tilted by an angle [rad]."""
-    side = np.cross(d, np.eye(3)[np.abs(d).argmin(axis=1)])
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    sides = np.einsum("kj,mji->mki", _SIDES, np.stack([side, np.cross(d, side)], axis=1))
-    around = math.cos(angle) * d[:, None] + math.sin(angle) * sides
-    return np.concatenate([d[:, None], around], axis=1)
+FIELDS = ("t", "half", "r", "v", "push", "span", "other", "most")  # of ``Manoeuvres``, in the
+# order of the extension
 
 
 @value_class
@@ -93,16 +77,10 @@ class Manoeuvres:
         """Return those with the numbers ``k``."""
         return Manoeuvres(*(getattr(self, name)[k] for name in FIELDS))
 
-    def strayed(self, k: NDArray[np.integer], tau: Array) -> tuple[Array, Array]:
-        """Return by how much position [m] and velocity [m/s] at most differ over the range, each
-        (n,).
-
-        Args:
-            k: (n,) number of the manoeuvre.
-            tau: (n,) time after the middle of its range [s].
-        """
-        half, other = self.half[k], self.other[k]
-        return half * other * (np.abs(tau) + half), half * other
+    @property
+    def table(self) -> Array:
+        """The fields side by side (m, 14)."""
+        return np.column_stack([getattr(self, name) for name in FIELDS])
 
 
 @value_class
@@ -138,12 +116,24 @@ class Certificate:
     margins_m: Array
     safe_s: float
 
+    @property
+    def escapes(self) -> Array:
+        """Start instants [s], ascending, and directions in {A} of the manoeuvres (m, 4)."""
+        push = self.worst.push
+        d = push / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), 1e-12)
+        return np.column_stack([self.worst.t, d])[np.argsort(self.worst.t, kind="stable")]
+
 
 class Space:
     """The target after an instant as a withdrawal sees it."""
 
     def __init__(
-        self, sampled: SampledScene, limits: Limits, a_max: float, extent_m: float
+        self,
+        sampled: SampledScene,
+        limits: Limits,
+        a_max: float,
+        extent_m: float,
+        planned: bool = False,
     ) -> None:
         """Create it.
 
@@ -152,93 +142,81 @@ class Space:
             limits: Resolved limits: clearance, corridor and sigmas.
             a_max: Acceleration that the robot has in every direction [m/s2].
             extent_m: Diagonal of the target's bounding box [m].
+            planned: Require of withdrawals what plans aim at: more than what is stated, by the
+                shortage that a plan may have.
         """
         self.sampled, self.a_max = sampled, a_max
-        self.limits = replace(limits, clearance_m=limits.kept_m or None)
         self.enough_m = ENOUGH_OF_EXTENT * extent_m
         self.resolution_m = RESOLUTION_OF_EXTENT * extent_m
+        kept = limits.kept_m + (self.resolution_m if planned else 0.0)
+        self.limits = replace(limits, clearance_m=kept or None)
+        self.kept_share = PLANNED_SHARE if planned else KEPT_SHARE
         scene = sampled.scene
         self.centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
         self.radius_m = scene.radius_m
+        self._kernel, self._end_s = self._made(), -1.0
+
+    def _made(self) -> _cone.Space:
+        """The target for the extension."""
+        scene, limits = self.sampled.scene, self.limits
+        axis_c = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
+        corridor = (math.nan, 0.0, 0.0)
+        tangent = math.tan(math.radians(limits.final_deg or 0.0))
+        if scene.axis_c is not None and limits.final_deg is not None:
+            corridor = (tangent, limits.mouth_m or 0.0, limits.final_range_m or 0.0)
         # the corridor's margin changes by at most this factor times the change of the position
-        self.slope = 1.0 / math.cos(math.radians(limits.final_deg or 0.0))
+        slope = math.hypot(1.0, tangent)
+        kernel = _cone.Space(
+            scene.surface,
+            clearance_m=limits.clearance_m or 0.0,
+            sigmas=limits.clearance_sigmas,
+            axis_c=_triple(axis_c),
+            corridor=corridor,
+            centre_c=_triple(self.centre_c),
+            radius_m=self.radius_m,
+            enough_m=self.enough_m,
+            rates=(slope, *self._rates()),
+            a_max=self.a_max,
+            coast_s=COAST_S,
+            kept_share=self.kept_share,
+        )
+        if (table := self.sampled.sigma_table) is not None:
+            grid, position, attitude = table
+            kernel.set_sigma(float(grid[-1]), position, attitude)
+        return kernel
+
+    def _rates(self) -> tuple[float, float, float]:
+        """Bounds of the angular rate [rad/s], of its change [rad/s2] and of the acceleration of
+        the grasp point [m/s2].
+        """
         times = np.linspace(0.0, COAST_S, 121)
-        (_, dR), (drho, _) = sampled.at(times, 1), sampled.at(times, 1)
+        drho, dR = self.sampled.at(times, 1)
         step = times[1] - times[0]
 
         def largest(values: Array) -> float:
-            return MOTION_FACTOR * float(np.sqrt((values**2).sum(axis=-1)).max(initial=0.0))
+            return float(np.sqrt((values**2).sum(axis=-1)).max(initial=0.0))
 
-        self.turn = largest(dR.reshape(-1, 9)) / MOTION_FACTOR / math.sqrt(2.0) * 1.05
-        self.bend = largest(np.diff(dR, axis=0).reshape(-1, 9)) / step
-        self.pull = largest(np.diff(drho, axis=0)) / step
+        turn = largest(dR.reshape(-1, 9)) / math.sqrt(2.0) * 1.05
+        bend = MOTION_FACTOR * largest(np.diff(dR, axis=0).reshape(-1, 9)) / step
+        return turn, bend, MOTION_FACTOR * largest(np.diff(drho, axis=0)) / step
 
-    @property
-    def known(self) -> bool:
-        """Whether the body is known at all."""
-        return self.sampled.scene.surface is not None or self.radius_m > 0.0
+    def kernel(self, last_s: float) -> _cone.Space:
+        """Return the target for the extension, with its motion until ``last_s``."""
+        if last_s > self._end_s:
+            c, x = self.sampled.pieces(last_s)
+            self._kernel.set_motion(c, x)
+            self._end_s = float(x[-1])
+        return self._kernel
 
-    def required(self, y: Array, times: Array) -> Array:
-        """Return the required distance to the surface (n,) [m] at points (n, 3) in {C}."""
-        sigma = self.sampled.sigma(times)
-        return required_clearance(self.limits, np.linalg.norm(y, axis=1), sigma)
-
-    def margin(self, y: Array, times: Array, most: Array | float) -> tuple[Array, Array]:
-        """Return margins (n,) of points (n, 3) in {C} at times (n,), and the required distances, at
-        most ``most`` (n,) [m].
-
-        A margin is that of the corridor inside it, else the distance to the surface less the
-        required one. Far from the target it is a lower bound: from the sphere.
-        """
-        required = np.minimum(self.required(y, times), most)
-        gap = self.gap(y, required)
-        side, end = corridor_margin(self.sampled.scene, self.limits, y)
-        return np.maximum(gap - required, np.minimum(side, end)), required
-
-    def most(self, y: Array, times: Array) -> Array:
+    def most(self, r: Array, times: Array) -> Array:
         """Return the largest distance to the surface (n,) [m] that is required of manoeuvres from
-        points (n, 3) in {C}.
+        points (n, 3) in {A}.
         """
-        side, end = corridor_margin(self.sampled.scene, self.limits, y)
-        inside = np.flatnonzero(np.minimum(side, end) > 0.0)
-        out = np.full(len(y), math.inf)
-        if len(inside):
-            required = self.required(y[inside], times[inside])
-            out[inside] = KEPT_SHARE * np.maximum(self.gap(y[inside], required), 0.0)
-        return out
-
-    def gap(self, y: Array, required: Array) -> Array:
-        """Return the distances to the surface (n,) [m] of points (n, 3) in {C}, those to the sphere
-        where the required ones are exceeded by enough.
-        """
-        gap = np.linalg.norm(y - self.centre_c, axis=1) - self.radius_m
-        surface = self.sampled.scene.surface
-        if surface is not None:
-            near = (gap - required < self.enough_m) | (self.radius_m == 0.0)
-            gap[near] = surface(y[near])[1]
-        return np.asarray(gap)
+        return self.kernel(float(times.max())).most(times, r)
 
     def gradient(self, y: Array, times: Array, most: Array) -> Array:
         """Return the gradients (n, 3) in {C} of the margin at points (n, 3) in {C}."""
-        scene = self.sampled.scene
-        size = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
-        out = y - self.centre_c
-        if scene.surface is not None:
-            foot, gap = scene.surface(y)
-            away = (y - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
-            out = np.where(np.isfinite(gap)[:, None], away, out)
-        else:
-            gap = np.linalg.norm(out, axis=1) - self.radius_m
-        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-        side, end = corridor_margin(scene, self.limits, y)
-        inside = np.minimum(side, end) > gap - np.minimum(self.required(y, times), most)
-        if scene.axis_c is None or not inside.any():
-            return out
-        along = (y @ scene.axis_c)[:, None] * scene.axis_c
-        lateral = (y - along) / np.maximum(np.linalg.norm(y - along, axis=1, keepdims=True), 1e-9)
-        wall = math.tan(math.radians(self.limits.final_deg or 0.0)) * scene.axis_c - lateral
-        corridor = np.where((side < end)[:, None], wall, -y / size)
-        return np.where(inside[:, None], corridor, out)
+        return self._kernel.gradient(y, times, most)
 
     def relative(self, times: Array, r: Array, v: Array) -> tuple[Array, Array]:
         """Return position and velocity (n, 3) in {A} relative to the centre of mass."""
@@ -257,216 +235,72 @@ class Space:
             Lower bounds (m,) over the ranges of start instants, the smallest margins (m,) found in
             the middle, and their times (m,).
         """
-        count = len(m.t)
-        share = np.linspace(0.0, 1.0, INTERVALS + 1)
-        nodes = -m.half[:, None] + (m.half + m.span)[:, None] * share
-        k = np.repeat(np.arange(count), INTERVALS)
-        ends = np.stack([nodes[:, :-1].ravel(), nodes[:, 1:].ravel()])
-        found = self._nodes(m, np.repeat(np.arange(count), INTERVALS + 1), nodes.ravel())
-        values = found.reshape(len(found), count, INTERVALS + 1)
-        a = values[:, :, :-1].reshape(len(found), -1)
-        b = values[:, :, 1:].reshape(len(found), -1)
-        first = values[0].argmin(axis=1)
-        upper = values[0][np.arange(count), first]
-        at, lower = nodes[np.arange(count), first], np.full(count, math.inf)
-        for halving in range(HALVINGS):
-            bound, strayed = self._between(m, k, ends, a, b)
-            refined = (bound < target_m) & (np.minimum(a[0], b[0]) - strayed >= target_m)
-            refined &= upper[k] >= target_m
-            if halving == HALVINGS - 1:
-                refined[:] = False
-            np.minimum.at(lower, k[~refined], bound[~refined])
-            if not refined.any():
-                break
-            k, ends, a, b = k[refined], ends[:, refined], a[:, refined], b[:, refined]
-            middle = ends.mean(axis=0)
-            c = self._nodes(m, k, middle)
-            better = np.lexsort((c[0], k))
-            better = better[np.r_[True, np.diff(k[better]) > 0]]
-            better = better[c[0][better] < upper[k[better]]]
-            upper[k[better]], at[k[better]] = c[0][better], middle[better]
-            k = np.r_[k, k]
-            ends = np.stack([np.r_[ends[0], middle], np.r_[middle, ends[1]]])
-            a, b = np.c_[a, c], np.c_[c, b]
-        return np.minimum(lower, upper), upper, at
-
-    def _nodes(self, m: Manoeuvres, k: NDArray[np.integer], tau: Array) -> Array:
-        """Margin [m], required distance [m], speed [m/s] and bound of the acceleration [m/s2] in
-        {C} (4, n).
-        """
-        t = tau[:, None]
-        r = m.r[k] + t * m.v[k] + 0.5 * t * t * m.push[k]
-        v, times = m.v[k] + t * m.push[k], m.t[k] + tau
-        rho, R = self.sampled.at(times)
-        drho, dR = self.sampled.at(times, 1)
-        q, w = r - rho, v - drho
-        margin, required = self.margin(in_fixture_axes(R, q), times, m.most[k])
-        speed = np.linalg.norm(in_fixture_axes(R, w) + in_fixture_axes(dR, q), axis=1)
-        away, slip = np.linalg.norm(q, axis=1), np.linalg.norm(w, axis=1)
-        bend = np.linalg.norm(m.push[k], axis=1) + self.pull + 2.0 * self.turn * slip
-        bend += (self.turn**2 + self.bend) * away
-        return np.stack([margin, required, speed, bend])
-
-    def _between(
-        self, m: Manoeuvres, k: NDArray[np.integer], ends: Array, a: Array, b: Array
-    ) -> tuple[Array, Array]:
-        """Lower bounds (n,) of the margin between instants with the values a, b (4, n), and what
-        the range of start instants takes from them.
-        """
-        h = ends[1] - ends[0]
-        length = 0.5 * h * (a[2] + b[2]) + 0.25 * MOTION_FACTOR * h * h * np.maximum(a[3], b[3])
-        strayed = self.slope * m.strayed(k, np.abs(ends).max(axis=0))[0]
-        lower = 0.5 * (a[0] + b[0] - self.slope * length - np.abs(a[1] - b[1]))
-        return lower - strayed, strayed
+        lower, upper, at = self.kernel(_last_s(m)).least(m.table, target_m).T
+        return lower, upper, at
 
     def escapes(
         self, t: Array, half: Array, path: tuple[Array, Array, Array], d: Array
     ) -> Manoeuvres:
-        """Return escapes in directions d (m, c, 3), m * c of them, of each start one after the
-        other.
-
-        Args:
-            t: (m,) start instants, the middles of ranges [s].
-            half: (m,) half widths of the ranges [s].
-            path: Position, velocity and acceleration of the path there, each (m, 3).
-            d: (m, c, 3) directions in {A}, unit.
-        """
-        r, v, u = path
-        count, push = d.shape[1], self.a_max * d
-        other = np.linalg.norm(u[:, None] - push, axis=2)
-        span = np.full(len(t), COAST_S)
-        if self.radius_m > 0.0:
-            speed = np.linalg.norm(self.relative(t, r, v)[1], axis=1)
-            least = 2.0 * (self.radius_m + (self.limits.clearance_m or 0.0) + self.enough_m)
-            span = (speed + np.sqrt(2.0 * speed**2 + 4.0 * self.a_max * least)) / self.a_max
-        most = self.most(self.sampled.coordinates(t, r), t)
-        t, half, r, v, span, most = (
-            np.repeat(x, count, axis=0) for x in (t, half, r, v, span, most)
-        )
-        return Manoeuvres(t, half, r, v, push.reshape(-1, 3), span, other.ravel(), most)
-
-    def directions(self, t: Array, path: tuple[Array, Array, Array]) -> Array:
-        """Return directions (m, c, 3) in {A} that are compared for starts without a known one:
-        away from the centre of mass, to all sides, and around the fixture's axis.
-        """
-        q, _ = self.relative(t, path[0], path[1])
-        outward = q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9)
-        fixed = np.broadcast_to(DIRECTIONS, (len(t), *DIRECTIONS.shape))
-        axis_c = self.sampled.scene.axis_c
-        along = outward if axis_c is None else self.sampled.at(t)[1] @ axis_c
-        tilted = [_tilted(along, tilt)[:, 1:] for tilt in TILTS_RAD]
-        return np.concatenate([outward[:, None], fixed, along[:, None], *tilted], axis=1)
-
-    def ended(self, m: Manoeuvres) -> Manoeuvres:
-        """Return the manoeuvres, each ended where the robot recedes outside the sphere.
+        """Return escapes in directions d (m, 3), each ended where the robot recedes outside the
+        sphere.
 
         From then on the distance to the centre of mass grows, under the same acceleration and in
         the brake that follows.
-        """
-        if self.radius_m == 0.0:
-            return m
-        share = np.linspace(0.0, 1.0, COMPARED + 1)[1:]
-        tau = m.span[:, None] * share
-        k = np.repeat(np.arange(len(m.t)), len(share))
-        free = self._free(m, k, tau.ravel()).reshape(tau.shape)
-        first = free.argmax(axis=1)
-        span = np.where(free.any(axis=1), tau[np.arange(len(tau)), first], m.span)
-        return replace(m, span=span)
-
-    def _free(self, m: Manoeuvres, k: NDArray[np.integer], tau: Array) -> NDArray[np.bool_]:
-        """Whether the robot recedes outside the sphere (n,)."""
-        t, push = tau[:, None], m.push[k]
-        times = m.t[k] + tau
-        q, w = self.relative(times, m.r[k] + t * m.v[k] + 0.5 * t * t * push, m.v[k] + t * push)
-        dr, dv = m.strayed(k, tau)
-        distance = np.linalg.norm(q, axis=1)
-        required = np.minimum(self.required(q, times), m.most[k]) + self.enough_m
-        a = np.linalg.norm(push, axis=1)
-        out = distance - dr >= self.radius_m + required
-        out &= np.sum(q * w, axis=1) >= distance * dv + np.linalg.norm(w, axis=1) * dr
-        out &= (np.sum(w * push, axis=1) >= a * dv) & (np.sum(q * push, axis=1) >= a * dr)
-        return np.asarray(out)
-
-    def compared(self, m: Manoeuvres) -> tuple[Array, Array]:
-        """Return about the smallest margin (m,) of each manoeuvre after its begin, at most
-        ``enough_m``, and its time.
-        """
-        share = np.linspace(0.0, 1.0, COMPARED + 1)[1:] ** 1.7
-        least, at = self.at_instants(m, m.span[:, None] * share)
-        return np.minimum(least, self.enough_m), at
-
-    def at_instants(
-        self, m: Manoeuvres, tau: Array, apart: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Return the smallest margins (m,) at times (m, n) of manoeuvres, and their times; only
-        those far from the times ``apart`` (m,) where given.
-        """
-        k = np.repeat(np.arange(len(m.t)), tau.shape[1])
-        t, times = tau.ravel()[:, None], m.t[k] + tau.ravel()
-        y = self.sampled.coordinates(times, m.r[k] + t * m.v[k] + 0.5 * t * t * m.push[k])
-        values = self.margin(y, times, m.most[k])[0].reshape(tau.shape)
-        if apart is not None:
-            values[np.abs(tau - apart[:, None]) < 2.0 * m.span[:, None] / COMPARED] = math.inf
-        first = values.argmin(axis=1)
-        row = np.arange(len(tau))
-        return values[row, first], tau[row, first]
-
-    def chosen(
-        self, t: Array, half: Array, path: tuple[Array, Array, Array], before: Array
-    ) -> Manoeuvres:
-        """Return of each start the escape with the largest margin of those compared.
 
         Args:
             t: (m,) start instants, the middles of ranges [s].
             half: (m,) half widths of the ranges [s].
             path: Position, velocity and acceleration of the path there, each (m, 3).
+            d: (m, 3) directions in {A}, unit.
+        """
+        r, v, u = path
+        push = self.a_max * d
+        other = np.linalg.norm(u - push, axis=1)
+        kernel = self.kernel(float(t.max()))
+        span = kernel.span(t, r, v)
+        return self.ended(Manoeuvres(t, half, r, v, push, span, other, kernel.most(t, r)))
+
+    def ended(self, m: Manoeuvres) -> Manoeuvres:
+        """Return the manoeuvres, each ended where the robot recedes outside the sphere."""
+        return replace(m, span=self.kernel(_last_s(m)).ended(m.table))
+
+    def margins(self, m: Manoeuvres, below_m: float) -> tuple[Array, Array]:
+        """Return margins (m, n) at n instants of manoeuvres, denser at the begin, and the times
+        after it (m, n); a margin above ``below_m`` may be a lower bound [m].
+        """
+        share = np.linspace(0.0, 1.0, COMPARED + 1) ** DENSER
+        tau = m.span[:, None] * share
+        found: Array = self.kernel(_last_s(m)).margins(m.table, tau, below_m)
+        return found, tau
+
+    def directions(
+        self, t: Array, r: Array, v: Array, before: Array, wanted_m: float = math.inf
+    ) -> Array:
+        """Return of each start the direction (m, 3) in {A} of the escape with the largest margin of
+        those compared.
+
+        Args:
+            t: (m,) start instants [s].
+            r: (m, 3) positions in {A} there [m].
+            v: (m, 3) velocities [m/s].
             before: (m, 3) directions that are known to be good; NaN: none. They are improved; where
                 the margin is negative all directions are compared.
+            wanted_m: Margin from which no better direction is looked for [m].
         """
-        d, values = before.copy(), np.full(len(t), -math.inf)
-        self._improve(t, path, d, values, np.flatnonzero(~np.isnan(before[:, 0])))
-        poor = np.flatnonzero(values < 0.0)
-        if len(poor):
-            some = path[0][poor], path[1][poor], path[2][poor]
-            every = self.directions(t[poor], some)
-            found = self._compared(t[poor], some, every)
-            first, better = found.argmax(axis=1), found.max(axis=1) > values[poor]
-            d[poor[better]] = every[np.arange(len(poor)), first][better]
-            values[poor] = np.maximum(values[poor], found.max(axis=1))
-            self._improve(t, path, d, values, poor[better & (values[poor] < self.enough_m)])
-        return self.ended(self.escapes(t, half, path, d[:, None]))
-
-    def _improve(
-        self,
-        t: Array,
-        path: tuple[Array, Array, Array],
-        d: Array,
-        values: Array,
-        k: NDArray[np.integer],
-    ) -> None:
-        """Improve the directions d (m, 3) with the numbers k where their margin is not enough, and
-        set their margins in ``values`` (m,).
-        """
-        for tilt in REFINED_RAD:
-            if len(k):
-                some = path[0][k], path[1][k], path[2][k]
-                every = _tilted(d[k], tilt)
-                found = self._compared(t[k], some, every)
-                d[k] = every[np.arange(len(k)), found.argmax(axis=1)]
-                values[k] = found.max(axis=1)
-                k = k[values[k] < self.enough_m]
-
-    def _compared(self, t: Array, path: tuple[Array, Array, Array], d: Array) -> Array:
-        """About the smallest margins (m, c) of escapes in directions d (m, c, 3)."""
-        every = self.escapes(t, np.zeros(len(t)), path, d)
-        return self.compared(every)[0].reshape(d.shape[:2])
+        span = self.kernel(float(t.max())).span(t, r, v)
+        kernel = self.kernel(float((t + span).max()))
+        found: Array = kernel.search(t, r, v, before, wanted_m)[0]
+        return found
 
 
-def _replaced(m: Manoeuvres, k: NDArray[np.bool_], other: Manoeuvres) -> Manoeuvres:
-    fields = {name: getattr(m, name).copy() for name in FIELDS}
-    for name, field in fields.items():
-        field[k] = getattr(other, name)
-    return Manoeuvres(**fields)
+def _triple(x: Array) -> tuple[float, float, float]:
+    a, b, c = (float(value) for value in x)
+    return a, b, c
+
+
+def _last_s(m: Manoeuvres) -> float:
+    """Last instant of manoeuvres [s]."""
+    return float((m.t + m.half + m.span).max())
 
 
 def joined(parts: Sequence[Manoeuvres]) -> Manoeuvres:
@@ -500,11 +334,11 @@ def certified(
     goal = space.enough_m - space.resolution_m if least_m is None else least_m
     for halving in range(HALVINGS):
         t, half = 0.5 * (low + high), 0.5 * (high - low)
-        m = _bounded(space.chosen(t, half, (*path.at(t), u), d), path)
-        lower, upper, at = space.least(m, goal)
+        m, lower, upper, at = _chosen(space, path, t, half, u, d, goal)
         worst = float(upper.min())
         if least_m is None and worst - space.resolution_m < goal:
-            goal = worst - space.resolution_m
+            # whether the margin is negative is decided first
+            goal = 0.0 if 0.0 < worst < space.resolution_m else worst - space.resolution_m
             lower, upper, at = space.least(m, goal)
         last = halving == HALVINGS - 1 or len(t) > MOST_RANGES or worst < goal
         kept = (lower >= goal) | last
@@ -513,6 +347,32 @@ def certified(
             break
         low, high, u, d = _halved(low, high, u, m.push / space.a_max, ~kept)
     return _certificate(space, done, worst < goal)
+
+
+def _chosen(
+    space: Space, path: RobotPath, t: Array, half: Array, u: Array, d: Array, goal: float
+) -> tuple[Manoeuvres, Array, Array, Array]:
+    """Escapes for ranges of start instants with the bounds of ``Space.least``, in the directions d
+    (m, 3); where one does not reach the goal all directions are compared.
+    """
+    r, v = path.at(t)
+
+    def bounded(d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
+        m = _bounded(space.escapes(t, half, (r, v, u), d), path)
+        return m, *space.least(m, goal)
+
+    unknown = np.isnan(d[:, 0])
+    if unknown.any():
+        d = d.copy()
+        d[unknown] = space.directions(t[unknown], r[unknown], v[unknown], d[unknown])
+    found = bounded(d)
+    poor = found[2] < goal
+    if not poor.any():
+        return found
+    other = d.copy()
+    other[poor] = space.directions(t[poor], r[poor], v[poor], np.full((poor.sum(), 3), math.nan))
+    again = bounded(other)
+    return bounded(np.where((again[2] > found[2])[:, None], other, d))
 
 
 def coasting(space: Space, path: RobotPath, begin_s: float) -> Certificate:
@@ -610,22 +470,21 @@ class Tried:
         share = 1.0 - (1.0 - np.arange(STARTS) / STARTS) ** 1.7
         return cls(share, np.full((STARTS, 3), math.nan))
 
-    def table(self, begin_s: float, end_s: float) -> Array:
-        """Return the start instants [s] and directions in time order (m, 4).
-
-        Args:
-            begin_s: Begin of the flight [s after the instant of planning].
-            end_s: Its end [s].
-        """
-        t = begin_s + (end_s - begin_s) * self.share
-        return np.column_stack([t, self.d])[np.argsort(t, kind="stable")]
-
     @classmethod
     def of(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
         """Return the instants of a table; the first ones where there is none."""
         if table is None:
             return cls.first()
         return cls((table[:, 0] - begin_s) / max(end_s - begin_s, 1e-9), table[:, 1:])
+
+    @classmethod
+    def near(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
+        """Return the first instants with the directions of the nearest instants of a table."""
+        first = cls.first()
+        if table is None:
+            return first
+        t = begin_s + (end_s - begin_s) * first.share
+        return cls(first.share, table[np.abs(t[:, None] - table[:, 0]).argmin(axis=1), 1:])
 
     def also(self, share: Array, d: Array, short_m: float) -> Tried:
         """Return these instants and others (n,) with their directions (n, 3), where the margin was
@@ -644,10 +503,9 @@ def sampled(
     begin_s: float,
     since_s: float = 0.0,
     improve: bool = True,
+    below_m: float = 0.0,
 ) -> tuple[Certificate, Tried]:
-    """Return the withdrawals from instants of a path, with their smallest margins at instants only.
-
-    Each escape is listed with its worst moment and with the worst one far from it.
+    """Return the withdrawals from instants of a path, with their margins at instants only.
 
     Args:
         space: The target.
@@ -656,29 +514,19 @@ def sampled(
         begin_s: Begin of the thrust [s after the instant of planning].
         since_s: Time between the begin of the path and the instant of planning [s].
         improve: Search better directions where the margin is negative; else only at new instants.
+        below_m: Margins below this are listed, and the smallest one of every withdrawal [m].
     """
     t = begin_s + (path.t_go_s - since_s - begin_s) * tried.share
     r, v = path.at(since_s + t)
-    every = r, v, np.zeros_like(r)
-    d = tried.d.copy()
-    new = np.isnan(d[:, 0])
-    m = space.ended(
-        space.escapes(t, np.zeros(len(t)), every, np.where(new[:, None], r, d)[:, None])
-    )
-    if improve:
-        new |= space.compared(m)[0] < 0.0
+    d, new = tried.d.copy(), np.isnan(tried.d[:, 0])
     if new.any():
-        some = r[new], v[new], every[2][new]
-        m = _replaced(m, new, space.chosen(t[new], np.zeros(int(new.sum())), some, d[new]))
-    at = space.compared(m)[1]
-    near = m.span[:, None] * np.linspace(-1.0, 1.0, 9) / COMPARED
-    tau = np.c_[np.zeros(len(t)), np.clip(at[:, None] + near, 0.0, m.span[:, None])]
-    margins, at = space.at_instants(m, tau)
-    coarse = m.span[:, None] * np.linspace(0.0, 1.0, COMPARED + 1)
-    others, other_at = space.at_instants(m, coarse, apart=at)
-    found = Certificate(
-        float(margins.min()), joined([m, m]), np.r_[at, other_at], np.r_[margins, others], math.inf
-    )
+        d[new] = space.directions(t[new], r[new], v[new], d[new])
+    if improve:
+        d = space.directions(t, r, v, d, 0.0)
+    m = space.escapes(t, np.zeros(len(t)), (r, v, np.zeros_like(r)), d)
+    margins, tau = space.margins(m, below_m)
+    k, i = np.nonzero((margins < below_m) | (margins == margins.min(axis=1)[:, None]))
+    found = Certificate(float(margins.min()), m.of(k), tau[k, i], margins[k, i], math.inf)
     return found, replace(tried, d=m.push / space.a_max)
 
 
@@ -709,11 +557,11 @@ def withdrawal(
     rest = q + 0.5 * brake.t_go_s * w
     if np.linalg.norm(rest) >= space.radius_m + least_m:
         paths.append(brake)
-    path, unknown = (r[None], v[None], np.zeros((1, 3))), np.full((1, 3), math.nan)
-    every = [space.chosen(zero, zero, path, unknown)]
+    path = r[None], v[None], np.zeros((1, 3))
+    d = space.directions(zero, r[None], v[None], np.full((1, 3), math.nan))
+    escapes = space.escapes(zero, zero, path, d)
     if planned is not None:
-        every.append(space.ended(space.escapes(zero, zero, path, planned[None, None])))
-    escapes = joined(every)
+        escapes = joined([escapes, space.escapes(zero, zero, path, planned[None])])
     for push, span in zip(escapes.push, escapes.span, strict=True):
         burn = _burn_s(space, q, w, push, span if space.radius_m > 0.0 else 0.0, least_m)
         after = r + burn * v + 0.5 * burn**2 * push, v + burn * push
@@ -759,7 +607,7 @@ def _largest(space: Space, paths: list[BurnPath]) -> Withdrawal:
     owner = np.repeat(np.arange(len(every)), [len(m.t) for m in every])
     m = joined(every)
     rough = np.full(len(paths), space.enough_m)
-    np.minimum.at(rough, owner, space.compared(m)[0])
+    np.minimum.at(rough, owner, space.margins(m, space.enough_m)[0].min(axis=1))
     goal = float(rough.max()) - space.resolution_m
     lower = np.full(len(paths), goal)
     np.minimum.at(lower, owner, space.least(m, goal)[0])
@@ -774,5 +622,5 @@ def _pieces(space: Space, path: BurnPath) -> Manoeuvres:
     u = path.u if len(path.u) else np.zeros((1, 3))
     r, v = path.at(begins)
     none, zero = np.zeros(len(begins)), np.zeros(1)
-    most = none + space.most(space.sampled.coordinates(zero, r[:1]), zero)
+    most = none + space.most(r[:1], zero)
     return Manoeuvres(begins, none, r, v, u, np.maximum(ends - begins, 0.0), none, most)

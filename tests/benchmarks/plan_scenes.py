@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from avsreplay.plan._cone import Body
 from avsreplay.plan.limits import Scene
 
 HORIZON_S = 125.0
@@ -29,20 +31,9 @@ class Problem:
 
 
 def box_surface(centre, half):
-    """Closest points and signed distances of a box whose axes are those of {C}."""
-
-    def closest(y):
-        q = y - centre
-        inside = np.all(np.abs(q) < half, axis=1)
-        foot = np.clip(q, -half, half)
-        deep = np.flatnonzero(inside)
-        gap = half - np.abs(q[deep])
-        i = gap.argmin(axis=1)
-        foot[deep, i] = np.copysign(half[i], q[deep, i])
-        distance = np.linalg.norm(q - foot, axis=1)
-        return foot + centre, np.where(inside, -distance, distance)
-
-    return closest
+    """Mesh of a box whose axes are those of {C}."""
+    mesh = trimesh.creation.box(extents=2.0 * half)
+    return Body(mesh.vertices + centre, np.asarray(mesh.faces, np.int32))
 
 
 def problem(rng, rate=(0.02, 0.1)):

@@ -5,10 +5,11 @@
 
 #include <cstring>
 
+#include "body.hpp"
 #include "constraints.hpp"
 #include "interior_point.hpp"
 #include "primer.hpp"
-#include "winding.hpp"
+#include "space.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -139,26 +140,140 @@ nb::object integrals(const In<double, -1, 3>& P0, const In<double, -1, 3>& P1, c
                         nb::ndarray<nb::numpy, double>(second, 2, shape, own_second));
 }
 
-Winding winding_of(const In<double, -1, 3>& vertices, const In<int, -1, 3>& faces) {
+using Points = In<double, -1, 3>;
+using Values = In<double, -1>;
+using Many = In<double, -1, 14>;  // manoeuvres
+
+const Vector3* vectors(const Points& points) { return reinterpret_cast<const Vector3*>(points.data()); }
+
+// An array of n (times width) values, filled without the lock of the interpreter.
+template <typename F>
+nb::object filled(size_t n, size_t width, F fill) {
+  double* out = new double[std::max<size_t>(n * width, 1)];
+  nb::capsule own(out, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+  {
+    nb::gil_scoped_release release;
+    fill(out);
+  }
+  const size_t shape[2] = {n, width};
+  return nb::cast(nb::ndarray<nb::numpy, double>(out, width == 1 ? 1 : 2, shape, own));
+}
+
+nb::object vectors_of(const std::vector<Vector3>& found) {
+  const auto copied = [&](double* out) { std::copy(found.begin(), found.end(), reinterpret_cast<Vector3*>(out)); };
+  return filled(found.size(), 3, copied);
+}
+
+void make_body(Body* self, const Points& vertices, const In<int, -1, 3>& faces) {
   const size_t n = vertices.shape(0), m = faces.shape(0);
   for (size_t i = 0; i < 3 * m; ++i)
     if (faces.data()[i] < 0 || static_cast<size_t>(faces.data()[i]) >= n)
       throw nb::value_error("a face refers to a missing vertex");
-  nb::gil_scoped_release release;
-  return Winding(vertices.data(), faces.data(), m);
+  new (self) Body(std::make_shared<const FaceTree>(vertices.data(), n, faces.data(), m), {});
 }
 
-// Which points (n, 3) with distances (n,) to the surface have a winding number above ``least``.
-nb::object inside(const Winding& winding, const In<double, -1, 3>& points, const In<double, -1>& distances, double least) {
-  const size_t n = points.shape(0), shape[1] = {n};
-  if (distances.shape(0) != n) throw nb::value_error("points and distances of different numbers");
-  bool* out = new bool[n];
-  nb::capsule own(out, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
-  {
-    nb::gil_scoped_release release;
-    winding.inside(reinterpret_cast<const Vector3*>(points.data()), distances.data(), n, least, out);
-  }
-  return nb::cast(nb::ndarray<nb::numpy, bool>(out, 1, shape, own));
+// Closest points (n, 3) of points (n, 3), and their signed distances (n,).
+nb::object closest(const Body& body, const Points& points) {
+  const size_t n = points.shape(0);
+  std::vector<Vector3> feet(n);
+  nb::object distances = filled(n, 1, [&](double* out) {
+    Near last;
+    for (size_t i = 0; i < n; ++i) out[i] = body.signed_distance(vectors(points)[i], last, &feet[i]);
+  });
+  return nb::make_tuple(vectors_of(feet), distances);
+}
+
+using Triple = std::array<double, 3>;
+
+void make_space(Space* self, const Body* body, double clearance, double sigmas, const Triple& axis, const Triple& corridor,
+                const Triple& centre, double radius, double enough, const std::array<double, 4>& rates, double a_max,
+                double coast, double kept_share) {
+  new (self) Space(body, {clearance, sigmas, axis, corridor[0], corridor[1], corridor[2], centre, radius, enough, rates[0],
+                          rates[1], rates[2], rates[3], a_max, coast, kept_share});
+}
+
+void set_motion(Space& space, const In<double, 4, -1, 12>& c, const Values& x) {
+  if (c.shape(1) < 1 || x.shape(0) != c.shape(1) + 1) throw nb::value_error("pieces and limits differ");
+  space.set_motion(c.data(), x.data(), c.shape(1));
+}
+
+void set_sigma(Space& space, double end, const Values& position, const Values& attitude) {
+  if (position.shape(0) < 2 || position.shape(0) != attitude.shape(0)) throw nb::value_error("sigmas differ");
+  space.set_sigma(end, position.data(), attitude.data(), position.shape(0));
+}
+
+const Manoeuvre* manoeuvres(const Many& m) { return reinterpret_cast<const Manoeuvre*>(m.data()); }
+
+// Largest required distances (n,) of manoeuvres from points (n, 3) in {A} at times (n,).
+nb::object most(const Space& space, const Values& times, const Points& r) {
+  const size_t n = r.shape(0);
+  if (times.shape(0) != n) throw nb::value_error("points of different numbers");
+  return filled(n, 1, [&](double* out) {
+    Near last;
+    for (size_t i = 0; i < n; ++i) out[i] = space.most(times.data()[i], vectors(r)[i], last);
+  });
+}
+
+// Gradients (n, 3) in {C} of the margin at points (n, 3) in {C}.
+nb::object gradient(const Space& space, const Points& y, const Values& times, const Values& most) {
+  const size_t n = y.shape(0);
+  if (times.shape(0) != n || most.shape(0) != n) throw nb::value_error("points of different numbers");
+  return filled(n, 3, [&](double* out) {
+    for (size_t i = 0; i < n; ++i)
+      reinterpret_cast<Vector3*>(out)[i] = space.gradient(vectors(y)[i], times.data()[i], most.data()[i]);
+  });
+}
+
+// Longest durations (n,) of escapes from states (n, 3), (n, 3) at times (n,).
+nb::object span(const Space& space, const Values& times, const Points& r, const Points& v) {
+  const size_t n = r.shape(0);
+  if (times.shape(0) != n || v.shape(0) != n) throw nb::value_error("states of different numbers");
+  return filled(n, 1, [&](double* out) {
+    for (size_t i = 0; i < n; ++i) out[i] = space.span(times.data()[i], vectors(r)[i], vectors(v)[i]);
+  });
+}
+
+// Durations (n,) of manoeuvres until the robot recedes outside the sphere.
+nb::object ended(const Space& space, const Many& m) {
+  const size_t n = m.shape(0);
+  return filled(n, 1, [&](double* out) {
+    for (size_t i = 0; i < n; ++i) out[i] = space.ended(manoeuvres(m)[i]);
+  });
+}
+
+// Margins at instants tau (n, k) of manoeuvres; those above ``below`` may be lower bounds.
+nb::object margins(const Space& space, const Many& m, const In<double, -1, -1>& tau, double below) {
+  const size_t n = m.shape(0), k = tau.shape(1);
+  if (tau.shape(0) != n) throw nb::value_error("manoeuvres of different numbers");
+  return filled(n, k, [&](double* out) {
+    for (size_t i = 0; i < n; ++i) space.margins(manoeuvres(m)[i], tau.data() + i * k, k, below, out + i * k);
+  });
+}
+
+// Lower bounds, smallest margins that were found, and their times (n, 3).
+nb::object least(const Space& space, const Many& m, double target) {
+  const size_t n = m.shape(0);
+  return filled(n, 3, [&](double* out) {
+    for (size_t i = 0; i < n; ++i) {
+      const Least found = space.least(manoeuvres(m)[i], target);
+      out[3 * i] = found.lower;
+      out[3 * i + 1] = found.upper;
+      out[3 * i + 2] = found.at;
+    }
+  });
+}
+
+// Directions of escapes (n, 3), searched from directions d (n, 3), and their margins (n,); NaN: none.
+nb::object search(const Space& space, const Values& times, const Points& r, const Points& v, const Points& d,
+                  double wanted) {
+  const size_t n = r.shape(0);
+  if (times.shape(0) != n || v.shape(0) != n || d.shape(0) != n) throw nb::value_error("states of different numbers");
+  std::vector<Vector3> found(vectors(d), vectors(d) + n);
+  nb::object margins = filled(n, 1, [&](double* out) {
+    for (size_t i = 0; i < n; ++i)
+      out[i] = space.search(times.data()[i], vectors(r)[i], vectors(v)[i], wanted, found[i]);
+  });
+  return nb::make_tuple(vectors_of(found), margins);
 }
 
 }  // namespace
@@ -171,6 +286,21 @@ NB_MODULE(_cone, m) {
   m.def("spline", &spline_of);
   m.def("values", &values);
   m.def("integrals", &integrals);
-  nb::class_<Winding>(m, "Winding").def("inside", &inside);
-  m.def("winding", &winding_of);
+  nb::class_<Body>(m, "Body")
+      .def("__init__", &make_body)
+      .def("moved", &Body::moved)
+      .def("__call__", &closest);
+  nb::class_<Space>(m, "Space")
+      .def("__init__", &make_space, nb::keep_alive<1, 2>(), nb::arg("body").none(), nb::arg("clearance_m"),
+           nb::arg("sigmas"), nb::arg("axis_c"), nb::arg("corridor"), nb::arg("centre_c"), nb::arg("radius_m"),
+           nb::arg("enough_m"), nb::arg("rates"), nb::arg("a_max"), nb::arg("coast_s"), nb::arg("kept_share"))
+      .def("set_motion", &set_motion)
+      .def("set_sigma", &set_sigma)
+      .def("most", &most)
+      .def("gradient", &gradient)
+      .def("span", &span)
+      .def("ended", &ended)
+      .def("margins", &margins)
+      .def("least", &least)
+      .def("search", &search);
 }

@@ -6,12 +6,6 @@
 namespace avs {
 namespace {
 
-double dot(const Vector3& a, const Vector3& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-double norm(const Vector3& a) { return std::sqrt(dot(a, a)); }
-
-Vector3 minus(const Vector3& a, const Vector3& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
-
 Vector3 divided(const Vector3& a, double by) { return {a[0] / by, a[1] / by, a[2] / by}; }
 
 class Maker {
@@ -49,7 +43,7 @@ class Maker {
       if (on(k, 2, true)) ball(k, limits_.release - at_.off[k][2]);
     for (size_t k = 0; k < at_.count; ++k) {
       if (!on(k, 2, false)) continue;
-      const Vector3 out = minus(at_.y[k], frame_.centre), normal = divided(out, std::max(norm(out), 1e-9));
+      const Vector3 out = (at_.y[k] - frame_.centre), normal = divided(out, std::max(norm(out), 1e-9));
       fixed(planes_, k, {normal}, -dot(normal, frame_.centre) - limits_.keepout - at_.off[k][2]);
     }
   }
@@ -63,7 +57,7 @@ class Maker {
     for (size_t k = 0; k < at_.count; ++k) {
       if (!on(k, 3, false)) continue;
       const double gap = std::fabs(at_.distance[k]) > 1e-9 ? at_.distance[k] : 1e-9;
-      const Vector3 normal = divided(minus(at_.y[k], at_.foot[k]), gap);
+      const Vector3 normal = divided((at_.y[k] - at_.foot[k]), gap);
       fixed(planes_, k, {normal}, -dot(normal, at_.foot[k]) - at_.clearance[k] - at_.off[k][3]);
     }
   }
@@ -80,7 +74,7 @@ class Maker {
       cones_.sizes.push_back(4);
     }
     for (size_t k = 0; k + 1 < at_.count && !std::isnan(limits_.reach_min); ++k) {
-      const Vector3 out = minus(at_.r[k], frame_.base), normal = divided(out, std::max(norm(out), 1e-9));
+      const Vector3 out = (at_.r[k] - frame_.base), normal = divided(out, std::max(norm(out), 1e-9));
       put(planes_, k, normal, -dot(normal, frame_.base) - limits_.reach_min - at_.off[k][4], 0, true);
       planes_.sizes.push_back(1);
     }

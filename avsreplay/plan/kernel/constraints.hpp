@@ -5,10 +5,10 @@
 #include <cstdint>
 #include <vector>
 
+#include "vector.hpp"
+
 namespace avs {
 
-using Vector3 = std::array<double, 3>;
-using Matrix3 = std::array<Vector3, 3>;
 constexpr int ALTERNATIVES = 5;  // cone, corridor, sphere, body, workspace
 using Pairs = std::array<double, ALTERNATIVES>;
 
