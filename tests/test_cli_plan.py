@@ -136,6 +136,9 @@ def test_tables_name_what_they_show(result):
         "optimal",
         "CAPTURE likely",
         "plan flown blind",
+        "active safety",
+        "passive safety",
+        "not checked: no clearance",
         "Plans against ground truth",
         "outcome: captured",
     ):
