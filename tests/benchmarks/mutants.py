@@ -5,12 +5,16 @@ Each mutant changes one operator, comparison, sign, number or condition of one m
 seed among all that the syntax trees of the package contain. The test files of its area run in a
 copy of the checkout: those whose name begins with the package or the package and the module. Prints
 one line per mutant, then the share that was killed; survivors may be equivalent to the code.
+
+With ``--record FILE`` each verdict is a line of JSON in the file, and a campaign that was ended
+continues after the mutants that are in it: those whose line of code is the same.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import os
 import random
 import shutil
@@ -19,6 +23,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -155,8 +160,38 @@ def killed(mutant: Mutant, tests: list[str], folder: Path, slow: bool) -> bool:
         place.write_text(text, encoding="utf-8")
 
 
+def verdicts(record: Path | None) -> dict[str, bool]:
+    """The verdicts of an earlier campaign, by the name of the mutant."""
+    if record is None or not record.is_file():
+        return {}
+    lines = map(json.loads, record.read_text(encoding="utf-8").splitlines())
+    return {line["mutant"]: line["killed"] for line in lines}
+
+
+def named(mutant: Mutant) -> str:
+    """Path, code of its line, number of the change in the module, and what is changed."""
+    text = (ROOT / mutant.path).read_text(encoding="utf-8").splitlines()[mutant.line - 1]
+    return f"{mutant.path} [{text.strip()}] {mutant.number} {mutant.what}"
+
+
+def _copied(folder: Path) -> None:
+    """Copy the checkout with the compiled modules of the installed package. An editable install
+    would import the original; every interpreter that is started removes what does this.
+    """
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "build", ".mypy_cache"))
+    for each in metadata.files("avsreplay") or ():
+        if each.suffix == ".so":
+            shutil.copy(str(each.locate()), folder / each)
+    (folder.parent / "sitecustomize.py").write_text(
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path"
+        " if not type(each).__module__.startswith('_editable')]\n",
+        encoding="utf-8",
+    )
+
+
 def _environment(folder: Path) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    path = os.pathsep.join(map(str, (folder, folder.parent)))
+    return {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _is_imported(folder: Path) -> bool:
@@ -180,24 +215,29 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--only", default="", help="modules whose path contains this")
     parser.add_argument("--slow", action="store_true", help="run the slow tests of the area too")
+    parser.add_argument("--record", type=Path, help="file of verdicts, which is continued")
     parser.add_argument("--list", action="store_true", help="print the mutants and stop")
     options = parser.parse_args()
     paths = sorted(p for p in ROOT.glob("avsreplay/**/*.py") if options.only in str(p))
     everything = [mutant for path in paths for mutant in mutants(path)]
     sample = random.Random(options.seed).sample(everything, min(options.count, len(everything)))
     print(f"{len(sample)} of {len(everything)} mutants of {len(paths)} modules", flush=True)
-    ended: list[bool] = []
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "avsreplay"
-        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "build", ".mypy_cache"))
+    before, ended = verdicts(options.record), list[bool]()
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent) / "avsreplay"
+        _copied(folder)
         if not options.list and not _is_imported(folder):
-            print("install the package without --editable", file=sys.stderr)
+            print("the copy of the checkout is not what Python imports", file=sys.stderr)
             return 2
         sound: dict[tuple[str, ...], bool] = {}  # tests of an area pass without a mutant
         for mutant in sample:
             where = f"{mutant.path}:{mutant.line} {mutant.what}"
             if options.list:
                 print(where)
+                continue
+            name = named(mutant)
+            if name in before:
+                ended.append(before[name])
                 continue
             tests = tests_of(mutant.path, folder)
             if tuple(tests) not in sound:
@@ -207,6 +247,10 @@ def main() -> int:
                 continue
             ended.append(killed(mutant, tests, folder, options.slow))
             print(f"{'killed  ' if ended[-1] else 'survived'} {where}", flush=True)
+            if options.record:
+                verdict = {"mutant": name, "line": mutant.line, "killed": ended[-1]}
+                with options.record.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(verdict) + "\n")
     if ended:
         print(f"killed {sum(ended)} of {len(ended)}")
     return 0
