@@ -364,7 +364,8 @@ SECTIONS = (
     ),
     (
         "Reading a log",
-        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`.",
+        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`;"
+        " `run --help-all` lists them.",
         "avsreplay.log.options:SourceOptions",
     ),
     (
