@@ -155,6 +155,7 @@ def _clone(folder):
 
 NEEDS = {
     "README.md": (_own_bag, _without_log),
+    "docs/index.md": (_without_log,),
     "docs/your-own-log.md": (_clone,),
     "docs/your-own-backend.md": (_own_backend, _without_log),
     "docs/your-own-estimator.md": (_own_estimator, _without_log),
