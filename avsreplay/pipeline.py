@@ -59,6 +59,7 @@ from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import Effort, effort_for, shown
 from avsreplay.tracker import Kinematics, Tracker
 
+_NAMED = 3  # poses that explain one scan, or are equal, and are named
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 # Scans in a row that the estimate of the free body uses, after which the target counts as free
 # again. With fewer it is left and returned to more often.
@@ -315,9 +316,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
     if acquired is None and not verdict.gamma and lost:
-        measurement = _acquire(
-            stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired"
-        )
+        points = _deskewed(stages, state, scan, predicted)
+        near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
+        measurement = _acquire(stages, state, scan, points, "acquired", near)
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
     track, verdict = stages.estimator.step(
         track, prior, innovation, verdict, state.monitors.convergence.converged
@@ -554,11 +555,46 @@ def _register(
 
 
 def _acquire(
-    stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str
+    stages: Stages,
+    state: PipelineState,
+    scan: Scan,
+    points: NDArray[Any],
+    origin: str,
+    near: Pose | None = None,
 ) -> Measurement:
-    """Register the scan without a guess."""
-    found = SensorFrame(stages.registrar, scan.sensor).acquire(points, _effort(state, scan))
+    """Register the scan without a guess. Of poses that exact symmetries make equal, the run follows
+    one: that which is nearest to a pose T_ac, or the registered one.
+    """
+    frame, effort = SensorFrame(stages.registrar, scan.sensor), _effort(state, scan)
+    found = frame.acquire(points, effort)
+    if found.equal:
+        best = found.T_ac if near is None else min(found.members, key=partial(_turn, near))
+        one = frame.register(points, best, scan.seq, False, effort, None)
+        found = replace(one, message=one.message or _equal_words(found))
+    elif found.members and not found.message:
+        options = _options(found.members[:_NAMED])
+        found = replace(found, message=f"{len(found.members)} poses explain the scan: {options}")
     return _measurement(stages, scan, points, found, origin)
+
+
+def _equal_words(found: Alignment) -> str:
+    """That the pose is one of several that a symmetry of the model makes equal."""
+    others = _options(found.members[1 : _NAMED + 1])
+    return (
+        f"one of {len(found.members)} poses that the symmetry of the model makes equal"
+        f" ({found.free_directions}); the others: {others}"
+    )
+
+
+def _options(poses: Iterable[Pose]) -> str:
+    """The options that begin a run with one of some poses."""
+    texts = (",".join(f"{x:.6g}" for x in (*pose.t, *pose.q)) for pose in poses)
+    return ", ".join(f"--init {text}" for text in texts)
+
+
+def _turn(T_ac: Pose, other: Pose) -> float:
+    """Angle between two poses [rad]."""
+    return float(geometry.angle(geometry.multiply(geometry.conjugate(T_ac.q), other.q)))
 
 
 def _effort(state: PipelineState, scan: Scan) -> Effort:

@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array, MeasuredPose, Pose, bounding_diagonal, frozen, matrix, rotate
+from avsreplay.geometry import (
+    Array,
+    MeasuredPose,
+    Pose,
+    bounding_diagonal,
+    frozen,
+    matrix,
+    multiply,
+    rotate,
+)
 
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -241,6 +250,19 @@ class Truth:
     state: State | None = None
     fault: str | None = None
 
+    def at_image(self, image: Pose) -> Truth:
+        """Return the truth about an image of {C} under a symmetry of the model.
+
+        Args:
+            image: pose of the image in {C}.
+        """
+        x, pose = self.state, None if self.pose is None else self.pose @ image
+        if x is not None:
+            c_b = x.c_b + matrix(x.q_bc) @ image.t
+            q_bc = multiply(x.q_bc, image.q)
+            x = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, c_b, q_bc)
+        return Truth(pose, x, self.fault)
+
 
 @value_class
 class LogHeader:
@@ -299,6 +321,8 @@ class Alignment:
         message: why it failed or is not accepted.
         free_directions: not determined, in words; free: columns d (6, k).
         members: of an ambiguous one, the poses T_ac that explain the scan, the registered first.
+        equal: no scan can tell them apart, because exact symmetries of the model carry one onto
+            another.
         split_nis, size: see ``quality``; with the 1 sigma of the size.
         size_1s: error of the size, until it is fitted.
     """
@@ -322,6 +346,7 @@ class Alignment:
     systematic: Array | None = None
     size: tuple[float, float] | None = None
     members: tuple[Pose, ...] = ()
+    equal: bool = False
 
     @property
     def measured(self) -> bool:

@@ -29,6 +29,7 @@ from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
     CONSTRAINTS,
+    SampledScene,
     Scene,
     TargetGeometry,
     in_fixture_axes,
@@ -40,6 +41,7 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
+from avsreplay.plan.withdrawal import COAST_S, Certificate, Space, coasting
 from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
@@ -175,6 +177,22 @@ class Replanning:
         belief, estimator = self.belief(index), self.saved.estimator
         scene = Scene(estimator.motion(belief), estimator.attitude(belief))
         return self.arm.last_metres(self.path(made), scene, self.limits)
+
+    def passive(self, index: int, made: Plan) -> Certificate | None:
+        """Return the margin of a robot that coasts after a cut of its thrust at any instant of a
+        plan; None without a plan or a clearance.
+
+        Args:
+            index: index of the scan from which the plan was made.
+            made: the plan.
+        """
+        if not made.found or self.limits.clearance_m is None:
+            return None
+        params, scene = self.params, self._scene(self.belief(index))
+        span_s = made.t_go_s + 1.5 * COAST_S
+        sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
+        space = Space(sampled, self.limits, params.a_max_mps2, self.saved.extent_m)
+        return coasting(space, self.path(made), made.latency_s)
 
     def path(self, made: Plan) -> RobotPath:
         """Return the path of a plan from the start.

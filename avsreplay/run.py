@@ -10,8 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.assess import FlightLog, Setup, assess
 from avsreplay.assessment import Assessment
@@ -38,7 +36,7 @@ from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.registrar import Registrar
 from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
-from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
+from avsreplay.score import HealthyPoses, Scorer, matched_truth, pose_error, reference_motion
 from avsreplay.tables import RowTable
 from avsreplay.toml_document import own_settings
 
@@ -49,6 +47,9 @@ RECONSTRUCTED, MOST_LOSSES = (
     Path("auto"),
     100,
 )  # a model built from the log; losses listed one by one in run.json
+
+
+_EQUAL_DEG = 3.0  # an error below this is not that of another one of equal poses
 
 
 @value_class
@@ -160,6 +161,7 @@ class Run:
         self._reference_instants: list[int] = []
         self._state, self.done = first_state(self._stages), 0
         self._scored: Scorer | None = None
+        self._image: Pose | None = None  # of {C}, which the run follows
         self._end: tuple[Belief, State] | None = None
         self.flight = FlightLog()
         self._assessed: tuple[int, Assessment] | None = None
@@ -237,6 +239,8 @@ class Run:
         ):  # the pipeline has a thread of its own; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
+            if self._image is None and outcome.verdict.gamma:
+                self._follow(outcome)
             truth = self._truth_of(outcome.scan)
             if self.job.growing:
                 self.job.growing.take(outcome.scan, self._true(outcome.scan))
@@ -272,8 +276,8 @@ class Run:
             more: further state to store with it, such as what listeners have collected.
         """
         own = (
-            *(self._state, self.done, self.model_check, self._end, self._scored),
-            self.flight,
+            *(self._state, self.done, self.model_check, self._end, self._image),
+            *(self._scored, self.flight),
         )
         motion = None if self._scored is None else self._scored.motion
         return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
@@ -291,12 +295,12 @@ class Run:
         """
         scored = self._scorer()
         motion, scored.motion = scored.motion, None  # it is named and not stored
-        judged = self.model_check, None, scored, self.flight
+        judged = self.model_check, None, None, scored, self.flight
         like: Any = (self._state, 0, *judged, [], [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self.model_check, self._end, *rest = found
         self.taken = rows
-        self._scored, self.flight, *rest = rest
+        self._image, self._scored, self.flight, *rest = rest
         self._fixes, self._reference_instants, stored = rest
         if self._fixes:
             self._reference = reference_motion(self._fixes, self.estimator)
@@ -466,6 +470,21 @@ class Run:
             growing=bool(self.job.growing),
         )
 
+    def _follow(self, outcome: Outcome) -> None:
+        """Take the truth as that of the pose that the run follows, where exact symmetries of the
+        model make several poses equal.
+        """
+        truth = self._truth_of(outcome.scan).pose
+        if truth is None:
+            return
+        found, best = outcome.alignment.T_ac, truth
+        if pose_error(found, truth).angle_deg > _EQUAL_DEG:
+            images = self.registrar.images(truth)
+            best = min(images, key=lambda pose: pose_error(found, pose).angle_deg)
+        self._image = truth.inverse() @ best
+        if best is not truth:
+            self._scored = self._scorer()
+
     def _true_poses(self) -> list[tuple[int, Pose]]:
         """True poses of the log, or of the reference within its span, about the grasp point."""
         reference, poses = self._reference, list(self.source.truth_poses())
@@ -478,7 +497,7 @@ class Run:
                 t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns
             ]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
-        point = Pose(np.array([0.0, 0.0, 0.0, 1.0]), self.task.grasp_c)
+        point = (self._image or Pose.identity()) @ Pose(Pose.identity().q, self.task.grasp_c)
         return [(t_ns, pose @ point) for t_ns, pose in poses]
 
     def _truth_of(self, scan: Scan) -> Truth:
@@ -487,7 +506,7 @@ class Run:
         """
         truth, fitted = self._true(scan), self._reference
         if fitted is None:
-            return truth
+            return truth if self._image is None else truth.at_image(self._image)
         inside = (
             fitted.epoch_ns <= scan.t_ns <= fitted.end_ns
         )  # from the first to the last healthy pose

@@ -196,7 +196,7 @@ def built_in(show: Browser, folder: Path) -> None:
     show.choose(scans - 40)
     save(show.shot(), "page.png")
     save(show.part(".approach"), "approach.png")
-    show.open(page, 900, 1170)
+    show.open(page, 900, 840)
     show.driver.execute_script(
         "document.querySelectorAll('header, #lead, #controls, #scene, .tables, footer')"
         ".forEach((each) => each.remove()); scrollTo(0, 0)"

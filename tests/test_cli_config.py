@@ -37,7 +37,7 @@ def test_the_reference_page_holds_every_setting():
     for _, _, owner in SECTIONS:
         module, _, name = owner.partition(":")
         for entry in settings.entries(getattr(importlib.import_module(module), name)):
-            assert f"| `{entry.key}` |" in page
+            assert f"- `{entry.key}` (" in page
 
 
 def test_a_printed_configuration_gives_the_same_run(cli, fixtures_folder, tmp_path):

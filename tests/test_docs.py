@@ -35,7 +35,7 @@ def _blocks(page):
 MARKED = [page for page in PAGES if any(block["mark"] for block in _blocks(page))]
 QUICK = {"docs/index.md"}
 SHORT = {
-    "AVSREPLAY_RECORD_DURATION_S": "12",
+    "AVSREPLAY_RECORD_DURATION_S": "8",  # ends before the approach: no flights are simulated
     "AVSREPLAY_SWEEP_LIMIT": "2",
 }  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
@@ -155,6 +155,7 @@ def _clone(folder):
 
 NEEDS = {
     "README.md": (_own_bag, _without_log),
+    "docs/index.md": (_without_log,),
     "docs/your-own-log.md": (_clone,),
     "docs/your-own-backend.md": (_own_backend, _without_log),
     "docs/your-own-estimator.md": (_own_estimator, _without_log),

@@ -189,13 +189,15 @@ def test_bounds_per_axis_from_rest_to_rest_in_closed_form():
 
 
 def test_every_plan_of_a_run_obeys_the_limits():
+    """The log is too short for the convergence that the default tolerance requires."""
+    soon = ("convergence.sigmas=0.02", "convergence.dwell_s=0.5")
     limits = ("limits.final_deg=15", "limits.clearance_m=0.1")
-    rows = [row for row in replay(TUMBLE, *limits) if row.plan_status is not None]
+    rows = [row for row in replay(TUMBLE, *soon, *limits) if row.plan_status is not None]
     planned = [row for row in rows if row.plan_status in ("optimal", "feasible")]
     assert planned
     assert all(
         row.plan_margin_m >= 0.0 and row.plan_limit in ("corridor", "body") for row in planned
     )
-    free = [row for row in replay(TUMBLE) if row.capture_time_s is not None]
+    free = [row for row in replay(TUMBLE, *soon) if row.capture_time_s is not None]
     assert min(r.capture_time_s for r in planned) >= min(r.capture_time_s for r in free) - 1e-6
     assert all(row.plan_margin_m is None for row in free)

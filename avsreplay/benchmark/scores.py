@@ -95,7 +95,7 @@ def _any(values: Sequence[float]) -> Estimate:
 
 def _mean(values: Sequence[float]) -> Estimate:
     mean = math.fsum(values) / len(values)
-    if len(values) < 2:
+    if len(set(values)) < 2:  # of equal values the bootstrap would say that there is no doubt
         return Estimate(mean, None, None, len(values))
     low, high = interval_of_mean(np.asarray(values, dtype=np.float64))
     return Estimate(mean, low, high, len(values))

@@ -177,7 +177,7 @@ class _Scorer:
             **capture_of(summary.assessment if self._run.truth is not None else None),
             "position_permille": None if rms[0] is None else 1e3 * rms[0] / self._extent_m,
             "attitude_deg": rms[1],
-            "nees": float(np.median(nees)) / 6.0 if nees else None,
+            "nees": float(np.median(nees)) / 6.0 if nees and not self._log.truth_m else None,
         }
 
 

@@ -364,7 +364,8 @@ SECTIONS = (
     ),
     (
         "Reading a log",
-        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`.",
+        "Options of `avsreplay run`, `info` and `record`, with dashes: `--model-unit mm`;"
+        " `run --help-all` lists them.",
         "avsreplay.log.options:SourceOptions",
     ),
     (
@@ -451,14 +452,12 @@ def _page() -> Iterator[str]:
         for table, rows in tables.items():
             if table:
                 yield f"### [{table}]\n"
-            yield "| setting | default, range | meaning |\n|---|---|---|"
-            yield "\n".join(map(_row, rows)) + "\n"
+            yield "\n".join(map(_line, rows)) + "\n"
 
 
-def _row(entry: Entry) -> str:
+def _line(entry: Entry) -> str:
     value = ", ".join(part for part in (_default(entry), _range(entry)) if part)
-    cells = (f"`{entry.key}`", value, entry.declared.doc)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    return f"- `{entry.key}` ({value}): {entry.declared.doc}"
 
 
 def _default(entry: Entry) -> str:

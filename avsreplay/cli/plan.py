@@ -189,7 +189,10 @@ def plan_command(
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    answer = Answer(planning, at_s, made, assessment, spread, joints, hindsight, execution, changes)
+    passive = planning.passive(index, made)
+    answer = Answer(
+        planning, at_s, made, assessment, spread, joints, hindsight, execution, changes, passive
+    )
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:
@@ -330,7 +333,7 @@ def _animate(answer: Answer, index: int, path: Path) -> str:
         raise UsageError(
             "there is no plan to show", where=str(path), hint=f"its status is {made.status.value}"
         )
-    facts = plan_facts(planning, answer.at_s, made)
+    facts = plan_facts(planning, answer.at_s, made, answer.passive)
     title = f"{planning.saved.name}: flight planned at {answer.at_s:.2f} s"
     page = build_flight_page(
         title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts

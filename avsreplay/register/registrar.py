@@ -62,6 +62,11 @@ LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = (
 MANY_OFF = 0.1
 
 
+def _turn(T_ac: Pose, other: Pose) -> float:
+    """Angle between two poses [rad]."""
+    return float(geometry.angle(geometry.multiply(geometry.conjugate(T_ac.q), other.q)))
+
+
 class Registrar:
     """Registers scans to one surface with one back end. Built once, used for every scan of a log.
 
@@ -172,6 +177,7 @@ class Registrar:
         )
         if self._far(guess, found) and not searched:
             found = self._searched(seen.points, found, carried, budget)
+            found = self._at_image(scan, found, guess, budget, halves, carried)
         elif not searched:
             found = self._unique(scan, guess, found, budget, halves, carried)
             found = self._settled(scan, found, budget, halves, carried, unknown)
@@ -199,7 +205,17 @@ class Registrar:
                 quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED
             )
         budget = Budget(healthy_work(len(scan), self._target.near_work))
-        return self._neighbourhood.finished(scan, self._acquire(scan, budget, False), budget)
+        found = self._neighbourhood.finished(scan, self._acquire(scan, budget, False), budget)
+        return self._symmetry.equal(scan, found) if found.status in ACCEPTED else found
+
+    def images(self, T_ac: Pose) -> list[Pose]:
+        """Return the poses that no scan can tell from a pose, because an exact symmetry of the
+        model carries it onto itself; the pose itself is the first.
+
+        Args:
+            T_ac: the pose.
+        """
+        return [T_ac, *(each.inverse() for each in self._symmetry.images(T_ac.inverse()))]
 
     def _acquire(
         self,
@@ -340,9 +356,6 @@ class Registrar:
             budget.spend(work + extra)
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
                 found = self._neighbourhood.regraded(scan, few, best, budget, True, carried)
-        images, same = self._symmetry.images(found.T_ac.inverse()), self._symmetry.search.same
-        rivals = [each for each in rivals if not any(same(each, image) for image in images)]
-        rivals = images + rivals
         return self._unrivalled(scan, found, rivals, covered, budget), alone, at.doubtful
 
     def _verified(
@@ -379,7 +392,10 @@ class Registrar:
         found = self._symmetry.rivalled(scan, found, rivals)
         if found.status is AlignStatus.AMBIGUOUS or covered or not self._visibility.sided:
             return found
-        return self._neighbourhood.of_one(scan, found, budget)
+        one = self._neighbourhood.of_one(scan, found, budget)
+        if one.status not in ACCEPTED and (said := self._symmetry.equal(scan, found)).members:
+            return replace(said, equal=False)
+        return one
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see
@@ -496,6 +512,25 @@ class Registrar:
             found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED
         )
 
+    def _at_image(
+        self,
+        scan: NDArray[Any],
+        found: Alignment,
+        guess: Pose,
+        budget: Budget,
+        halves: bool,
+        carried: bool,
+    ) -> Alignment:
+        """The result of a search at that of its equal poses which is nearest to the guess."""
+        if found.status not in ACCEPTED:
+            return found
+        poses = (found.T_ac, *self._symmetry.equal(scan, found).members)
+        best = min(poses, key=lambda T_ac: _turn(T_ac, guess))
+        if best is found.T_ac:
+            return found
+        few = self._restarter.part(scan)
+        return self._neighbourhood.regraded(scan, few, best.inverse(), budget, halves, carried)
+
     def _recovered(
         self,
         seen: Observed,
@@ -546,7 +581,7 @@ class Registrar:
                     and (found := self._acquire(seen.points, budget, carried, 1, known)).status
                     in ACCEPTED
                 ):
-                    return found, True
+                    return self._at_image(scan, found, guess, budget, halves, carried), True
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break

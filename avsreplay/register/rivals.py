@@ -316,21 +316,39 @@ class NearSymmetry:
 
     def rivalled(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> Alignment:
         """Return the alignment; AMBIGUOUS with rivals that differ not only along its
-        unobservable directions.
+        unobservable directions, and by no exact symmetry.
+        """
+        images, same = self.images(found.T_ac.inverse()), self.search.same
+        rivals = [each for each in rivals if not any(same(each, image) for image in images)]
+        rivals = self._apart(scan, found, rivals)
+        return self._named(found, rivals) if rivals else found
+
+    def equal(self, scan: NDArray[Any], found: Alignment) -> Alignment:
+        """Return the alignment; AMBIGUOUS with its images by the exact symmetries of the model,
+        which no scan can tell apart.
+        """
+        images = self._apart(scan, found, self.images(found.T_ac.inverse()))
+        return replace(self._named(found, images), equal=True) if images else found
+
+    def _apart(self, scan: NDArray[Any], found: Alignment, others: list[Pose]) -> list[Pose]:
+        """Those of other poses T_ca that differ from a result not only along its unobservable
+        directions.
         """
         at, target = found.T_ac.inverse(), self._target
-        if rivals and found.status is AlignStatus.DEGENERATE:
+        if others and found.status is AlignStatus.DEGENERATE:
             free = view_directions(target.index, target.visibility, scan, at, self._gate)
-            rivals = [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
-        if not rivals:
-            return found
-        words = dict.fromkeys(turn_words(at @ each.inverse()) for each in rivals)
+            others = [T_ca for T_ca in others if not self.search.same(T_ca, free.nearest(at, T_ca))]
+        return others
+
+    def _named(self, found: Alignment, others: list[Pose]) -> Alignment:
+        """The alignment as one of several poses that explain the scan."""
+        words = dict.fromkeys(turn_words(found.T_ac.inverse() @ each.inverse()) for each in others)
         return replace(
             found,
             status=AlignStatus.AMBIGUOUS,
             covariance=None,
             free_directions=", ".join([*words][:MOST_NAMED]),
-            members=(found.T_ac, *(each.inverse() for each in rivals)),
+            members=(found.T_ac, *(each.inverse() for each in others)),
         )
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:

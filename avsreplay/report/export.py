@@ -228,12 +228,11 @@ def columns_page() -> str:
         if each.section is not None:
             parts += [*words, f"\n## {each.section.title}\n\n"]
             parts += [f"{each.section.text}\n\n"] if each.section.text else []
-            parts.append("| column | type | golden | meaning |\n|---|---|---|---|\n")
             words = []
         parts.append(_line(each, *field_types()[each.name]))
         if each.words:
-            words.append(f"\n| value of `{each.name}` | meaning |\n|---|---|\n")
-            words += [f"| `{word}` | {meaning} |\n" for word, meaning in each.words.items()]
+            words.append(f"\nValues of `{each.name}`:\n\n")
+            words += [f"- `{word}`: {meaning}\n" for word, meaning in each.words.items()]
     return "".join([*parts, *words])
 
 
@@ -247,8 +246,8 @@ def _line(column: Column, kind: type, nullable: bool) -> str:
         if value
     )
     word = kind.__name__ + ("?" if nullable else "") + (f" {column.unit}" if column.unit else "")
-    meaning = column.text.replace("|", "\\|")
-    return f"| `{column.name}` | {word} | {tolerance} | {meaning} |\n"
+    kinds = f"{word}, golden {tolerance}" if tolerance else word
+    return f"- `{column.name}` ({kinds}): {column.text}\n"
 
 
 def row_schema() -> dict[str, Any]:

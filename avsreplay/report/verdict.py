@@ -453,6 +453,9 @@ def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
         "measured": "the first measured pose",
         "acquired": "a global search without any prior knowledge",
     }.get(rows[0].guess, plain(rows[0].guess))
+    first = next((row for row in rows if row.gamma), rows[0])
+    if first.guess == "acquired" and first.message:
+        said += f": {first.message}"
     return said + (f"; initialisation '{mode}'" if mode else "")
 
 
