@@ -200,8 +200,7 @@ def find_model(
         The number of scans in which the model is found, and whether the sensor is elsewhere. If the
         mirror image of the model explains the scans better, a second finding says so.
     """
-    scale = _named_unit(found, "--model-unit") or options.model_unit.metres
-    model = scaled(surface, scale / options.model_unit.metres)
+    model = in_found_unit(surface, found, options)
     if (metres := _named_unit(found, "--scan-unit")) is not None:
         clouds = [metres * cloud for cloud in clouds]
     few, registrar = _few(clouds), Registrar(model)
@@ -223,6 +222,18 @@ def find_model(
         Advice("ok", "pose", text + ("" if one else ", each time in more than one pose")),
         *mirrored,
     ]
+
+
+def in_found_unit(surface: Surface, found: Sequence[Advice], options: SourceOptions) -> Surface:
+    """Return the model in the unit that findings suggest for it.
+
+    Args:
+        surface: model of the target.
+        found: findings of ``compare_sizes``.
+        options: how the log is read.
+    """
+    scale = _named_unit(found, "--model-unit") or options.model_unit.metres
+    return scaled(surface, scale / options.model_unit.metres)
 
 
 def _named_unit(found: Sequence[Advice], option: str) -> float | None:

@@ -14,7 +14,7 @@ from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
 from avsreplay.log.returns import MAX_COORDINATE_M
-from avsreplay.model_size import Advice, compare_sizes, find_model
+from avsreplay.model_size import Advice, compare_sizes, find_model, in_found_unit
 from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
@@ -49,15 +49,11 @@ def preflight(
     info, scans = source.info(), _sampled(source)
     general = [*_transforms(info, source), *_truth(info, source, scans), *_clock(info)]
     general += _meaning(source)
-    grasp = _grasp_patches(surface) if search else _grasp_point(surface)
     if source.options.poses:
-        return [*_poses(source, surface), *grasp, *general]
-    found = [
-        *_contents(source, scans, surface, registrar, search),
-        *_faces(surface),
-        *grasp,
-        *general,
-    ]
+        return [*_poses(source, surface), *_grasp(surface, search), *general]
+    sizes = _contents(source, scans, surface, registrar, search)
+    model = None if surface is None else in_found_unit(surface, sizes, source.options)
+    found = [*sizes, *_faces(surface), *_grasp(model, search), *general]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = (
@@ -81,6 +77,10 @@ def _faces(surface: Surface | None) -> list[Advice]:
         return []
     text = f"{surface.reversed} of {len(surface.faces)} faces pointed inwards and are used reversed"
     return [Advice("ok", "faces", text)]
+
+
+def _grasp(surface: Surface | None, search: bool) -> list[Advice]:
+    return _grasp_patches(surface) if search else _grasp_point(surface)
 
 
 def _grasp_point(surface: Surface | None) -> list[Advice]:
