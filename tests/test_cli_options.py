@@ -87,21 +87,24 @@ def test_a_quick_run_prints_no_progress(capsys):
     assert capsys.readouterr().err == ""
 
 
-def _interrupted(rows):
-    yield from rows
+def _interrupted(rows, kept):
+    """A run that keeps each row and yields it, until the user interrupts."""
+    for row in rows:
+        kept.append(row)
+        yield row
     raise KeyboardInterrupt
 
 
 def test_an_interrupt_keeps_the_rows_so_far(make_rows):
     kept = []
-    assert _collect(_interrupted(make_rows(3)), kept)
+    assert _collect(_interrupted(make_rows(3), kept), kept)
     assert [row.seq for row in kept] == [0, 1, 2]
     assert not _collect((row for row in make_rows(2)), [])
 
 
 def test_an_interrupt_before_the_first_row_ends_the_run():
     with pytest.raises(KeyboardInterrupt):
-        _collect(_interrupted([]), [])
+        _collect(_interrupted([], []), [])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")

@@ -332,7 +332,7 @@ def test_a_link_to_a_folder_is_followed(tmp_path: Path) -> None:
     assert (tmp_path / "there" / "file").is_file()
 
 
-SHAPES = {"n": ("i", (None,)), "x": ("f", (None, 2))}
+SHAPES = {"n": ("i8", ()), "x": ("f8", (2,))}  # of each record
 
 
 def archive(tmp_path: Path, **arrays: np.ndarray) -> Path:
@@ -342,13 +342,10 @@ def archive(tmp_path: Path, **arrays: np.ndarray) -> Path:
 
 
 def test_arrays_come_back_as_they_were_written(tmp_path: Path) -> None:
-    n, x = (
-        np.arange(5, dtype=np.int32),
-        np.asfortranarray(np.random.default_rng(1).normal(size=(3, 2))),
-    )
+    n, x = np.arange(5, dtype=np.int32), np.random.default_rng(1).normal(size=(3, 2))
     found = read_npz(archive(tmp_path, n=n, x=x), SHAPES, limit=1 << 20, hint="hint")
-    assert np.array_equal(found["n"], n)
-    assert np.array_equal(found["x"], x)
+    assert np.array_equal(found["n"].read(0, 5), n)
+    assert np.array_equal(found["x"].read(0, 3), x)
 
 
 @pytest.mark.parametrize(

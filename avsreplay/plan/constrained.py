@@ -86,6 +86,7 @@ def constrained(
     extent_m: float = 8.0,
     warm: tuple[RobotPath, float] | None = None,
     earliest_s: float = 0.0,
+    stated: bool = True,
 ) -> Plan:
     """Plan a rendezvous under constraints.
 
@@ -99,6 +100,7 @@ def constrained(
         extent_m: Diagonal of the target's bounding box [m].
         warm: A path planned earlier and the time since its begin [s]; it is the first initial path.
         earliest_s: Earliest capture allowed [s after t_ns].
+        stated: State the margin of the withdrawals from every instant; it is required in any case.
 
     Returns:
         A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the
@@ -127,9 +129,13 @@ def constrained(
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     buffer_m = BUFFER_OF_EXTENT * extent_m
     case = Case(sampled, limits, params, r0, v0, buffer_m, earliest_s=earliest_s)
-    return _free_plan(case, free) or _graded(
+    plan = _free_plan(case, free) or _graded(
         case, free, _best_path(case, free, unbound, warm), t_ns
     )
+    if not (stated and plan.found):
+        return plan
+    margin_m = withdrawal_margin(case, path_of(plan, r0, v0), plan.escapes)
+    return replace(plan, abort_margin_m=margin_m)
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
@@ -201,15 +207,12 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
         if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
             return None
     worst, name = worst_margin(case, path)
-    if worst < 0.0 or proven(case, path, withdrawn(case, path, Tried.first())).short_m > 0.0:
+    if worst < 0.0:
         return None
-    return replace(
-        free,
-        violation_m=0.0,
-        margin_m=worst,
-        binding=name,
-        abort_margin_m=withdrawal_margin(case, path),
-    )
+    away = proven(case, path, withdrawn(case, path, Tried.first()))
+    if away.short_m > 0.0:
+        return None
+    return replace(free, violation_m=0.0, margin_m=worst, binding=name, escapes=away.escapes)
 
 
 def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
@@ -234,7 +237,6 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         violation_m=max(-worst, 0.0),
         margin_m=worst,
         binding=name,
-        abort_margin_m=withdrawal_margin(case, found),
         escapes=found.escapes,
     )
 

@@ -412,14 +412,13 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
     return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
 
 
-def withdrawal_margin(case: Case, path: RobotPath) -> float:
+def withdrawal_margin(case: Case, path: RobotPath, escapes: Array | None) -> float:
     """Return a lower bound of the margin of withdrawals from every instant of a path [m]; NaN
     without a clearance.
     """
     if case.space is None:
         return math.nan
     space = Space(case.sampled, case.limits, case.params.a_max_mps2, case.extent_m)
-    escapes = path.escapes if isinstance(path, StepPath) else None
     tried = Tried.of(escapes, case.wait_s, path.t_go_s)
     return certified(space, path, case.wait_s, tried).margin_m
 

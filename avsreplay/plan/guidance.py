@@ -139,6 +139,7 @@ class Guidance:
         extent_m: float = 8.0,
         gripper: tuple[Array, float] | None = None,
         arm: Arm | None = None,
+        stated: bool = True,
     ) -> None:
         """Create the guidance of one run.
 
@@ -150,10 +151,16 @@ class Guidance:
             gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration
                 [rad/s2]; None: the attitude is not planned.
             arm: Manipulator that must be able to fly the last metres; None without.
+            stated: Plans state the margin of their withdrawals.
         """
-        self.gripper, self.arm = gripper, arm
+        self.gripper, self.arm, self.stated = gripper, arm, stated
         self.params, self.supervisor = params, supervisor
         self.limits, self.extent_m = (limits or Limits()).resolved(extent_m), extent_m
+
+    def unstated(self) -> Guidance:
+        """Return the same guidance, whose plans do not state the margin of their withdrawals."""
+        own = self.params, self.supervisor, self.limits, self.extent_m, self.gripper, self.arm
+        return Guidance(*own, stated=False)
 
     def initial(self, t_ns: int) -> GuidanceState:
         """Return the state at the first scan: the robot at its configured position and velocity.
@@ -284,12 +291,11 @@ class Guidance:
             nonlocal searched_s
             if draft is not None and draft.path is not None:
                 since_s = (known.t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
-                plan = constrained(
-                    *problem, warm=(draft.path, max(since_s, 0.0)), earliest_s=earliest_s
-                )
+                warm = draft.path, max(since_s, 0.0)
+                plan = constrained(*problem, warm=warm, earliest_s=earliest_s, stated=self.stated)
                 if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
                     return plan
-            plan = constrained(*problem, earliest_s=earliest_s)
+            plan = constrained(*problem, earliest_s=earliest_s, stated=self.stated)
             searched_s = plan.t_go_s
             return plan
 

@@ -370,7 +370,7 @@ def _chosen(
     if not poor.any():
         return found
     other = d.copy()
-    other[poor] = space.directions(t[poor], r[poor], v[poor], np.full((poor.sum(), 3), math.nan))
+    other[poor] = space.directions(t[poor], r[poor], v[poor], d[poor])
     again = bounded(other)
     return bounded(np.where((again[2] > found[2])[:, None], other, d))
 

@@ -160,14 +160,6 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
         (("IN", "-o", "OUT.tum", "--n-scans", "4"),),
         ("log.mcap", "zstd.mcap", "scans"),
     ),
-    ("odometry", "model"): (
-        (("log.mcap", "--model", "IN", "-o", "OUT.tum", "--n-scans", "4"),),
-        MODELS,
-    ),
-    ("odometry", "truth_file"): (
-        (("scans", "--truth", "IN", "-o", "OUT.tum", "--n-scans", "4"),),
-        POSES,
-    ),
     ("report", "result"): ((("IN", "-o", "OUT.html"),), ("result", "interrupted")),
     ("export", "result"): (
         tuple(
@@ -196,13 +188,9 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
         (("dense.mcap", "--against", "IN", "-o", "OUT.ply", "--n-scans", "4"),),
         MODELS,
     ),
-    ("model", "model"): (
-        (("dense.mcap", "--model", "IN", "-o", "OUT.ply", "--n-scans", "4"),),
-        MODELS,
-    ),
-    ("model", "truth_file"): (
-        (("dense.mcap", "--truth", "IN", "-o", "OUT.ply", "--n-scans", "4"),),
-        POSES,
+    ("benchmark", "data"): (
+        (("--only", "real-turntable", "--data", "IN", "-o", "OUT", "--n-scans", "1"),),
+        ("scans",),
     ),
     ("config", "log"): ((("IN",),), ("log.mcap", "zstd.mcap")),
     ("config", "config_file"): ((("--config", "IN"),), ("config.toml",)),
