@@ -109,7 +109,7 @@ def _grasp_patches(surface: Surface | None) -> list[Advice]:
     if task.problem:
         option = patches[0].option if patches else "--grasp X,Y,Z"
         found.append(Advice("check", "grasp point", task.problem, option))
-    return found + [Advice("ok", f"patch {each.name}", each.text, each.option) for each in patches]
+    return found + [Advice("ok", "grasp patch", f"{each.option}: {each.text}") for each in patches]
 
 
 def _sampled(source: Source) -> list[Scan]:

@@ -548,11 +548,11 @@ def test_patches_that_a_gripper_reaches_are_proposed(usable):
     body = Surface(mesh.vertices + at, mesh.faces.astype(np.int32), "box", "a")
     found = preflight(Log([]), body, search=True)
     at_origin = [a for a in found if a.about == "grasp point"]
-    offered = [a for a in found if a.about.startswith("patch")]
+    offered = [a for a in found if a.about == "grasp patch"]
     assert [a.option for a in at_origin] == ([] if usable else ["--set task.patch=flat-1"])
     assert len(offered) == 3
     for advice in offered:
-        name = advice.option.removeprefix("--set task.patch=")
+        name = advice.text.split(":")[0].removeprefix("--set task.patch=")
         config = RunConfig(task=TaskParams(patch=name))
         task, target = task_and_target(config, body)
         assert not task.problem

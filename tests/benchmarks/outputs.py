@@ -75,8 +75,9 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("model", "poses"): ("log.mcap", "-o", "other.ply", "--poses", "OUT", "--overwrite"),
     ("odometry", "output"): ("log.mcap", "-o", "OUT", "--overwrite", "--n-scans", "3"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
+    ("benchmark", "output"): ("--only", "real-turntable", "--data", "scans", "-o", "OUT"),
 }
-FOLDERS = {("run", "output"), ("sweep", "output")}
+FOLDERS = {("run", "output"), ("sweep", "output"), ("benchmark", "output")}
 NODES = (
     "file",
     "null",
