@@ -88,6 +88,12 @@ def test_info_describes_a_log(whole: Path) -> None:
     assert told["scans"] == 20
     assert [f["kind"] for f in told["faults"]] == ["occlusion", "dropped", "bias"]
     assert told["topics"][1]["rate_hz"] == pytest.approx(2.0)
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    kinds = {chunk.compression or "uncompressed" for chunk in summary.chunk_indexes}
+    assert told["chunks"] == f"{len(summary.chunk_indexes)} {kinds.pop()}"
+    assert not kinds
 
 
 def test_info_exits_with_4_on_a_damaged_log_and_3_without_one(damaged: Path) -> None:

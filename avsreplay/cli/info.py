@@ -249,6 +249,7 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
         ("file", info.path),
         ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
         ("size", f"{info.bytes / 1e6:.3g} MB" if info.bytes >= 1e6 else f"{info.bytes} bytes"),
+        *([("chunks", info.chunks)] if info.chunks else []),
         ("log clock", " ".join(filter(None, (_time(info.start_ns), "for", span))) if span else "-"),
         (
             "scans",

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import zlib
 from array import array
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -174,6 +175,10 @@ class ChunkStore:
     def __len__(self) -> int:
         return len(self._offset)
 
+    def compressions(self) -> Counter[str]:
+        """Return the number of chunks of each compression."""
+        return Counter(_COMPRESSIONS[k] or "uncompressed" for k in self._compression)
+
     def check(self, at: int, head: ChunkHead) -> bytes:
         """Return the decompressed chunk at offset ``at``.
 
@@ -237,6 +242,10 @@ class Recording:
         self.path, self.losses = path, list[Loss]()
         self.metadata: dict[str, dict[str, str]] = {}
         self._limit, self._table = limit, MessageTable(sinks, limit)
+
+    def chunks(self) -> Counter[str]:
+        """Return the number of chunks of each compression; a database has none."""
+        return Counter()
 
     def topics(self) -> list[TopicInfo]:
         """Return every topic that was declared, sorted by name."""
@@ -341,6 +350,10 @@ class Merged(Recording):
         self.metadata = {}
         for part in reversed(self._parts):  # the first part with a record of that name counts
             self.metadata.update(part.metadata)
+
+    def chunks(self) -> Counter[str]:
+        """Return the number of chunks of each compression in all parts."""
+        return sum((part.chunks() for part in self._parts), Counter[str]())
 
     def topics(self) -> list[TopicInfo]:
         """Return every topic of any part with the sum of its counts, sorted by name."""

@@ -158,7 +158,8 @@ def _messages(
     except BaseException:
         recording.close()
         raise
-    extra = {"profile": recording.profile, "library": recording.library}
+    stored = ", ".join(f"{count} {name}" for name, count in sorted(recording.chunks().items()))
+    extra = {"profile": recording.profile, "library": recording.library, "chunks": stored}
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     return Source(
         path, clouds, header, options, ground_truth, files=files, extra=extra, losses=lost

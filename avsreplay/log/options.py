@@ -369,6 +369,7 @@ class LogInfo:
         start_ns, end_ns: first and last time on the log clock.
         cloud_topic, scans: the cloud topic and its number of clouds.
         profile, library: what an MCAP file states about its use and its writer.
+        chunks: number of chunks of each compression, in words.
         model, model_vertices, model_faces, model_extent_m: name, size and extent [m] of the model.
         scenario, seed: whether the log was simulated, and the seed.
         truth: whether true poses are known.
@@ -388,6 +389,7 @@ class LogInfo:
     scans: int = 0
     profile: str = ""
     library: str = ""
+    chunks: str = ""
     model: str | None = None
     model_vertices: int = 0
     model_faces: int = 0

@@ -4,6 +4,7 @@ is damaged and resumes at the next record that is intact.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -61,6 +62,10 @@ class RecordPass(Recording):
         self._orphans = 0  # messages whose channel is not defined
         self._file = ByteFile(path, upto)
         self._chunks = ChunkStore(self._file, limit)
+
+    def chunks(self) -> Counter[str]:
+        """Return the number of chunks of each compression."""
+        return self._chunks.compressions()
 
     def _pass(self, at: int, end: int, step: Callable[[int], int]) -> bool:
         """Take the records from ``at`` to ``end``; return whether all could be taken.

@@ -340,6 +340,7 @@ class Source:
             scans=len(self._placed),
             profile=self._extra.get("profile", ""),
             library=self._extra.get("library", ""),
+            chunks=self._extra.get("chunks", ""),
             model=None if surface is None else surface.name,
             model_vertices=0 if surface is None else len(surface.vertices),
             model_faces=0 if surface is None else len(surface.faces),
