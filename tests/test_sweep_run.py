@@ -270,13 +270,12 @@ def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     assert "4 of 6 runs done (4 ok)" in retried.output
 
 
-def test_a_run_that_raises_is_a_row(monkeypatch):
+def test_a_run_that_raises_is_a_row():
     def broken(task):
         raise ZeroDivisionError("by nought\nsecond line")
 
-    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "run_task", broken)
     task = Task("ab", "", "", "", "", (), True)
-    (outcome,) = run_tasks([task])
+    (outcome,) = run_tasks([task], work=broken)
     assert (outcome.status, outcome.error) == ("crashed", "ZeroDivisionError: by nought")
     killed = type("KilledWorker", (Exception,), {})("tcp://10.0.0.1:5000")
     assert "10.0.0.1" not in _crashed("ab", killed).error
