@@ -1,7 +1,7 @@
 """Tables of one entry per scan, of which only a part is in memory: rows and poses.
 
 A table is a sequence of the objects that were put into it. Its entries are packed into records of
-a spool, and made again when they are asked for; ``column_of`` takes one column of all rows without
+a spool, and made again when they are read; ``column_of`` takes one column of all rows without
 making them.
 """
 
@@ -246,7 +246,7 @@ def used_rows(rows: Sequence[Row]) -> Sequence[Row]:
 
 
 class Columns(Mapping[str, Sequence[Any]]):
-    """The columns of rows by name; each is taken from the rows when it is asked for."""
+    """The columns of rows by name; each is taken from the rows when it is read."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         """Refer to rows.

@@ -35,7 +35,7 @@ _ERRORS = np.logspace(0.0, 1.5, 7)
 # Probability that the acceleration or the errors grow or fall by one value from scan to scan. A
 # larger one accepts more sudden motions, and more wrong poses.
 _LEAK = 0.05
-_LEAST_ERROR = 1e-4  # of a pose [rad, extents], below which claims are not believed
+_LEAST_ERROR = 1e-4  # of a pose [rad, extents], below which no smaller one is used
 _FIRST_RATE = 3.0  # 1 sigma of the rate before a second pose [rad/s, extents/s]
 # A pose whose error has a smaller probability contradicts the poses before it.
 _LEAST_PROBABILITY = 1e-4

@@ -1,4 +1,4 @@
-"""The estimate of a target that does not move freely: pose and rates as a tracker of poses knows
+"""The estimate of a target that does not move freely: pose and rates as a tracker of poses has
 them.
 
 Nothing is known of inertia and centre of mass. Their standard deviations are those of a start, and
