@@ -237,14 +237,15 @@ class Tables:
         """
         return cast(S, dict(self.given).get(name) or kind())
 
-    def with_part(self, name: str, kind: type[Settings]) -> Tables:
+    def with_part(self, name: str, kind: type[Settings] | None) -> Tables:
         """Return the tables that change something, and that of a part, given or default.
 
         Args:
             name: Its name.
-            kind: Its parameter class.
+            kind: Its parameter class; None: it has no parameters.
         """
-        return Tables(tuple(sorted({**dict(self._changed()), name: self.of(name, kind)}.items())))
+        own = {} if kind is None else {name: self.of(name, kind)}
+        return Tables(tuple(sorted({**dict(self._changed()), **own}.items())))
 
 
 def declared_of(field: dataclasses.Field[Any]) -> Setting:

@@ -254,7 +254,7 @@ class EstimatorParams(Settings):
     def with_own(self) -> EstimatorParams:
         """Return the same with the parameters of the estimator that is used, given or default."""
         kind = ESTIMATORS.parameters(self.method)
-        return self if kind is None else replace(self, own=self.own.with_part(self.method, kind))
+        return replace(self, own=self.own.with_part(self.method, kind))
 
     def check(self) -> None:
         """Raise ValueError where the axes of the orbit are not orthonormal, or it has an
