@@ -668,7 +668,7 @@ def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_u
     states = tumbling.follow(np.append(times, 90.0), moments, first)
     estimator, test = (
         Estimator(WHITE, None, 2.0),
-        Convergence(ConvergenceParams(), 2.0, (0.005, 0.0025, 0.035)),
+        Convergence(ConvergenceParams(), 2.0, (0.02, 0.01, 0.035)),
     )
     track, held = estimator.initial(0, first.T_ac), test.initial()
     rng = np.random.Generator(np.random.PCG64(1))

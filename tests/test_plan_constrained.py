@@ -210,7 +210,8 @@ def test_a_search_that_fails_does_not_claim_impossibility():
 
 
 def test_a_corridor_inside_the_clearance_is_proven_impossible():
-    scene = replace(body(), surface=lambda y: (np.zeros_like(y), np.linalg.norm(y, axis=1)))
+    point = trimesh.creation.box([1e-4, 1e-4, 1e-4])  # the body is nearly a point
+    scene = replace(body(), surface=Body(point.vertices, np.asarray(point.faces, np.int32)))
     shut = constrained(
         scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.6, final_deg=15.0, final_range_m=0.5)
     )
