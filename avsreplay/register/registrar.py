@@ -392,6 +392,8 @@ class Registrar:
         found = self._symmetry.rivalled(scan, found, rivals)
         if found.status is AlignStatus.AMBIGUOUS or covered or not self._visibility.sided:
             return found
+        if self._symmetry.revolved(scan, found):  # no other body is meant by the free turn
+            return found
         one = self._neighbourhood.of_one(scan, found, budget)
         if one.status not in ACCEPTED and (said := self._symmetry.equal(scan, found)).members:
             return replace(said, equal=False)

@@ -330,6 +330,16 @@ class NearSymmetry:
         images = self._apart(scan, found, self.images(found.T_ac.inverse()))
         return replace(self._named(found, images), equal=True) if images else found
 
+    def revolved(self, scan: NDArray[Any], found: Alignment) -> bool:
+        """Return whether the only unobservable direction of a result is a turn that carries the
+        model onto itself.
+        """
+        free = found.free if found.status is AlignStatus.DEGENERATE else None
+        if free is None or free.shape[1] != 1:
+            return False
+        images = self.images(found.T_ac.inverse())
+        return len(images) > 0 and not self._apart(scan, found, images)
+
     def _apart(self, scan: NDArray[Any], found: Alignment, others: list[Pose]) -> list[Pose]:
         """Those of other poses T_ca that differ from a result not only along its unobservable
         directions.

@@ -84,10 +84,11 @@ class OracleIndex:
             if inliers < _MIN_INLIERS:
                 break
             D, turn, move = _plane_step(p, foot, normal) if plane else _horn_step(p, foot)
-            T = D @ T
             tighter = min(gate, max(floor, rule.tighten * rms)) if rule.tighten > 0.0 else gate
             small = turn < rule.eps_rad and move < eps_m and tighter >= 0.99 * gate
-            gate, done = tighter, small and not plane
+            done = small and not plane
+            if not done:  # a converged pose is that at which the step was measured
+                T, gate = D @ T, tighter
             plane = plane and passes < rule.n_plane and not small
         ignored, searched = len(points) - len(scan), passes * len(scan)
         return IcpResult(T, passes, done, inliers, rms, gate, turn, move, ignored, searched)
