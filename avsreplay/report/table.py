@@ -112,12 +112,13 @@ def ascii_only(console: Console) -> bool:
 
 def print_table(console: Console, table: Table, *, tight: bool = False) -> None:
     """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank
-    between columns.
+    between columns, as where two do not fit.
 
     Lines are longer than the console is wide where numbers and names, which are never cut, require
     it.
     """
     if table.rows:
+        tight = tight or _least_width(table, 2) > console.width
         width, console.width = (
             console.width,
             max(console.width, _least_width(table, 1 if tight else 2)),
