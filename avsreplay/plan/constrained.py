@@ -37,7 +37,7 @@ from avsreplay.plan.convexification import (
     proven,
     shortened,
     warm_reference,
-    withdrawal_margin,
+    withdrawals,
     withdrawn,
     worst_margin,
 )
@@ -134,8 +134,10 @@ def constrained(
     )
     if not (stated and plan.found):
         return plan
-    margin_m = withdrawal_margin(case, path_of(plan, r0, v0), plan.escapes)
-    return replace(plan, abort_margin_m=margin_m)
+    found = withdrawals(case, path_of(plan, r0, v0), plan.escapes)
+    if found is None:
+        return plan
+    return replace(plan, abort_margin_m=found.margin_m, escapes=found.escapes)
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:

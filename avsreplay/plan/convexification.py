@@ -412,15 +412,20 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
     return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
 
 
-def withdrawal_margin(case: Case, path: RobotPath, escapes: Array | None) -> float:
-    """Return a lower bound of the margin of withdrawals from every instant of a path [m]; NaN
+def withdrawals(case: Case, path: RobotPath, escapes: Array | None) -> Certificate | None:
+    """Return the withdrawals from every instant of a path, with a lower bound of their margin; None
     without a clearance.
+
+    Args:
+        case: The problem.
+        path: The path.
+        escapes: Escapes that are known to be good, as a plan carries them.
     """
     if case.space is None:
-        return math.nan
+        return None
     space = Space(case.sampled, case.limits, case.params.a_max_mps2, case.extent_m)
     tried = Tried.of(escapes, case.wait_s, path.t_go_s)
-    return certified(space, path, case.wait_s, tried).margin_m
+    return certified(space, path, case.wait_s, tried)
 
 
 def _accepted(space: Space, found: Certificate) -> float:
