@@ -276,8 +276,11 @@ def _closed(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any
     errors = np.empty((len(drawn), 7))
     for k, (each, (dr, dv)) in enumerate(zip(drawn, pushed, strict=True)):
         (rho, rate), q = setup.estimator.motion(each)(after), setup.estimator.attitude(each)(after)
-        turn = geometry.multiply(geometry.conjugate(q[0]), aimed)
-        errors[k] = [*(rho[0] - r - dr[-1]), *(rate[0] - v - dv[-1]), geometry.angle(turn)]
+        errors[k] = [
+            *(rho[0] - r - dr[-1]),
+            *(rate[0] - v - dv[-1]),
+            geometry.angle_between(q[0], aimed),
+        ]
     sizes = np.column_stack(
         [
             np.linalg.norm(errors[:, :3], axis=1),
@@ -633,7 +636,7 @@ def _predicted(setup: Setup, belief: Belief, after_s: float) -> tuple[int, float
     (rho, rate), q = setup.estimator.motion(belief)(at), setup.estimator.attitude(belief)(at)[0]
     for k, each in enumerate(drawn):
         (r, v), own = setup.estimator.motion(each)(at), setup.estimator.attitude(each)(at)[0]
-        turn = geometry.angle(geometry.multiply(geometry.conjugate(own), q))
+        turn = geometry.angle_between(own, q)
         errors[k] = [*(r - rho)[0], *(v - rate)[0], turn]
     return worst, float(sizes[worst]), _cause(steps, errors, worst)
 

@@ -253,6 +253,11 @@ def angle(q: ArrayLike) -> Array:
     return np.asarray(2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3])))
 
 
+def angle_between(q_ab: ArrayLike, q_ac: ArrayLike) -> Array:
+    """Return the angles (...) in [0, pi] [rad] between attitudes (..., 4)."""
+    return angle(multiply(conjugate(q_ab), q_ac))
+
+
 def moved_in_time(points: Array, times: Array, knots: Array, R: Array, t: Array) -> Array:
     """Return points (n, 3) transformed by R p + t, each with the R and t of its own time ``times``
     (n,).

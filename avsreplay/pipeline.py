@@ -568,7 +568,10 @@ def _acquire(
     frame, effort = SensorFrame(stages.registrar, scan.sensor), _effort(state, scan)
     found = frame.acquire(points, effort)
     if found.equal:
-        best = found.T_ac if near is None else min(found.members, key=partial(_turn, near))
+        best = found.T_ac
+        if near is not None:
+            turn = partial(geometry.angle_between, near.q)
+            best = min(found.members, key=lambda T_ac: float(turn(T_ac.q)))
         one = frame.register(points, best, scan.seq, False, effort, None)
         found = replace(one, message=one.message or _equal_words(found))
     elif found.members and not found.message:
@@ -590,11 +593,6 @@ def _options(poses: Iterable[Pose]) -> str:
     """The options that begin a run with one of some poses."""
     texts = (",".join(f"{x:.6g}" for x in (*pose.t, *pose.q)) for pose in poses)
     return ", ".join(f"--init {text}" for text in texts)
-
-
-def _turn(T_ac: Pose, other: Pose) -> float:
-    """Angle between two poses [rad]."""
-    return float(geometry.angle(geometry.multiply(geometry.conjugate(T_ac.q), other.q)))
 
 
 def _effort(state: PipelineState, scan: Scan) -> Effort:

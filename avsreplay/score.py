@@ -198,9 +198,9 @@ def pose_error(pose: Pose, truth: Pose) -> PoseError:
         pose: estimated or measured pose T_ac.
         truth: true pose T_ac.
     """
-    turn = geometry.multiply(geometry.conjugate(truth.q), pose.q)
     return PoseError(
-        float(np.linalg.norm(pose.t - truth.t)), float(np.degrees(geometry.angle(turn)))
+        float(np.linalg.norm(pose.t - truth.t)),
+        float(np.degrees(geometry.angle_between(truth.q, pose.q))),
     )
 
 

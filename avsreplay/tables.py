@@ -23,7 +23,18 @@ _TYPES: dict[type, str] = {float: "f8", int: "i8", bool: "?", str: "u4"}
 _KNOWN = " known"  # field of the flags that say which columns have a value
 
 
-class RowTable(Sequence[Row]):
+class _Rows(Sequence[Row]):
+    """A sequence of rows that equals any other with the same ones."""
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sequence):
+            return NotImplemented
+        return len(self) == len(other) and all(map(Row.__eq__, self, other))
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+class RowTable(_Rows):
     """Rows, packed: numbers as they are, texts by their place in a list of distinct texts."""
 
     def __init__(self, rows: Iterable[Row] = ()) -> None:
@@ -56,13 +67,6 @@ class RowTable(Sequence[Row]):
     def __iter__(self) -> Iterator[Row]:
         for block in self._records.blocks():
             yield from self._rows(block)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Sequence):
-            return NotImplemented
-        return len(self) == len(other) and all(map(Row.__eq__, self, other))
-
-    __hash__ = None  # type: ignore[assignment]
 
     def append(self, row: Row) -> None:
         """Append a row.
@@ -137,7 +141,7 @@ class RowTable(Sequence[Row]):
             yield Row(*cells)
 
 
-class _ChosenRows(Sequence[Row]):
+class _ChosenRows(_Rows):
     """Some rows of a table."""
 
     def __init__(self, table: RowTable, places: NDArray[np.int64]) -> None:
@@ -155,13 +159,6 @@ class _ChosenRows(Sequence[Row]):
         if isinstance(place, slice):
             return _ChosenRows(self._table, self._places[place])
         return self._table[int(self._places[place])]
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Sequence):
-            return NotImplemented
-        return len(self) == len(other) and all(map(Row.__eq__, self, other))
-
-    __hash__ = None  # type: ignore[assignment]
 
     def column(self, name: str) -> list[Any]:
         """The values of a column in these rows."""

@@ -255,7 +255,7 @@ class Tracker:
 
     def _repeated(self, last: Pose, pose: Pose, variances: tuple[float, float]) -> bool:
         """Whether a pose is the last one again, as that of a sensor that repeats its scan."""
-        turned = float(geometry.angle(geometry.multiply(geometry.conjugate(last.q), pose.q)))
+        turned = float(geometry.angle_between(last.q, pose.q))
         moved = float(np.linalg.norm(pose.apply(self.middle) - last.apply(self.middle)))
         changes = turned, moved / self.extent_m
         return all(c < _REPEATED * math.sqrt(v) for c, v in zip(changes, variances, strict=True))

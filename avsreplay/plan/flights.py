@@ -182,9 +182,7 @@ def _miss_at(
     rho, rate, q = truth(np.array([at_s]))
     turn = math.nan
     if attitude is not None:
-        turn = math.degrees(
-            float(geometry.angle(geometry.multiply(geometry.conjugate(q[0]), attitude)))
-        )
+        turn = math.degrees(float(geometry.angle_between(q[0], attitude)))
     return Miss(
         lead_s, at_s, float(np.linalg.norm(rho[0] - r)), float(np.linalg.norm(rate[0] - v)), turn
     )

@@ -292,7 +292,7 @@ def sight_lines(views: Sequence[ScanView], T_ca: Sequence[Pose]) -> Array:
 
 def turn(a: Pose, b: Pose) -> float:
     """Angle between two attitudes [rad]."""
-    return float(geometry.angle(geometry.multiply(geometry.conjugate(a.q), b.q)))
+    return float(geometry.angle_between(a.q, b.q))
 
 
 def depth_behind(

@@ -102,5 +102,5 @@ class Grader:
 
     def _worth_more(self, guess: Pose, found: Alignment) -> bool:
         """Whether the fit is close, and its pose need not be verified by a search anyway."""
-        turned = float(geometry.angle(geometry.multiply(geometry.conjugate(guess.q), found.T_ac.q)))
+        turned = float(geometry.angle_between(guess.q, found.T_ac.q))
         return turned <= FAR_RAD and self._restarter.healthy(found.inlier_ratio, found.rms_m)

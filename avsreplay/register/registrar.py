@@ -62,11 +62,6 @@ LAST_SCANS, LEAST_TO_TURN, SURE_RATIO = (
 MANY_OFF = 0.1
 
 
-def _turn(T_ac: Pose, other: Pose) -> float:
-    """Angle between two poses [rad]."""
-    return float(geometry.angle(geometry.multiply(geometry.conjugate(T_ac.q), other.q)))
-
-
 class Registrar:
     """Registers scans to one surface with one back end. Built once, used for every scan of a log.
 
@@ -495,7 +490,7 @@ class Registrar:
 
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
-        angle = float(geometry.angle(geometry.multiply(geometry.conjugate(guess.q), found.T_ac.q)))
+        angle = float(geometry.angle_between(guess.q, found.T_ac.q))
         if not found.measured or angle <= TURNED_RAD or angle > FAR_RAD:
             return found.measured and angle > FAR_RAD
         return (
@@ -527,7 +522,7 @@ class Registrar:
         if found.status not in ACCEPTED:
             return found
         poses = (found.T_ac, *self._symmetry.equal(scan, found).members)
-        best = min(poses, key=lambda T_ac: _turn(T_ac, guess))
+        best = min(poses, key=lambda T_ac: float(geometry.angle_between(T_ac.q, guess.q)))
         if best is found.T_ac:
             return found
         few = self._restarter.part(scan)
