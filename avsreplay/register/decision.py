@@ -113,7 +113,7 @@ class Decision:
         if not at.rivals:
             return None
         images = self._symmetry().images(at.T_ca)
-        rivals = [each for each in at.rivals if not self._poses.among(each, images)]
+        rivals = [each for each in at.rivals if not self._poses.among(each, [at.T_ca, *images])]
         rivals = self._apart(case, at.found, rivals)
         return _named(at.found, rivals) if rivals else None
 

@@ -7,6 +7,7 @@ near-symmetry carries onto the surface.
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -214,12 +215,18 @@ class NearSymmetry:
         No scan can tell them apart. Each is a different pose. A registration could only move it
         away.
         """
-        found = list[Pose]()
-        for T in self._exact:
-            turned = Pose.from_matrix(T) @ T_ca
-            if not self.poses.among(turned, [T_ca, *found]):
-                found.append(turned)
-        return found
+        return [motion @ T_ca for motion in self._images]
+
+    @cached_property
+    def _images(self) -> list[Pose]:
+        """The exact symmetries that give different poses: whether they do is the same for all
+        poses.
+        """
+        found = [Pose.identity()]
+        for T in map(Pose.from_matrix, self._exact):
+            if not self.poses.among(T, found):
+                found.append(T)
+        return found[1:]
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
