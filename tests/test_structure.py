@@ -29,7 +29,9 @@ def test_tests_and_their_processes_import_the_package_that_is_installed():
     import avsreplay
     import avsreplay.register._kernel as kernel
 
-    code = "import avsreplay.register._kernel as k; print(avsreplay.__file__, k.__file__)"
+    code = (
+        "import avsreplay, avsreplay.register._kernel as k; print(avsreplay.__file__, k.__file__)"
+    )
     done = run(sys.executable, "-c", code)
     assert done.stdout.split() == [avsreplay.__file__, kernel.__file__], done.stderr
     assert str(ROOT) not in sys.path
