@@ -267,8 +267,8 @@ def test_a_body_that_is_driven_back_and_forth_keeps_its_poses_in_order_and_its_l
         track = estimator.initial(0, pose) if track is None else track
         prior = estimator.predict(track, round(t * 1e9))
         innovation = estimator.innovate(prior, seen)
-        verdict = detector.judge(ScanStatus.OK, seen, innovation, prior.belief)
-        track, _ = estimator.step(track, prior, innovation, verdict, False)
+        examined = detector.examine(ScanStatus.OK, seen, innovation, prior.belief)
+        track, _ = estimator.step(track, prior, innovation, examined.admission, False)
         instants = [fix.t_ns for fix in (*track.older, *track.fixes)]
         assert instants == sorted(set(instants))
         assert np.isfinite([track.levels.torque, track.levels.force]).all()
