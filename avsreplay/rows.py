@@ -370,13 +370,14 @@ _REASON_WORDS = {
     "halves_differ": (
         "The poses from two halves of the scan differ by more than their errors explain."
     ),
-    "pose_jump": "The pose is too far from the prediction.",
+    "clock": "The time stamp steps back or jumps.",
+    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
+    "wrong_scan": "Neither a motion nor an error of the sensor explains the last poses.",
+    "pose_jump": "The pose is too far from the prediction, and what explains it is not decided.",
     "doubtful": (
-        "The innovation is large, and it is not decided yet whether the scan, the "
+        "The innovations are unlikely, and it is not decided yet whether the scan, the "
         "sensor or the target is the cause."
     ),
-    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
-    "clock": "The time stamp steps back or jumps.",
 }
 _GUESS_WORDS = {
     "start": "The initial state that the log states.",

@@ -315,7 +315,12 @@ def _checked(run: Run) -> list[Advice]:
     """
     from avsreplay.preflight import preflight
 
-    checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
+    followed = bool(run.config.region)
+    checked = (
+        preflight(run.source, run.surface, run.registrar, followed=followed)
+        if len(run.source)
+        else []
+    )
     found = [advice for advice in checked if advice.grade != "ok"]
     for each in run.source.meaning.inferences:
         if each.grade == "ok":
