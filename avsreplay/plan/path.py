@@ -422,7 +422,7 @@ def resolved_step(goal: Trajectory, step_s: float, end_s: float) -> float:
         end_s: Latest instant that is of interest [s].
     """
     for _ in range(MOST_HALVINGS):
-        times = np.arange(PROBED + 1) * min(step_s, end_s / PROBED)
+        times = np.linspace(0.0, min(step_s * PROBED, end_s), PROBED + 1)
         step = float(times[1])
         rho, rate = goal(times)
         turned = _largest_norm(np.diff(rho, axis=0) - 0.5 * step * (rate[1:] + rate[:-1]))
