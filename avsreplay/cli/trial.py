@@ -177,7 +177,7 @@ def try_advice(
 
 
 def _of_rows(rows: Sequence[Row], extent_m: float) -> Trial:
-    unused = [row.reason if row.status == "ok" else row.status for row in rows if not row.gamma]
+    unused = [row.reason or row.status for row in rows if not row.gamma]
     reason = max(sorted(set(unused)), key=unused.count) if unused else ""
     return Trial(
         len(rows),
