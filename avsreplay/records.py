@@ -117,7 +117,7 @@ class Admission(Enum):
 class Finding(Enum):
     """What the estimate has found of a pose, with the poses before it."""
 
-    UNTESTED = "untested"  # it was refused, or its innovation reaches the limit: no further test
+    UNTESTED = "untested"  # it was rejected, or its innovation reaches the limit: no further test
     AGREES = "agrees"  # the predicted pose, within its errors
     EXPLAINED = "explained"  # by a change or a disturbance of the motion, or by larger noise
     OPEN = "open"  # not decided yet
