@@ -141,7 +141,10 @@ _CHOICES = {
 
 
 def read_options(flags: Mapping[str, Any]) -> SourceOptions:
-    """The given (not None) options as ``SourceOptions``.
+    """Return the options that were given (not None) as ``SourceOptions``.
+
+    Args:
+        flags: options by the names of their fields.
 
     Raises:
         UsageError: a value is not allowed.
@@ -300,8 +303,12 @@ PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield the items and show the progress on stderr; ``total`` 0 means that their number is
-    unknown.
+    """Yield items and show the progress on stderr.
+
+    Args:
+        items: the items.
+        total: their number, 0 if it is unknown.
+        what: what is being done, in words.
     """
     if not sys.stderr.isatty():
         yield from _with_lines(items, total, what)
@@ -343,7 +350,8 @@ _GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
 
-    A scan that takes longer than ``_GRACE_S`` after the first one is given up; its row is missing.
+    A scan that takes longer than ``_GRACE_S`` after the first Ctrl-C is given up; its row is
+    missing.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.

@@ -51,9 +51,9 @@ def open_source(
     Args:
         path: the file or folder.
         options: how it is read.
-        upto: number of bytes that are read of an MCAP file that still grows.
         inspect: also open a log without a cloud topic, or with several of which none was chosen; it
-            has no scans then.
+            then has no scans.
+        upto: number of bytes that are read of an MCAP file that still grows; None reads all.
 
     Returns:
         The source; close it after use.
@@ -61,8 +61,8 @@ def open_source(
     Raises:
         UnreadableInput: it does not exist, is of no known format, has no cloud topic, or
             (``strict``) is damaged.
-        UsageError: there are several cloud topics and none was chosen, a requested topic or
-            frame does not exist, or the values of the clouds do not tell what they mean.
+        UsageError: there are several cloud topics and none was chosen, a requested topic or frame
+            does not exist, or the values of the clouds do not show what they mean.
     """
     path, options = Path(path), options or SourceOptions()
     if path.name == BAG_METADATA and path.is_file():  # of a bag, whose folder is meant
