@@ -29,20 +29,18 @@ class GateRule(Settings):
     """
 
     metric: str = setting(doc="The metric that is limited.")
-    min: float | None = setting(None, "Smallest value that passes.")
-    max: float | None = setting(None, "Largest value that passes.")
-    min_ratio: float | None = setting(
-        None, "Smallest multiple of the baseline's value that passes."
-    )
-    max_ratio: float | None = setting(None, "Largest multiple of the baseline's value that passes.")
+    min: float | None = setting(None, "Smallest allowed value.")
+    max: float | None = setting(None, "Largest allowed value.")
+    min_ratio: float | None = setting(None, "Smallest allowed multiple of the baseline's value.")
+    max_ratio: float | None = setting(None, "Largest allowed multiple of the baseline's value.")
     max_increase: float | None = setting(
-        None, "Largest increase over the baseline's value that passes."
+        None, "Largest allowed increase over the baseline's value."
     )
     max_decrease: float | None = setting(
-        None, "Largest decrease below the baseline's value that passes."
+        None, "Largest allowed decrease below the baseline's value."
     )
     optional: bool = setting(
-        False, "Whether a run without a value passes, if the baseline has none either."
+        False, "Whether the rule holds for a run without a value if the baseline has none either."
     )
     note: str = setting("", "The reason, printed with the outcome.")
 

@@ -392,7 +392,7 @@ class InjectedFault(Settings):
     )
     harmful: bool | None = setting(
         None,
-        "Whether the label states that such a scan gives no good pose.",
+        "Whether such a scan is unusable: it gives no correct pose.",
         unset="as usual for the kind",
     )
 

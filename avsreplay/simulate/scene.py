@@ -52,7 +52,7 @@ class Presence(Settings):
         high=1e8,
         unset="to the end of the log, without a label",
     )
-    harmful: bool = setting(False, "Whether its label states that such a scan gives no good pose.")
+    harmful: bool = setting(False, "Whether such a scan is unusable: it gives no correct pose.")
 
     def check(self) -> None:
         """Raise ValueError where the name is empty."""
