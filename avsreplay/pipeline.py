@@ -1,9 +1,9 @@
 """The processing chain: one scan in, one outcome out. Read ``step`` first.
 
-scan -> registration -> innovation -> verdict (gamma) -> estimate -> monitors -> guidance ->
-outcome. The predicted pose is the initial guess of the registration; that is the only feedback,
-apart from the convergence flag of the previous scan, which lets the filter take over from the batch
-fit. Nothing here has access to ground truth.
+scan -> registration -> innovation -> rules on the scan -> estimate, tracker -> verdict (gamma) ->
+monitors -> guidance -> outcome. The predicted pose is the initial guess of the registration; that
+is the only feedback, apart from the convergence flag of the previous scan, which lets the filter
+take over from the batch fit. Nothing here has access to ground truth.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from avsreplay.monitor.convergence import (
     ConvergenceTrack,
     violations,
 )
-from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.monitor.fault_detection import Examined, FaultDetector
 from avsreplay.monitor.gramian import Gramian, from_trajectory, measure, observe
 from avsreplay.monitor.gramian import gramian as empty_gramian
 from avsreplay.outcome import MonitorReport, Outcome
@@ -44,13 +44,13 @@ from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segme
 from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.records import (
+    Admission,
     Alignment,
     Belief,
+    Finding,
     Forecast,
     Innovation,
-    Reason,
     Scan,
-    Verdict,
 )
 from avsreplay.region import Followed, Region
 from avsreplay.register.backend import measured_alignment
@@ -260,6 +260,11 @@ class Following:
     used: int = 0
     shown: Track | None = None
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether the last pose is used because the track confirms it."""
+        return self.driven and self.contradicted
+
 
 @value_class
 class PipelineState:
@@ -313,17 +318,18 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
+    prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
-    if acquired is None and not verdict.gamma and lost:
+    if acquired is None and examined.admission is not Admission.ADMITTED and lost:
         points = _deskewed(stages, state, scan, predicted)
         near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
         measurement = _acquire(stages, state, scan, points, "acquired", near)
-        prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
-    track, verdict = stages.estimator.step(
-        track, prior, innovation, verdict, state.monitors.convergence.converged
+        prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
+    track, finding = stages.estimator.step(
+        track, prior, innovation, examined.admission, state.monitors.convergence.converged
     )
-    following, verdict = _followed_on(stages, state, scan, measurement, track, verdict)
+    following = _followed_on(stages, state, scan, measurement, track, finding)
+    verdict = stages.faults.judge(examined, finding, following.confirmed)
     gamma, used = verdict.gamma, measurement.alignment if verdict.gamma else None
     track = track.changed(
         errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor)
@@ -343,7 +349,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         known = planner_input(
             stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
-        guidance = stages.guidance.step(guidance, known)
+        guidance = stages.guidance.stated(stages.guidance.step(guidance, known), known)
     outcome = Outcome(
         scan=scan,
         start_ns=state.start_ns,
@@ -401,33 +407,31 @@ def _followed_on(
     scan: Scan,
     measurement: Measurement,
     track: Track,
-    verdict: Verdict,
-) -> tuple[Following, Verdict]:
-    """What is known of the target whatever moves it after a scan, and the final verdict.
+    finding: Finding,
+) -> Following:
+    """What is known of the target whatever moves it after a scan.
 
     A pose that the track confirms is used also where the estimate of the free body finds no
     explanation for it, and from then on where that one is in doubt.
     """
     tracker, before = stages.tracker, state.following
     if tracker is None:
-        return before, verdict
+        return before
     kinematics, confirmed = tracker.after(before.kinematics, scan.t_ns, measurement.alignment)
-    if verdict.gamma:
+    if finding.used:
         kinematics = tracker.used(kinematics, scan.t_ns)
-    contradicted = confirmed and verdict.reason in (Reason.POSE_JUMP, Reason.DOUBTFUL)
-    unexplained = contradicted and verdict.reason is Reason.POSE_JUMP
-    used = 0 if contradicted else before.used + verdict.gamma
+    contradicted = confirmed and finding in (Finding.UNEXPLAINED, Finding.OPEN)
+    unexplained = contradicted and finding is Finding.UNEXPLAINED
+    used = 0 if contradicted else before.used + finding.used
     driven = unexplained or (before.driven and used < FREE_AGAIN)
     shown = None
     if driven and kinematics is not None:
-        if contradicted:
-            verdict = Verdict(1, Reason.OK)
         known = kinematics.t_ns == scan.t_ns or tracker.predicted(kinematics, scan.t_ns) is not None
         if known:
             motion = tracker.motion(kinematics, scan.t_ns)
             of = stages.estimator.frame, stages.estimator.params
             shown = kinematic_track(*of, track, scan.t_ns, motion)
-    return Following(kinematics, contradicted, driven, used, shown), verdict
+    return Following(kinematics, contradicted, driven, used, shown)
 
 
 def _seen(
@@ -627,15 +631,15 @@ def _measurement(
     return Measurement(alignment, origin, instants)
 
 
-def _judge(
+def _examined(
     stages: Stages,
     scan: Scan,
     predicted: Prediction,
     measurement: Measurement,
     repeated: bool,
-) -> tuple[Prediction, Innovation | None, Verdict]:
+) -> tuple[Prediction, Innovation | None, Examined]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured)
-    and the verdict.
+    and what the rules on the scan alone find.
     """
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
@@ -645,7 +649,7 @@ def _judge(
     return (
         predicted,
         innovation,
-        stages.faults.judge(scan.status, alignment, innovation, predicted.belief, repeated),
+        stages.faults.examine(scan.status, alignment, innovation, predicted.belief, repeated),
     )
 
 

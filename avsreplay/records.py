@@ -83,7 +83,7 @@ class AlignStatus(Enum):
 
 
 class Reason(Enum):
-    """Why gamma is 0 (``OK``: gamma is 1): the first condition that holds, in this order."""
+    """Why gamma is 0 (``OK``: gamma is 1): the first rule that holds, in this order."""
 
     OK = "ok"
     NO_SCAN = "no_scan"  # empty or damaged scan
@@ -95,14 +95,39 @@ class Reason(Enum):
     HALVES_DIFFER = (
         "halves_differ"  # the poses from two halves of the scan differ by more than their errors
     )
-    POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
-    DOUBTFUL = (
-        "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
-    )
+    CLOCK = "clock"  # the stamp steps back or jumps
     SENSOR_BIAS = (
         "sensor_bias"  # the measured poses have a constant offset that motion does not explain
     )
-    CLOCK = "clock"  # the stamp steps back or jumps
+    WRONG_SCAN = "wrong_scan"  # neither a motion nor an error of the sensor explains the poses
+    POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
+    DOUBTFUL = (
+        "doubtful"  # unlikely innovation: whether scan, sensor or target is the cause is open
+    )
+
+
+class Admission(Enum):
+    """What the rules on a scan alone allow the estimate to do with its pose."""
+
+    REFUSED = "refused"  # nothing
+    LARGE = "large"  # to use it where it explains the innovation, which reaches its limit
+    ADMITTED = "admitted"  # to use it
+
+
+class Finding(Enum):
+    """What the estimate has found of a pose, with the poses before it."""
+
+    UNTESTED = "untested"  # it was refused, or its innovation reaches the limit: no further test
+    AGREES = "agrees"  # the predicted pose, within its errors
+    EXPLAINED = "explained"  # by a change or a disturbance of the motion, or by larger noise
+    OPEN = "open"  # not decided yet
+    OFFSET = "offset"  # an error of the sensor that lasts
+    UNEXPLAINED = "unexplained"  # neither a motion nor an error of the sensor explains it
+
+    @property
+    def used(self) -> bool:
+        """Return whether the estimate has used the pose."""
+        return self in (Finding.AGREES, Finding.EXPLAINED)
 
 
 @value_class

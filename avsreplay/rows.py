@@ -370,13 +370,14 @@ _REASON_WORDS = {
     "halves_differ": (
         "The poses from two halves of the scan differ by more than their errors explain."
     ),
-    "pose_jump": "The pose is too far from the prediction.",
+    "clock": "The time stamp steps back or jumps.",
+    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
+    "wrong_scan": "Neither a motion nor an error of the sensor explains the last poses.",
+    "pose_jump": "The pose is too far from the prediction, and what explains it is not decided.",
     "doubtful": (
-        "The innovation is large, and it is not decided yet whether the scan, the "
+        "The innovations are unlikely, and it is not decided yet whether the scan, the "
         "sensor or the target is the cause."
     ),
-    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
-    "clock": "The time stamp steps back or jumps.",
 }
 _GUESS_WORDS = {
     "start": "The initial state that the log states.",
@@ -952,13 +953,28 @@ class Row:
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
         (
-            "Smallest margin of the clearance if the robot aborts at any time of the plan before "
-            "the corridor."
+            "Certified smallest margin of the required distance to the body if the robot withdraws "
+            "at any instant of the plan; from within the corridor less is required."
         ),
         "m",
         ".4f",
         0.0,
         0.01,
+    )
+    passive_margin_m: float | None = column(
+        lambda o, s: None if o.plan is None else finite(o.plan.passive_margin_m),
+        (
+            "Certified smallest margin of this distance if the thrust is cut at any instant of the "
+            "plan and the robot coasts for 30 s."
+        ),
+        "m",
+        ".4f",
+        0.0,
+        0.01,
+    )
+    passive_safe_s: float | None = _seconds(
+        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.passive_safe_s)),
+        "Time since the first scan up to which a cut of the thrust keeps this distance.",
     )
     gripper_ready_s: float | None = _seconds(
         _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)),

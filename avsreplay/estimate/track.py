@@ -208,13 +208,13 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
     return frozen(2.0 * length_m * (a @ left[:, : len(cosines)][:, cosines > _ALIKE]) / scale)
 
 
-def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
+def undetermined(track: Track, innovation: Innovation, used: bool, length_m: float) -> Array:
     """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in
     ``common_motions``.
     """
     return (
         common_motions(track.undetermined, innovation.free, length_m)
-        if gamma
+        if used
         else track.undetermined
     )
 

@@ -61,7 +61,7 @@ KINDS = {  # colour and pattern of each place
             "not_converged",
         ),
         "halves_differ",
-        *("doubtful", "sensor_bias", "clock"),
+        *("doubtful", "sensor_bias", "clock", "wrong_scan"),
     ),
     "injected": FAULTS.names(),
     "action": (
