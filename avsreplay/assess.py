@@ -50,7 +50,7 @@ from avsreplay.plan.flights import (
     flown_positions,
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import TargetGeometry
+from avsreplay.plan.limits import TargetGeometry, axis_blocked
 from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.plan.supervisor import RULES, Action
 from avsreplay.plan.uncertainty import Disturbance, draws, wilson
@@ -346,15 +346,16 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
     plan = state.plan if log.converged else None
     plan = free if plan is None and free.status is PlanStatus.INFEASIBLE else plan
     if plan is not None:
-        words = "proven" if plan.status is PlanStatus.INFEASIBLE else "found"
+        proven = plan.status is PlanStatus.INFEASIBLE
+        cause, change = _prevented(setup, belief, plan.lower_bound_s)
         return {
             **found,
             "limit": (
                 f"no capture within {params.horizon_s:g} s with {params.a_max_mps2:g} m/s2"
-                f" ({'proven impossible' if words == 'proven' else 'none found'})"
+                f" ({'proven impossible' if proven else 'none found'}{cause})"
             ),
             "known_s": setup.at_s(log.failing_ns or plan.t_ns),
-            "change": "more thrust or a longer horizon; 'avsreplay plan' names the settings",
+            "change": change,
         }
     after = _planned_s(setup, belief)
     worst, size, cause = _predicted(setup, belief, after)
@@ -371,6 +372,31 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
         "known_s": setup.at_s(belief.t_ns),
         "change": _change(cause),
     }
+
+
+def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
+    """Why no plan is found, as far as the shape of the target shows it, and what would change
+    it.
+    """
+    limits, forecast = setup.guidance.limits, partial(setup.estimator.forecast, belief)
+    scene = planner_input(setup.estimator, belief, setup.target, 1, True, forecast).scene
+    sigma = None
+    if scene.sigma is not None:
+        position, attitude = scene.sigma(np.array([max(after_s, 0.0)]))
+        sigma = float(position[0]), float(attitude[0])
+    blocked = axis_blocked(scene, limits, setup.extent_m, sigma)
+    if blocked is None:
+        return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
+    name, until_m, short_m = blocked
+    if name != "body":
+        cause = f"the {name} is violated by {short_m:.3g} m on the axis of the approach"
+        return f": {cause}", "another fixture or other limits"
+    length = limits.final_range_m or 0.0
+    cause = (
+        f"the corridor ends {length:.3g} m from the grasp point, where the body is"
+        f" {short_m:.3g} m nearer than the clearance"
+    )
+    return f": {cause}", f"limits.final_range_m={1.05 * until_m:.2g}, or a smaller clearance"
 
 
 def _continued(
