@@ -20,6 +20,7 @@ from avsreplay.records import (
     Forecast,
     Innovation,
     Manoeuvre,
+    Moves,
     Scan,
     Verdict,
 )
@@ -177,6 +178,9 @@ class Outcome:
             {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
+        moves: what the poses show of the target's motion.
+        disturbances: root densities of the random torque [rad/s^1.5] and force [m/s^1.5] that the
+            estimate allows for; None where it states none.
         sigma_hits: how often a bound of the inertia ratios limited the gain.
         r_floors: how often an eigenvalue of R was raised to its floor.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
@@ -198,6 +202,8 @@ class Outcome:
     pose_covariance: Array
     body: BodyParameters
     estimator: str
+    moves: Moves
+    disturbances: tuple[float, float] | None
     sigma_hits: int
     r_floors: int
     reinitialised: int

@@ -27,6 +27,7 @@ from avsreplay.estimate.kinematic import Motion, kinematic_track
 from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
+from avsreplay.estimate.track import moves
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.aliasing import Instants, in_words, other_rate
 from avsreplay.monitor.convergence import (
@@ -50,6 +51,7 @@ from avsreplay.records import (
     Finding,
     Forecast,
     Innovation,
+    Moves,
     Scan,
 )
 from avsreplay.region import Followed, Region
@@ -318,13 +320,15 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
+    prior, innovation, examined = _examined(stages, state, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
     if acquired is None and examined.admission is not Admission.ADMITTED and lost:
         points = _deskewed(stages, state, scan, predicted)
         near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
         measurement = _acquire(stages, state, scan, points, "acquired", near)
-        prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
+        prior, innovation, examined = _examined(
+            stages, state, scan, predicted, measurement, repeated
+        )
     track, finding = stages.estimator.step(
         track, prior, innovation, examined.admission, state.monitors.convergence.converged
     )
@@ -362,6 +366,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         pose_covariance=stages.estimator.pose_covariance(belief),
         body=body_parameters(belief),
         estimator=track.mode,
+        moves=Moves.DRIVEN if following.shown is not None else moves(track),
+        disturbances=stages.estimator.disturbances_of(track),
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
         reinitialised=track.reinitialised,
@@ -444,7 +450,15 @@ def _seen(
     if before is None or not measurement.alignment.measured:
         return None
     prior = stages.estimator.predict(before, scan.t_ns)
-    return prior, stages.estimator.innovate(prior, measurement.alignment)
+    alignment = _weighed(stages, state, measurement.alignment)
+    return prior, stages.estimator.innovate(prior, alignment)
+
+
+def _weighed(stages: Stages, state: PipelineState, alignment: Alignment) -> Alignment:
+    """The pose with the covariance that the tracker finds instead of the claimed one."""
+    if stages.tracker is None:
+        return alignment
+    return stages.tracker.weighed(state.following.kinematics, alignment)
 
 
 def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
@@ -633,6 +647,7 @@ def _measurement(
 
 def _examined(
     stages: Stages,
+    state: PipelineState,
     scan: Scan,
     predicted: Prediction,
     measurement: Measurement,
@@ -644,7 +659,7 @@ def _examined(
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
-    alignment = measurement.alignment
+    alignment = _weighed(stages, state, measurement.alignment)
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return (
         predicted,
