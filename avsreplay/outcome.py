@@ -119,6 +119,8 @@ class MonitorReport:
             limit.
         unconverged: blocks whose covariance is above its limit, and two rates where both explain
             the poses.
+        alias: the slower and the faster of two angular rates [rad/s] that both explain the poses;
+            None where only one does.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
 
@@ -133,6 +135,7 @@ class MonitorReport:
     covariance_converged: bool
     predictive_converged: bool
     unconverged: tuple[str, ...]
+    alias: tuple[float, float] | None
     forecast: Forecast
 
 

@@ -29,7 +29,7 @@ from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.estimate.track import moves
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.aliasing import Instants, in_words, other_rate
+from avsreplay.monitor.aliasing import Turns, in_words, two_rates
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,
@@ -95,7 +95,7 @@ class MonitorState:
     convergence: ConvergenceTrack
     violations: int = 0
     motion: FittedMotion | None = None
-    instants: Instants = Instants()
+    turns: Turns = Turns()
 
 
 @value_class
@@ -134,6 +134,7 @@ class Monitors:
         state: MonitorState,
         estimator: AnyEstimator,
         prior: Prediction,
+        alignment: Alignment,
         innovation: Innovation | None,
         gamma: int,
         track: Track,
@@ -147,6 +148,7 @@ class Monitors:
             state: state of the monitors before the scan.
             estimator: estimator of the run.
             prior: prediction at the scan.
+            alignment: of the scan.
             innovation: of the measurement; None where nothing was measured.
             gamma: 1 if the fault detector accepts the measurement, else 0.
             track: estimate after the scan.
@@ -169,8 +171,10 @@ class Monitors:
         if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
             forecast = estimator.track_forecast(track, np.array([planned.after_s()]), grasp_c)
         possible = with_change(forecast, belief, track.change_P)
-        instants = state.instants.after(belief.t_ns) if healthy else state.instants
-        w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
+        turns = state.turns
+        if alignment.measured:
+            turns = turns.after(belief.t_ns, alignment.T_ac.q)
+        alias = two_rates(turns)
         judged = self.convergence.judge(
             state.convergence,
             belief,
@@ -190,11 +194,12 @@ class Monitors:
             converged=judged.converged,
             covariance_converged=judged.covariance_converged,
             predictive_converged=judged.predictive_converged,
-            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(w, alias)),
+            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(alias)),
+            alias=alias,
             forecast=forecast,
         )
         violated = state.violations + len(failed)
-        return MonitorState(gramian, seen, judged, violated, motion, instants), report
+        return MonitorState(gramian, seen, judged, violated, motion, turns), report
 
     def _gramian(
         self,
@@ -345,7 +350,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     belief = stages.estimator.published(track)
     planned = _planned_time(stages, state.guidance, belief)
     seen = innovation, gamma, track, belief, planned, stages.grasp_c
-    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
+    monitors, report = stages.monitors.observe(
+        state.monitors, stages.estimator, prior, measurement.alignment, *seen
+    )
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)

@@ -907,6 +907,16 @@ class Row:
         lambda o, s: ", ".join(o.monitors.unconverged) or None,
         "Names of the blocks of states whose covariance is above its limit.",
     )
+    alias_slow_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[0],
+        "Slower of two angular rates that both explain the poses; empty where only one does.",
+        "rad/s",
+    )
+    alias_fast_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[1],
+        "Faster of these two rates.",
+        "rad/s",
+    )
     grasp_pos_1s_m: float | None = _number(
         lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
         (

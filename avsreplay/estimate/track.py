@@ -320,7 +320,7 @@ def moves(track: Track) -> Moves:
     """Return what the poses of a track show of the motion."""
     if track.drift is not None:
         return Moves.ACCELERATED
-    return Moves.DISTURBED if track.levels.established else Moves.FREE
+    return Moves.DISTURBED if track.levels.certain else Moves.FREE
 
 
 def with_history(then: Track, now: Track) -> Track:
