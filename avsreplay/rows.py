@@ -610,7 +610,7 @@ class Row:
         ),
         words=_ESTIMATOR_WORDS,
     )
-    motion: str = _exact(
+    motion: str | None = _exact(
         lambda o, s: o.moves.value,
         "What the poses show of the motion of the target.",
         words=_MOTION_WORDS,

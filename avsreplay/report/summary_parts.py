@@ -187,7 +187,7 @@ def _not_free(rows: Sequence[Row]) -> Iterator[str]:
             )
             if value
         ]
-        yield f"random torques or forces act on the target: {' and '.join(sizes)}"
+        yield f"the target does not move freely: random torques or forces act, {' and '.join(sizes)}"
 
 
 @value_class(eq=True)
