@@ -187,7 +187,8 @@ def _not_free(rows: Sequence[Row]) -> Iterator[str]:
             )
             if value
         ]
-        yield f"the target does not move freely: random torques or forces act, {' and '.join(sizes)}"
+        what = f"random torques or forces act, {' and '.join(sizes)}"
+        yield f"the target does not move freely: {what}"
 
 
 @value_class(eq=True)
