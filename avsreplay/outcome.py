@@ -60,8 +60,10 @@ class Plan:
             constraint with it; NaN and "" without constraints.
         abort_margin_m: Lower bound of the smallest margin of ``withdrawal_clearance_m`` if the
             robot withdraws at any instant of the plan [m]; NaN: not checked, without a clearance.
-        escapes: (m, 4) instants of the plan [s after t_ns], ascending, and the directions in {A} in
-            which the robot withdraws there; None: not planned.
+        passive_margin_m, passive_safe_s: The same of a robot that coasts after a cut of its thrust
+            [m], and the time from t_ns up to which a cut is safe [s].
+        escapes: (m, 4) begins of ranges of instants of the path [s after its begin], ascending, and
+            the direction in {A} in which the robot withdraws in each; None: not planned.
         steps: Number of steps of the search.
         attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN
             where not planned.
@@ -84,6 +86,8 @@ class Plan:
     margin_m: float = math.nan
     binding: str = ""
     abort_margin_m: float = math.nan
+    passive_margin_m: float = math.nan
+    passive_safe_s: float = math.nan
     escapes: Array | None = None
     steps: int = 0
     attitude_s: float = math.nan

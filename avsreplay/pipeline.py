@@ -360,7 +360,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         known = planner_input(
             stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
-        guidance = stages.guidance.step(guidance, known)
+        guidance = stages.guidance.stated(stages.guidance.step(guidance, known), known)
     outcome = Outcome(
         scan=scan,
         start_ns=state.start_ns,

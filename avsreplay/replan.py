@@ -22,14 +22,13 @@ from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
-from avsreplay.plan.constrained import constrained
+from avsreplay.plan.constrained import constrained, with_safety
 from avsreplay.plan.flights import Ended, Execution, Miss, miss
 from avsreplay.plan.flights import execute as plan_execute
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
     CONSTRAINTS,
-    SampledScene,
     Scene,
     TargetGeometry,
     in_fixture_axes,
@@ -41,7 +40,6 @@ from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
-from avsreplay.plan.withdrawal import COAST_S, Certificate, Space, coasting
 from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
@@ -127,6 +125,19 @@ class Replanning:
         belief = self.belief(index)
         return self._planned(self._scene(belief), belief.t_ns)
 
+    def stated(self, index: int, made: Plan) -> Plan:
+        """Return a plan with the margins of a robot that withdraws or coasts from any of its
+        instants.
+
+        Args:
+            index: index of the scan from which the plan was made.
+            made: the plan.
+        """
+        if not made.found:
+            return made
+        scene, own = self._scene(self.belief(index)), (self.params, self.limits)
+        return with_safety(scene, made, self.path(made), *own, self.saved.extent_m)
+
     def start_margin(self, index: int) -> float:
         """Return the margin of the limits at the start [m or m/s]: negative where one is violated,
         infinite without.
@@ -177,22 +188,6 @@ class Replanning:
         belief, estimator = self.belief(index), self.saved.estimator
         scene = Scene(estimator.motion(belief), estimator.attitude(belief))
         return self.arm.last_metres(self.path(made), scene, self.limits)
-
-    def passive(self, index: int, made: Plan) -> Certificate | None:
-        """Return the margin of a robot that coasts after a cut of its thrust at any instant of a
-        plan; None without a plan or a clearance.
-
-        Args:
-            index: index of the scan from which the plan was made.
-            made: the plan.
-        """
-        if not made.found or self.limits.clearance_m is None:
-            return None
-        params, scene = self.params, self._scene(self.belief(index))
-        span_s = made.t_go_s + 1.5 * COAST_S
-        sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
-        space = Space(sampled, self.limits, params.a_max_mps2, self.saved.extent_m)
-        return coasting(space, self.path(made), made.latency_s)
 
     def path(self, made: Plan) -> RobotPath:
         """Return the path of a plan from the start.

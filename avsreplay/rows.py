@@ -986,13 +986,28 @@ class Row:
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
         (
-            "Smallest margin of the clearance if the robot aborts at any time of the plan before "
-            "the corridor."
+            "Certified smallest margin of the required distance to the body if the robot withdraws "
+            "at any instant of the plan; from within the corridor less is required."
         ),
         "m",
         ".4f",
         0.0,
         0.01,
+    )
+    passive_margin_m: float | None = column(
+        lambda o, s: None if o.plan is None else finite(o.plan.passive_margin_m),
+        (
+            "Certified smallest margin of this distance if the thrust is cut at any instant of the "
+            "plan and the robot coasts for 30 s."
+        ),
+        "m",
+        ".4f",
+        0.0,
+        0.01,
+    )
+    passive_safe_s: float | None = _seconds(
+        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.passive_safe_s)),
+        "Time since the first scan up to which a cut of the thrust keeps this distance.",
     )
     gripper_ready_s: float | None = _seconds(
         _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)),

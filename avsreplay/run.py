@@ -4,7 +4,7 @@ scans and scores them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -239,29 +239,37 @@ class Run:
         ):  # the pipeline has a thread of its own; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
-            if self._image is None and outcome.verdict.gamma:
-                self._follow(outcome)
-            truth = self._truth_of(outcome.scan)
-            if self.job.growing:
-                self.job.growing.take(outcome.scan, self._true(outcome.scan))
             with shielded():
-                self.model_check.add(outcome.scan, outcome.alignment)
-            row = Row.of(outcome, self._scored.score(state, outcome, truth))
-            if truth.state is not None:
-                self._end = outcome.belief, truth.state
-            scan = ReplayedScan(outcome, state, truth, row)
-            for listener in listeners:
-                listener(scan)
-            self.flight.take(
-                at_grasp(outcome.belief, self.task.grasp_c),
-                state.guidance,
-                outcome.verdict.gamma,
-                outcome.monitors.converged,
-                None if outcome.innovation is None else outcome.innovation.R,
-            )
-            self.taken.append(row)
-            self._state, self.done = state, self.done + 1
+                row = self._take(state, outcome, listeners)
             yield row
+
+    def _take(self, state: PipelineState, outcome: Outcome, listeners: Sequence[Listener]) -> Row:
+        """Score a processed scan and hand it to everything that collects scans; the state of the
+        run is then that after this scan.
+        """
+        if self._image is None and outcome.verdict.gamma:
+            self._follow(outcome)
+        assert self._scored is not None
+        truth = self._truth_of(outcome.scan)
+        if self.job.growing:
+            self.job.growing.take(outcome.scan, self._true(outcome.scan))
+        self.model_check.add(outcome.scan, outcome.alignment)
+        row = Row.of(outcome, self._scored.score(state, outcome, truth))
+        if truth.state is not None:
+            self._end = outcome.belief, truth.state
+        scan = ReplayedScan(outcome, state, truth, row)
+        for listener in listeners:
+            listener(scan)
+        self.flight.take(
+            at_grasp(outcome.belief, self.task.grasp_c),
+            state.guidance,
+            outcome.verdict.gamma,
+            outcome.monitors.converged,
+            None if outcome.innovation is None else outcome.innovation.R,
+        )
+        self.taken.append(row)
+        self._state, self.done = state, self.done + 1
+        return row
 
     def rescore(self) -> list[int]:
         """Score the plans of a log that grew with all its true poses; replace the rows that change

@@ -4,6 +4,7 @@ interruption between scans.
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
 import tempfile
@@ -324,45 +325,50 @@ _GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
 
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
+    """Yield a function that returns whether Ctrl-C was pressed; the scan in progress is finished.
 
-    A scan that takes longer than ``_GRACE_S`` after the first one is given up; its row is missing.
+    A scan that takes longer than ``_GRACE_S`` after this, or until a second Ctrl-C, is given up:
+    its row is missing. What collects scans is never left with a part of one.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
         stop: called at the first Ctrl-C.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed a second time, or before the first result.
+        KeyboardInterrupt: the scan in progress was given up.
     """
     asked: list[int] = []
+    ended = threading.Event()
 
     def ask(number: int, _frame: object) -> None:
         if not interrupts.counts():
             return
         asked.append(number)
+        if ended.is_set():
+            return
         stop()
         if not rows or len(asked) > 1:
-            request_stop()
-            raise KeyboardInterrupt
-        late.start()
+            interrupt.stop()
+        elif not late.is_alive():
+            late.start()
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    from avsreplay.register.interrupt import request_stop
+    from avsreplay.register import interrupt
 
-    late = threading.Timer(_GRACE_S, request_stop)
+    late = threading.Timer(_GRACE_S, _thread.interrupt_main)  # as a second Ctrl-C
     late.daemon = True
     before = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: bool(asked)
     finally:
-        signal.signal(signal.SIGINT, before)
+        ended.set()  # what arrives from here on does not leave this block half done
         late.cancel()
         if late.is_alive():
             late.join()
-        request_stop(False)
+        signal.signal(signal.SIGINT, before)
+        interrupt.request_stop(False)
 
 
 _LIVE_HEAD = "  scan     t [s]  state             rms [mm]     nis pos err [mm] rot err [deg]"

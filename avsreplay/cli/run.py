@@ -27,7 +27,7 @@ from avsreplay.cli.options import (
 from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from avsreplay.log import GrowingLog
     from avsreplay.model_size import Advice
@@ -363,12 +363,22 @@ def _replayed(
         if keeper and wanted.resume:
             _resume(run, keeper)
         rows, kept = run.taken, run.done
-        interrupted = _take_scans(run, keeper, viewer, live_allowed=not wanted.as_json)
+        found: list[tuple[tuple[str, ...], str]] = []
+        interrupted = _take_scans(
+            run,
+            keeper,
+            viewer,
+            live_allowed=not wanted.as_json,
+            then=lambda: found.append(_model_notes(run, advice)),
+        )
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
         summary = run.summary()
-        record = _record(run, summary) | {"preflight": _findings(run, advice, rows, summary)}
+        notes, remark = found[0] if found else ((), "")
+        for note in (*notes, remark) if remark else notes:
+            click.echo(f"avsreplay: {note}", err=True)
+        record = _record(run, summary) | {"preflight": _findings(run, advice, summary, notes)}
         if interrupted:
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
@@ -385,8 +395,10 @@ def _take_scans(
     viewer: RerunStream | None,
     *,
     live_allowed: bool,
+    then: Callable[[], None],
 ) -> bool:
-    """Replay the scans that follow those taken; return whether this was interrupted.
+    """Replay the scans that follow those taken, then call ``then``; return whether this was
+    interrupted.
 
     Raises:
         Outdated: the log has grown, and what was recorded later changes rows.
@@ -401,7 +413,7 @@ def _take_scans(
     growing = run.job.growing
     live = growing is not None and live_allowed
     found = run.rows(listeners, None if live else tracked)
-    interrupted = _collect(found, run.taken, growing, live=live)
+    interrupted = _collect(found, run.taken, growing, live=live, then=then)
     if growing and not interrupted and growing.outdated():
         raise Outdated
     changed = run.rescore() if growing else []
@@ -411,14 +423,14 @@ def _take_scans(
 
 
 def _findings(
-    run: Run, advice: list[Advice], rows: Sequence[Row], summary: Summary
+    run: Run, advice: list[Advice], summary: Summary, notes: Sequence[str]
 ) -> list[dict[str, str]]:
-    """What the checks before and after the replay found, with grades."""
+    """What the checks before the replay, of the model and of the times found, with grades."""
     of_model = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
     graded = [
         *((each.grade, each.sentence) for each in advice),
-        *((of_model, note) for note in _model_notes(run, advice)),
-        *(("check", note) for note in _untimed_notes(run, rows)),
+        *((of_model, note) for note in notes),
+        *(("check", note) for note in _untimed_notes(run, run.taken)),
     ]
     return [{"grade": grade, "text": text} for grade, text in graded]
 
@@ -437,19 +449,16 @@ def _resume(run: Run, keeper: ResultWriter) -> None:
     click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
-def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows unless size or background explain them;
-    also said on stderr.
+def _model_notes(run: Run, advice: list[Advice]) -> tuple[tuple[str, ...], str]:
+    """Return the findings on the model from the rows, and a remark on it; nothing where size or
+    background explain them.
     """
     if any(
         a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail")
         for a in advice
     ):
-        return ()
-    notes, remark = run.model_check.notes(), run.model_check.remark()
-    for note in (*notes, remark) if remark else notes:
-        click.echo(f"avsreplay: {note}", err=True)
-    return notes
+        return (), ""
+    return run.model_check.notes(), run.model_check.remark()
 
 
 def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
@@ -476,11 +485,13 @@ def _collect(
     growing: GrowingLog | None = None,
     *,
     live: bool = False,
+    then: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Take all rows, which the run keeps; True if the user interrupted after one or more.
+    """Take all rows, which the run keeps, and call ``then``; True if the user interrupted after one
+    or more rows.
 
-    An interrupt takes effect between two scans, so that all results hold the same scans; a second
-    one at once. With ``live`` a line is printed for each row.
+    All results hold the same scans: an interrupt takes effect between two of them. With ``live`` a
+    line is printed for each row.
     """
     from avsreplay.cli.options import interruptible, say_live
 
@@ -493,7 +504,8 @@ def _collect(
                 if live:
                     say_live(row)
                 if stopped() and not growing:
-                    return True
+                    break
+            then()
             return stopped()
     except KeyboardInterrupt:
         if not rows:

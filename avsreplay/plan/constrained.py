@@ -37,7 +37,6 @@ from avsreplay.plan.convexification import (
     proven,
     shortened,
     warm_reference,
-    withdrawals,
     withdrawn,
     worst_margin,
 )
@@ -45,7 +44,7 @@ from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene, largest_acce
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
-from avsreplay.plan.withdrawal import COAST_S, Tried
+from avsreplay.plan.withdrawal import COAST_S, Space, Tried, certified, safety
 
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
@@ -86,7 +85,6 @@ def constrained(
     extent_m: float = 8.0,
     warm: tuple[RobotPath, float] | None = None,
     earliest_s: float = 0.0,
-    stated: bool = True,
 ) -> Plan:
     """Plan a rendezvous under constraints.
 
@@ -100,7 +98,6 @@ def constrained(
         extent_m: Diagonal of the target's bounding box [m].
         warm: A path planned earlier and the time since its begin [s]; it is the first initial path.
         earliest_s: Earliest capture allowed [s after t_ns].
-        stated: State the margin of the withdrawals from every instant; it is required in any case.
 
     Returns:
         A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the
@@ -129,15 +126,43 @@ def constrained(
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     buffer_m = BUFFER_OF_EXTENT * extent_m
     case = Case(sampled, limits, params, r0, v0, buffer_m, earliest_s=earliest_s)
-    plan = _free_plan(case, free) or _graded(
+    return _free_plan(case, free) or _graded(
         case, free, _best_path(case, free, unbound, warm), t_ns
     )
-    if not (stated and plan.found):
+
+
+def with_safety(
+    scene: Scene,
+    plan: Plan,
+    path: RobotPath,
+    params: PlanParams,
+    limits: Limits,
+    extent_m: float,
+    after_s: float = 0.0,
+) -> Plan:
+    """Return a plan with the margins of a robot that withdraws or coasts from any of its instants;
+    the same plan without one or without a clearance.
+
+    Args:
+        scene: The target after the begin of the path.
+        plan: The plan.
+        path: Its path.
+        params: Thrust, horizon and grid.
+        limits: Resolved limits.
+        extent_m: Diagonal of the target's bounding box [m].
+        after_s: Begin of the path [s after the instant of planning].
+    """
+    if not plan.found or limits.clearance_m is None or scene.surface is None:
         return plan
-    found = withdrawals(case, path_of(plan, r0, v0), plan.escapes)
-    if found is None:
-        return plan
-    return replace(plan, abort_margin_m=found.margin_m, escapes=found.escapes)
+    sampled = SampledScene(scene, params.horizon_s, params.grid_s, path.t_go_s + 1.5 * COAST_S)
+    space = Space(sampled, limits, params.a_max_mps2, extent_m)
+    found = safety(space, path, plan.latency_s - after_s, plan.escapes)
+    return replace(
+        plan,
+        abort_margin_m=found.margin_m,
+        passive_margin_m=found.passive_margin_m,
+        passive_safe_s=after_s + min(found.passive_safe_s, path.t_go_s),
+    )
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
@@ -222,6 +247,9 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         return no_plan(t_ns, PlanStatus.NOT_FOUND, free.a_max, free.lower_bound_s)
     position, velocity = found.terminal_errors(case.scene.goal)
     worst, name = worst_margin(case, found)
+    escapes = found.escapes
+    if found.short_m > 0.0 and case.space is not None:  # the search ended at the first short ones
+        escapes = certified(case.space, found, case.wait_s, escapes).escapes
     return Plan(
         t_ns=t_ns,
         status=PlanStatus.OPTIMAL
@@ -239,7 +267,7 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         violation_m=max(-worst, 0.0),
         margin_m=worst,
         binding=name,
-        escapes=found.escapes,
+        escapes=escapes,
     )
 
 

@@ -378,7 +378,7 @@ def closed_loop(
         ValueError: There is no scan.
     """
     aimed: Array | None = None
-    last_ns, flown, known, guidance = start_ns, list[Array](), None, guidance.unstated()
+    last_ns, flown, known = start_ns, list[Array](), None
     for known in inputs:
         if state is None:
             state, last_ns = guidance.initial(known.t_ns), known.t_ns

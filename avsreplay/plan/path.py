@@ -183,8 +183,9 @@ class StepPath:
         u: (n, 3) acceleration of each interval in {A} [m/s2].
         latency_s: Coasting time before the first interval [s].
         t_go_s: End of the last interval [s after the instant of planning].
-        escapes: (m, 4) instants of the path [s after the instant of planning], ascending, and the
-            directions in {A} in which the robot withdraws there; None: not planned.
+        escapes: (m, 4) begins of ranges of its instants [s after the instant of planning],
+            ascending, and the direction in {A} in which the robot withdraws in each; None: not
+            planned.
         short_m: By how much withdrawals miss what is required of them [m].
     """
 
