@@ -42,7 +42,7 @@ from avsreplay.plan.convexification import (
 )
 from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
+from avsreplay.plan.rendezvous import PlanParams, finer, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.withdrawal import COAST_S, Space, Tried, certified, safety
 
@@ -108,7 +108,7 @@ def constrained(
     Raises:
         ValueError: A value is not valid, or the scene lacks what a constraint needs.
     """
-    limits = limits.resolved(extent_m)
+    limits, params = limits.resolved(extent_m), finer(params, scene.goal)
     scene.check(limits)
     strongest = replace(params, a_max_mps2=largest_acceleration(limits, params))
     unbound = free = rendezvous(scene.goal, r0, v0, strongest, t_ns)
@@ -154,7 +154,8 @@ def with_safety(
     """
     if not plan.found or limits.clearance_m is None or scene.surface is None:
         return plan
-    sampled = SampledScene(scene, params.horizon_s, params.grid_s, path.t_go_s + 1.5 * COAST_S)
+    grid_s = finer(params, scene.goal).grid_s
+    sampled = SampledScene(scene, params.horizon_s, grid_s, path.t_go_s + 1.5 * COAST_S)
     space = Space(sampled, limits, params.a_max_mps2, extent_m)
     found = safety(space, path, plan.latency_s - after_s, plan.escapes)
     return replace(

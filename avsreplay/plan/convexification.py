@@ -25,6 +25,7 @@ from avsreplay.plan.limits import (
     in_fixture_axes,
     largest_acceleration,
     margins,
+    narrowing,
 )
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
@@ -519,7 +520,9 @@ def _geometric(
     dy *= (reference.t * s)[:, None]  # change with the relative change of the end time
     bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], y]), 2, axis=0), axis=1) / 8.0
     off = off + np.concatenate([bend, bend[-1:]])[:, None] - allowed(case.start, s)
-    found = margins(scene, limits, y, reference.r, case.sampled.sigma(times))
+    sigma = case.sampled.sigma(times)
+    found = margins(scene, limits, y, reference.r, sigma)
+    off[:, :2] += narrowing(scene, limits, y, sigma)
     inside = found.inside
     if case.entry is not None:
         inside[:, 0] = s >= case.entry[0] - 1e-9

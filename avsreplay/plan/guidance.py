@@ -22,7 +22,7 @@ from avsreplay.plan.attitude import Turn, next_turn, with_turn, without_turn
 from avsreplay.plan.constrained import constrained, with_safety
 from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import BurnPath, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.rendezvous import PlanParams, finer
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
 from avsreplay.plan.withdrawal import COAST_S, Space, Withdrawal, escapes_at, withdrawal
@@ -409,7 +409,8 @@ class Guidance:
         begin_ns = known.t_ns + round(wait_s * 1e9)
         r, v = segment.at(begin_ns)
         scene = known.scene.after(wait_s) if wait_s else known.scene
-        sampled = SampledScene(scene, self.params.horizon_s, self.params.grid_s, 1.5 * COAST_S)
+        grid_s = finer(self.params, scene.goal).grid_s
+        sampled = SampledScene(scene, self.params.horizon_s, grid_s, 1.5 * COAST_S)
         space = Space(sampled, self.limits, self.params.a_max_mps2, self.extent_m)
         path, after_s = segment.path, (begin_ns - segment.t_ns) * 1e-9
         current = planned = None
