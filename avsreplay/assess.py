@@ -77,12 +77,12 @@ _QUANTITIES = ("position", "speed", "attitude")
 
 @value_class
 class Leg:
-    """What the robot flew after one scan.
+    """What the robot did after one scan.
 
     Attributes:
-        belief: after the scan.
-        segment: its flight from then on.
-        action, rule: decision of the supervisor.
+        belief: the belief after the scan.
+        segment: the flight of the robot from then on.
+        action, rule: the action of the supervisor and the rule that determined it.
     """
 
     belief: Belief
@@ -96,13 +96,14 @@ class FlightLog:
 
     Attributes:
         legs: one per scan from the first approach to the end of the flight.
-        state: guidance after the last scan of the flight; None before the first.
-        belief: after the last scan.
-        converged: whether it may be used for planning.
-        gammas: of all scans.
-        stamps: of all scans [ns].
-        failing_ns: since when no capture is planned; None where one is.
-        noises: (6,) variances of the last measured poses, metres and half angles.
+        state: the state of guidance after the last scan of the flight; None before the first
+            approach.
+        belief: the belief after the last scan.
+        converged: whether this belief may be used for planning.
+        gammas: gamma of every scan.
+        stamps: instant of every scan [ns].
+        failing_ns: instant since which no capture is planned [ns]; None where one is.
+        noises: (6,) variances of the last measured poses: positions [m2], half angles [rad2].
     """
 
     def __init__(self) -> None:
@@ -126,11 +127,11 @@ class FlightLog:
         """Take one scan.
 
         Args:
-            belief: after it.
-            guidance: after it; it does not change after the capture.
-            gamma: 1 for a healthy scan.
+            belief: the belief after the scan.
+            guidance: the state of guidance after the scan; it does not change after the capture.
+            gamma: 1 for a healthy scan, else 0.
             converged: whether the belief may be used for planning.
-            noise: (6, 6) noise of the measured pose; None where nothing was measured.
+            noise: (6, 6) noise covariance of the measured pose; None where nothing was measured.
         """
         self.gammas.append(gamma)
         self.stamps.append(belief.t_ns)
@@ -168,20 +169,22 @@ class FlightLog:
 
 @value_class
 class Setup:
-    """What is assessed.
+    """The inputs of an assessment.
 
     Attributes:
-        task: what is to be grasped.
-        estimator, guidance: those of the run.
+        task: the task of the gripper.
+        estimator, guidance: estimator and guidance of the run.
         target: geometry of the target about the grasp point, with its surface.
         solid: whether inside and outside of the surface are known.
-        extent_m: of the target.
-        since_ns: instant of the first scan.
-        thrust_noise_mps2: 1 sigma of the thrust error of each axis, as its mean over 1 s.
-        noise: 1 sigma of a measured pose [m, rad of half angle]; None: R0 of the settings.
+        extent_m: extent of the target [m].
+        since_ns: instant of the first scan [ns].
+        thrust_noise_mps2: standard deviation of the thrust error of each axis, as its mean over 1 s
+            [m/s2].
+        noise: standard deviations of a measured pose [m, rad of half angle]; None takes R0 of the
+            settings.
         flights: number of simulated flights where the log ends before the capture.
-        seed: of all draws.
-        advice: grasp points that could be used, in words.
+        seed: seed of all random draws.
+        advice: grasp points that could be used instead, in words.
     """
 
     task: Task
@@ -449,14 +452,14 @@ def _why_not(setup: Setup, flight: Ended, end_s: float, hit: bool) -> str:
 def simulated(
     setup: Setup, log: FlightLog, state: GuidanceState | None, belief: Belief
 ) -> list[Ended]:
-    """Fly approaches from a belief on, with measured scans, thrust errors, delay and the blackouts
-    of the log, against targets that are drawn from the belief.
+    """Simulate approaches that begin at a belief, with measured scans, thrust errors, delay and the
+    blackouts of the log, against targets that are drawn from the belief.
 
     Args:
         setup: task, estimator, guidance and target.
         log: the flight so far, whose scans give interval and blackouts.
-        state: of guidance at the belief; None: the robot is at its start.
-        belief: from which the targets are drawn.
+        state: the state of guidance at the belief; None if the robot is at its start.
+        belief: the belief from which the targets are drawn.
     """
     rng = setup.rng(3)
     _, drawn = drawn_beliefs(belief, setup.flights, rng)

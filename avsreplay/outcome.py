@@ -215,7 +215,7 @@ class Outcome:
 
 @value_class(eq=True)
 class PoseError:
-    """Difference of two poses: distance of their origins [m] and angle between their
+    """Difference of two poses: the distance of their origins [m] and the angle between their
     attitudes [deg].
     """
 
@@ -225,8 +225,8 @@ class PoseError:
 
 @value_class(eq=True)
 class CaptureError:
-    """Gripper against true grasp point at the planned instant; NaN where the truth is not
-    known at that instant.
+    """Errors of the gripper relative to the true grasp point at the planned instant; NaN where the
+    truth is not known at that instant.
     """
 
     distance_m: float
@@ -236,16 +236,17 @@ class CaptureError:
 
 @value_class(kw_only=True)
 class Score:
-    """An outcome compared with ground truth; None where there is no truth for it.
+    """The comparison of an outcome with ground truth; a value is None where there is no truth for
+    it.
 
     Attributes:
-        fault: label of the injected fault.
+        fault: kind of the injected fault at the scan.
         reference: "truth", or "fit" (a motion fitted to all healthy poses).
-        estimate, registration: errors of the estimated and of the measured pose.
-        nees, nees_blocks: normalised estimation error squared, for the best order of the principal
-            axes, and by block.
-        planned: error of a plan made at this scan at its planned instant.
-        captured: of a capture since the last scan.
+        estimate, registration: errors of the estimated and of the registered pose.
+        nees, nees_blocks: normalised estimation error squared, for the order of the principal axes
+            in which it is smallest, in total and for each block of the state.
+        planned: error of a plan that was made at this scan, at its planned instant.
+        captured: error of a capture since the scan before.
     """
 
     fault: str | None = None

@@ -1,5 +1,5 @@
-"""Planning from the saved beliefs of a result: one plan, its distribution over the belief,
-its errors, the approach.
+"""Planning from the saved beliefs of a result: a plan, the distribution of its errors over the
+belief, its errors against the truth, and the simulated approach.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _NO_MODEL = Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int32), "", "")
 
 
 class Replanning:
-    """Planner for a saved result with other settings."""
+    """The planner for a saved result, with settings that may differ from those of the run."""
 
     def __init__(
         self,

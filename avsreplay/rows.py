@@ -46,13 +46,13 @@ class Column:
     """Metadata of a row field.
 
     Attributes:
-        name: field name, with its unit as suffix where it has one.
-        text: its meaning, one or more sentences.
-        unit: as printed in table headings, "" if none.
+        name: name of the field, with its unit as suffix where it has one.
+        text: meaning of its values, one or more sentences.
+        unit: unit as printed in table headings, "" if there is none.
         fmt: format specification for tables.
-        rtol, atol: relative and absolute golden tolerance; both 0 means exact.
-        table: shown in the per-scan table.
-        section: the section that begins with it, None if it continues one.
+        rtol, atol: relative and absolute golden tolerance; if both are 0, values must be equal.
+        table: whether the table of scans shows it.
+        section: the section of docs/columns.md that begins with it, None if it continues one.
         words: meaning of every value of a column that holds one of a few words.
     """
 
@@ -430,8 +430,8 @@ _ACTION_WORDS = {
 
 @value_class(eq=True)
 class Row:
-    """The result of one scan. None: does not apply (no truth, no measurement, no plan, no
-    fault).
+    """The result of one scan. A value is None where it does not apply: without truth, measurement,
+    plan or fault.
     """
 
     seq: int = _exact(
@@ -1062,7 +1062,7 @@ _VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 
 
 def columns() -> tuple[Column, ...]:
-    """Every column in order."""
+    """Return every column in order."""
     return tuple(
         dataclasses.replace(f.metadata["column"], name=f.name) for f in dataclasses.fields(Row)
     )
@@ -1070,7 +1070,9 @@ def columns() -> tuple[Column, ...]:
 
 @cache
 def field_types() -> Mapping[str, tuple[type, bool]]:
-    """Column name -> (str, int, float or bool; whether it may be null)."""
+    """Return for every column the type of its values (str, int, float or bool) and whether a value
+    may be null.
+    """
     hints = typing.get_type_hints(Row)
     names = (field.name for field in dataclasses.fields(Row))
     return MappingProxyType({name: _split(hints[name]) for name in names})

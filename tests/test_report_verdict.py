@@ -195,7 +195,10 @@ def test_a_missed_fault_fails_and_is_named(make_rows):
     rows = [dataclasses.replace(r, fault="range_bias") if 50 <= r.seq <= 55 else r for r in rows]
     found = _judged(rows, labels=[*_labels(rows), missed])
     assert found.grade is Grade.FAIL
-    assert "1 of 2 harmful faults were not detected, the first: range bias at 10.0 s" in found.line
+    assert (
+        "1 of 2 faults with unusable scans were not detected, the first: range bias at 10.0 s"
+        in found.line
+    )
 
 
 def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
@@ -361,8 +364,11 @@ def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
         changed = [dataclasses.replace(r, **used) if r.seq == at else r for r in rows]
         found = verdict_of(changed, Summary.fold(changed, labels=labels), HEADER)
         assert found.grade is Grade[grade], found.line
-        assert ("scans with a harmful fault were used" in found.line) == (grade != "PASS")
-    assert "1 of 6 scans with a harmful fault were used, with a position error up to " in found.line
+        assert ("scans that faults make unusable were used" in found.line) == (grade != "PASS")
+    assert (
+        "1 of 6 scans that faults make unusable were used, with a position error up to "
+        in found.line
+    )
 
 
 def test_a_rejected_measurement_is_no_moment_of_its_own(make_rows):

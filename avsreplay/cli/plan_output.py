@@ -47,8 +47,8 @@ class Answer:
         at_s: instant of planning [s after the first scan].
         made: the plan.
         assessment: whether the robot would capture, by the whole flight.
-        spread: the one plan flown blind, over the belief; None without a plan.
-        joints: of an arm during the last metres; None without an arm.
+        spread: the plan flown without replanning, over draws from the belief; None without a plan.
+        joints: joints of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
         execution: the simulated approach; None without ground truth.
         changes: single changes with which a plan is found, where there is none.
