@@ -105,7 +105,7 @@ class Segment:
         Args:
             instants: (n,) on the clock of the scans [ns].
         """
-        spans = (instants - self.t_ns) * 1e-9
+        spans: Array = np.asarray((instants - self.t_ns) * 1e-9, np.float64)
         r = self.r0 + spans[:, None] * self.v0 if self.path is None else self.path.at(spans)[0]
         if self.previous is not None:
             early = instants < self.t_ns
