@@ -1,9 +1,9 @@
-"""Size of the scans against that of the model: unit, background and crop, each with the option to
-add.
+"""Comparison of the size of the scans with that of the model: unit, background and crop, each with
+the option to add.
 
 Sizes are compared as diameters (largest distance between two points), which do not depend on the
 attitude. A scan shows one side of the target, so that its diameter is between about 0.4 and 1.1 of
-the model's. Where sizes permit several units, a search for the pose decides.
+that of the model. Where sizes permit several units, a search for the pose decides.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _SMALLEST_TARGET_M = 0.05  # a smaller model is too small, and not the unit of t
 
 @value_class(eq=True)
 class Advice:
-    """One finding.
+    """One finding of a check before a run.
 
     Attributes:
         grade: "ok", "check" or "fail".

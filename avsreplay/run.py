@@ -1,5 +1,5 @@
-"""One run, for command line, API and sweeps: opens the log, builds the stages, folds the
-scans and scores them.
+"""One run, for command line, Python and sweeps: opens the log, builds the stages, processes scan
+after scan and computes the errors.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ Progress = Callable[[Iterable[Scan], int, str], Iterable[Scan]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """What to run.
+    """The definition of a run.
 
     Attributes:
         source: log, bag or folder of scans.
         options: how to read it.
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
-        prefetch: scans decoded ahead on a thread; the pipeline then has one, too. 0: one thread.
-            Same result.
-        growing: the log, if it is still written; a scan is replayed when it is there.
+        prefetch: number of scans that are decoded ahead on a thread; the pipeline then has a
+            thread, too. 0 uses one thread; the result is the same.
+        growing: the log, if it is still written; a scan is replayed as soon as it is there.
     """
 
     source: Path
@@ -92,18 +92,19 @@ class Job:
 
 
 class Run:
-    """An open run; a context manager. ``rows`` may be iterated once.
+    """An open run, which is a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        config: effective configuration.
-        surface: model of the target.
+        config: the effective configuration.
+        surface: the model of the target.
         registrar: registers scans against that model.
-        model_check: check of the model by the rows so far.
+        model_check: result of the check of the model by the rows so far.
         done: number of scans processed so far.
-        taken: their rows.
-        task: what is to be grasped, compared with the model.
+        taken: the rows of these scans.
+        task: the task of the gripper, compared with the model.
         flight: the flight of guidance so far, for the assessment of the capture.
-        acceleration: fitted to the poses, None where it is given.
+        acceleration: acceleration of the target that was fitted to the poses; None where it is
+            given.
     """
 
     def __init__(self, job: Job) -> None:

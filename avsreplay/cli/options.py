@@ -55,6 +55,23 @@ class Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
+class Seconds(click.ParamType[float]):
+    """A time in seconds."""
+
+    name = "float"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """A float; for a start mode the usage error names the option that takes it."""
+        modes = [p for p in (ctx.command.params if ctx else ()) if "--start-mode" in p.opts]
+        try:
+            return float(value)
+        except ValueError:
+            hint = f"; to choose how the estimate begins, use --start-mode {value}" if modes else ""
+            self.fail(f"'{value}' is no time in seconds{hint}", param, ctx)
+
+
 def added(*options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds ``options`` to a command in this order."""
 
@@ -82,7 +99,7 @@ truth_options = added(
 """Options for the true poses."""
 scan_options = added(
     source_setting("-t", "--topic", common=True),
-    source_setting("--start", "start_s", type=float, common=True),
+    source_setting("--start", "start_s", type=Seconds(), common=True),
     source_setting("--end", "end_s", type=float),
     source_setting("--duration", "duration_s", type=float, common=True),
     source_setting("-n", "--n-scans", type=int, common=True),
@@ -125,7 +142,10 @@ _CHOICES = {
 
 
 def read_options(flags: Mapping[str, Any]) -> SourceOptions:
-    """The given (not None) options as ``SourceOptions``.
+    """Return the options that were given (not None) as ``SourceOptions``.
+
+    Args:
+        flags: options by the names of their fields.
 
     Raises:
         UsageError: a value is not allowed.
@@ -284,8 +304,12 @@ PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield the items and show the progress on stderr; ``total`` 0 means that their number is
-    unknown.
+    """Yield items and show the progress on stderr.
+
+    Args:
+        items: the items.
+        total: their number, 0 if it is unknown.
+        what: what is being done, in words.
     """
     if not sys.stderr.isatty():
         yield from _with_lines(items, total, what)

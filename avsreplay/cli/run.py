@@ -76,7 +76,9 @@ class Tables(click.ParamType[tuple[str, ...]]):
 
 
 class Requirement(click.ParamType[str | float]):
-    """``pass``, ``check`` or ``any``, or ``capture=P`` with the least probability of a capture."""
+    """The value of ``--require``: ``pass``, ``check`` or ``any``, or ``capture=P`` with the least
+    probability of a capture.
+    """
 
     name = "pass|check|any|capture=P"
 
@@ -331,7 +333,7 @@ def _checked(run: Run) -> list[Advice]:
 
 
 class Outdated(Exception):
-    """What was recorded later changes rows of a log that has grown: it is replayed again."""
+    """A log that has grown gives other rows than before; it is replayed again."""
 
 
 @value_class(eq=True)
