@@ -61,6 +61,7 @@ class Kind(Protocol):
         name: in ``run.json``.
         words: in sentences, with the size as ``{size}``.
         unit, factor: of the size in words, and its value in SI units.
+        si: SI unit of the size.
         size: number of columns.
         most: largest 1 sigma of the size before the poses [SI].
         odds: log prior probability of one such event in a log.
@@ -71,6 +72,7 @@ class Kind(Protocol):
     words: str
     unit: str
     factor: float
+    si: str
     size: int
     most: float
     odds: float
@@ -94,6 +96,7 @@ class RateStep:
     """A sudden change of the rate, as by a collision or a thruster pulse."""
 
     name, words, unit, factor = "rate_step", "rate changed by {size}", "mrad/s", 1e-3
+    si = "rad/s"
     size, most, odds, anywhere = 3, np.inf, -3.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -107,6 +110,7 @@ class VelocityStep:
     """A sudden change of the velocity of the mass centre."""
 
     name, words, unit, factor = "velocity_step", "velocity changed by {size}", "mm/s", 1e-3
+    si = "m/s"
     size, most, odds, anywhere = 3, np.inf, -3.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -121,6 +125,7 @@ class Torque:
     """A constant torque in {C}, as of a leak, from its onset to the end."""
 
     name, words, unit, factor = "torque", "constant torque of {size}", "mrad/s2", 1e-3
+    si = "rad/s2"
     size, most, odds, anywhere = 3, np.inf, -3.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -136,6 +141,7 @@ class Force:
     """A constant force in {A}, from its onset to the end."""
 
     name, words, unit, factor = "force", "constant force of {size}", "mm/s2", 1e-3
+    si = "m/s2"
     size, most, odds, anywhere = 3, np.inf, -3.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -151,6 +157,7 @@ class Drag:
     """A torque against the rate, as of eddy currents or air, over the whole log."""
 
     name, words, unit, factor = "drag", "drag of {size}", "%/s", 1e-2
+    si = "1/s"
     size, most, odds, anywhere = 1, np.inf, -3.0, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -164,6 +171,7 @@ class PeriodicTorque:
     """A torque in {C} with one frequency over the whole log, as of sloshing or of a panel."""
 
     name, words, unit, factor = "periodic_torque", "periodic torque of {size}", "mrad/s2", 1e-3
+    si = "rad/s2"
     size, most, odds, anywhere = 6, np.inf, -3.0, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -177,6 +185,7 @@ class SensorOffset:
     """A jump of the measured range, from its onset to the end."""
 
     name, words, unit, factor = "sensor_offset", "measured range jumped by {size}", "mm", 1e-3
+    si = "m"
     size, most, odds, anywhere = 1, 0.2, -5.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:
@@ -190,6 +199,7 @@ class SensorDrift:
     """A linear drift of the measured range, from its onset to the end."""
 
     name, words, unit, factor = "sensor_drift", "measured range drifts by {size}", "mm/s", 1e-3
+    si = "m/s"
     size, most, odds, anywhere = 1, 2e-3, -5.0, True
 
     def columns(self, of: Intervals, late: Array) -> Array:

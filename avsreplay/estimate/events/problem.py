@@ -37,6 +37,8 @@ from avsreplay.geometry import Array
 _TURN_RAD = 0.4  # largest turn over which effects of accelerations are integrated by Simpson's rule
 _GROSS = 40.0  # chi-square of a pose at which it is more likely a wrong scan than one of the noise
 _MOST_FIRST = 2.0  # largest factor on the claimed noise until the motion is found
+_FIRST_ROUNDS = 8
+_SETTLED = 0.05  # change of the evidence from which on a fit has settled
 _WORST = 0.1  # part of the largest chi-square above which poses are found wrong in one round
 _KNOWN = 150.0  # variance of the motion over that of a pose up to which a wrong pose is tested
 _PRIOR_DOF = 6.0  # weight of the claimed variances, in measured numbers
@@ -148,19 +150,23 @@ class Problem:
             rounds: largest number of improvements.
         """
         charts, before = tuple(charts), -np.inf
-        for round_ in range(rounds + 1):
+        for round_ in range(rounds):
             flow = self._linearised(charts, events)
             model = self._model(flow, levels, events, wrong)
-            found = passed(model)
+            found = passed(_plain(model))
             evidence = found.log_likelihood + self._wrong_cost(wrong, levels)
-            fit = Fit(tuple(events), charts, levels, wrong, evidence, model, found, flow.intervals)
-            if round_ == rounds or abs(evidence - before) < 0.02:
+            if abs(evidence - before) < _SETTLED:
                 break
             before = evidence
+            most = _MOST_FIRST if round_ < _FIRST_ROUNDS < rounds else np.inf
             charts = self._moved(charts, found)
-            levels = self._improved(levels, model, found, flow, wrong, _MOST_FIRST if round_ < 8 and rounds > 8 else np.inf)
+            levels = self._improved(levels, model, found, flow, wrong, most)
             wrong = self._wrong(model, found, wrong)
-        return fit
+        flow = self._linearised(charts, events)
+        model = self._model(flow, levels, events, wrong)
+        found = passed(model)
+        evidence = found.log_likelihood + self._wrong_cost(wrong, levels)
+        return Fit(tuple(events), charts, levels, wrong, evidence, model, found, flow.intervals)
 
     def _wrong_cost(self, wrong: NDArray[np.bool_], levels: Levels) -> float:
         logs = np.log(np.abs(np.einsum("kii->ki", self.root[wrong]))).sum()
@@ -171,7 +177,7 @@ class Problem:
         """Which poses are wrong scans: their deletion gains more than a wrong scan costs."""
         out = wrong.copy()
         for k in np.flatnonzero(wrong).tolist():
-            H, C = model.H[k], found.covariance(k)
+            H, C = model.H[k][:, : found.before.shape[1]], found.covariance(k)
             e = model.z[k] - H @ found.before[k] - H @ found.before_P[k] @ found.score[k]
             S = H @ C @ H.T
             known = np.trace(np.linalg.solve(model.R[k], S)) < _KNOWN
@@ -210,8 +216,8 @@ class Problem:
         u, D, R = found.error[on], found.weight[on], model.R[on]
         factors = np.empty(2)
         for b, part in enumerate((slice(0, 3), slice(3, 6))):
-            squares = np.einsum("ki,kij,kj->", u[:, part], R[:, part, part], u[:, part])
-            traces = np.einsum("kij,kji->", D[:, part, part], R[:, part, part])
+            squares = np.sum(u[:, part, None] * (R[:, part, part] @ u[:, part, None]))
+            traces = np.sum(D[:, part, part] * R[:, part, part])
             prior = _PRIOR_DOF / levels.factors[b] ** 2
             factors[b] = levels.factors[b] * np.sqrt((squares + prior) / (traces + _PRIOR_DOF))
             factors[b] = min(factors[b], most)
@@ -225,7 +231,7 @@ class Problem:
         densities = []
         for value, G in ((levels.torque, flow.torque), (levels.force, flow.force)):
             b_ = np.einsum("kip,ki->kp", G, found.score[:, :20])
-            g = np.einsum("kip,kij,kjp->", G, found.information[:, :20, :20], G)
+            g = np.sum(G * (found.information[:, :20, :20] @ G))
             ratio = float(np.square(b_).sum()) / max(float(g), 1e-300)
             densities.append(max(value * np.sqrt(ratio), _LEAST_DENSITY))
         return Levels(factors, common, *densities)
@@ -305,6 +311,12 @@ class Problem:
             intervals=Intervals(self.times, turn, torque, force, drag),
         )
 
+    def quiet(self, fit: Fit, factor: float) -> LinearModel:
+        """The linear model of a fit with other random disturbances, smaller by a factor."""
+        less = replace(fit.levels, torque=factor * fit.levels.torque, force=factor * fit.levels.force)
+        flow = self._linearised(fit.charts, fit.events)
+        return self._model(flow, less, fit.events, fit.wrong)
+
     def prior_mean(self) -> Chart:
         """A sphere at rest at the first pose."""
         zero = np.zeros(3)
@@ -320,10 +332,6 @@ class Problem:
         Q = fit.linear.Q.copy()
         Q[event.knot] -= added
         return replace(fit.linear, Q=Q)
-
-    def with_charts(self, fit: Fit) -> Fit:
-        """The fit with its charts at the smoothed states."""
-        return replace(fit, charts=self._moved(fit.charts, fit.found))
 
 
 @value_class
@@ -352,6 +360,18 @@ class _Intervals:
     torque: Array
     drag: Array
     sine: Array
+
+
+def _plain(model: LinearModel) -> LinearModel:
+    """The model without the states of lasting events, where none acts."""
+    n = COLOUR.stop
+    if model.P0[n:, n:].any() or model.Q[:, n:, n:].any():
+        return model
+    F, b, Q, H = model.F[:, :n, :n], model.b[:, :n], model.Q[:, :n, :n], model.H[:, :, :n]
+    parts = [np.ascontiguousarray(a) for a in (F, b, Q, H)]
+    return LinearModel(
+        *parts[:3], model.z, parts[3], model.R, model.used, model.m0[:n].copy(), model.P0[:n, :n].copy()
+    )
 
 
 def _flow(charts: Array, lengths: Array, since: Array, hz: float, poses: Poses) -> _Intervals:

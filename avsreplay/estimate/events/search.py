@@ -12,12 +12,13 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses
 from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.events.kinds import KINDS, STATES, Kind
-from avsreplay.estimate.events.linear import passed, shock_gain, shock_size
+from avsreplay.estimate.events.linear import Passed, passed, shock_gain, shock_size
 from avsreplay.estimate.events.problem import Body, Event, Fit, Levels, Problem
 from avsreplay.geometry import Array
 
 _LATE = (0.1, 0.3, 0.5, 0.7, 0.9)  # instants of an onset that are compared, as parts of an interval
-_TRIED = 4  # kinds of which the best event is fitted
+_QUIET, _DISTURBED = 0.1, 1.0  # factor on disturbances, and loss of log evidence that shows them
+_TRIED = 3  # kinds of which the best event is fitted
 _LEAST_GAIN = -4.0  # log odds at fixed noise from which an event is fitted
 _MOST_EVENTS = 8
 _START_ROUNDS, _ROUNDS = 25, 8
@@ -92,8 +93,14 @@ def total(problem: Problem, fit: Fit) -> float:
     return fit.evidence + sum(odds(problem, e) for e in fit.events)
 
 
-def candidates(problem: Problem, fit: Fit, frequencies: Array) -> Iterator[tuple[float, Event]]:
-    """The most likely event of each kind, with its log odds at fixed noise."""
+def candidates(problem: Problem, fit: Fit, found: Passed) -> Iterator[tuple[float, Event]]:
+    """The most likely event of each kind, with its log odds at fixed noise.
+
+    Args:
+        problem: the poses.
+        fit: the set to which it is added.
+        found: passes of the linear model of this fit.
+    """
     for kind in KINDS:
         if kind.name == "periodic_torque":
             continue
@@ -103,8 +110,8 @@ def candidates(problem: Problem, fit: Fit, frequencies: Array) -> Iterator[tuple
             W = W[1:-1] if kind.anywhere else W[:1]
             first = 1 if kind.anywhere else 0
             part = slice(first, first + len(W))
-            b = np.einsum("kip,ki->kp", W, fit.found.score[part])
-            g = W.swapaxes(1, 2) @ fit.found.information[part] @ W
+            b = np.einsum("kip,ki->kp", W, found.score[part])
+            g = W.swapaxes(1, 2) @ found.information[part] @ W
             gain, size = shock_gain(b, g, None, kind.most)
             k = int(np.argmax(gain))
             event = Event(kind, k + first, late, float(size[k]))
@@ -120,12 +127,10 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
     sets = [fit]
     best = fit
     while len(best.events) < _MOST_EVENTS:
-        proposed = sorted(candidates(problem, best, np.zeros(0)), key=lambda c: -c[0])
-        tried = []
-        for value, event in proposed[:_TRIED]:
-            if value < _LEAST_GAIN:
-                continue
-            tried.append(_settled(problem, best, (*best.events, event)))
+        tried: list[Fit] = []
+        for value, event in proposals(problem, best):
+            if value >= _LEAST_GAIN and not any(_alike(event, f.events[-1]) for f in tried):
+                tried.append(_settled(problem, best, (*best.events, event)))
         sets += tried
         top = max(tried, key=lambda f: total(problem, f), default=None)
         if top is None or total(problem, top) <= total(problem, best):
@@ -133,6 +138,26 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
         best = pruned(problem, top, sets)
     sets.sort(key=lambda f: -total(problem, f))
     return sets
+
+
+def proposals(problem: Problem, fit: Fit) -> list[tuple[float, Event]]:
+    """Events to try, by falling odds.
+
+    They are found with the noise of the fit, in which random disturbances may stand for an event,
+    and with disturbances that are as small as the poses allow without one.
+    """
+    out = sorted(candidates(problem, fit, fit.found), key=lambda c: -c[0])[:_TRIED]
+    quiet = problem.quiet(fit, _QUIET)
+    found = passed(quiet)
+    if found.log_likelihood < fit.found.log_likelihood - _DISTURBED:
+        loss = found.log_likelihood - fit.found.log_likelihood
+        more = sorted(candidates(problem, fit, found), key=lambda c: -c[0])[:2]
+        out += [(value + max(loss, 0.0), event) for value, event in more]
+    return out
+
+
+def _alike(a: Event, b: Event) -> bool:
+    return a.kind is b.kind and abs(a.knot - b.knot) <= 1
 
 
 def _settled(problem: Problem, fit: Fit, events: Sequence[Event]) -> Fit:
@@ -163,10 +188,7 @@ def pruned(problem: Problem, fit: Fit, sets: list[Fit]) -> Fit:
 def _onsets(problem: Problem, fit: Fit, event: Event) -> tuple[Array, Array, Array, Array]:
     """Evidence (m,) of the event at other onsets near its own, with the rest of the set as it is:
     knots, parts, gains, and score with information of the size."""
-    rest = tuple(e for e in fit.events if e is not event)
-    model = problem.without(fit, event)
-    found = passed(model)
-    del rest
+    found = passed(problem.without(fit, event))
     count = len(problem.times)
     low, high = (max(event.knot - 6, 1), min(event.knot + 7, count)) if event.kind.anywhere else (0, 1)
     knots, lates, scores, infos = [], [], [], []
