@@ -368,6 +368,7 @@ def _replayed(
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
+            record["smoothed"] = _smoothed_record(run)
             keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
@@ -524,6 +525,12 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
         "capture": None if summary.assessment is None else summary.assessment.record(),
         "measured_1s": None if run.flight.noise is None else list(run.flight.noise),
     }
+
+
+def _smoothed_record(run: Run) -> dict[str, Any] | None:
+    """The events of the whole log; None where too few poses are healthy."""
+    motion = run.smoothed()
+    return None if motion is None else motion.smoothed.record()
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

@@ -66,6 +66,7 @@ class Kind(Protocol):
         most: largest 1 sigma of the size before the poses [SI].
         odds: log prior probability of one such event in a log.
         anywhere: its onset is any instant; else it acts from the first pose on.
+        periodic: it has a frequency.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Kind(Protocol):
     most: float
     odds: float
     anywhere: bool
+    periodic: bool
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """(k, STATES, size) shock of the state at each knot by an event of unit size.
@@ -97,7 +99,7 @@ class RateStep:
 
     name, words, unit, factor = "rate_step", "rate changed by {size}", "mrad/s", 1e-3
     si = "rad/s"
-    size, most, odds, anywhere = 3, np.inf, -3.0, True
+    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """Effect of a change of the rate."""
@@ -111,7 +113,7 @@ class VelocityStep:
 
     name, words, unit, factor = "velocity_step", "velocity changed by {size}", "mm/s", 1e-3
     si = "m/s"
-    size, most, odds, anywhere = 3, np.inf, -3.0, True
+    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """Effect of a change of the velocity."""
@@ -126,7 +128,7 @@ class Torque:
 
     name, words, unit, factor = "torque", "constant torque of {size}", "mrad/s2", 1e-3
     si = "rad/s2"
-    size, most, odds, anywhere = 3, np.inf, -3.0, True
+    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The torque, and its effect since the onset within the interval."""
@@ -142,7 +144,7 @@ class Force:
 
     name, words, unit, factor = "force", "constant force of {size}", "mm/s2", 1e-3
     si = "m/s2"
-    size, most, odds, anywhere = 3, np.inf, -3.0, True
+    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The acceleration, and its effect since the onset within the interval."""
@@ -158,9 +160,9 @@ class Drag:
 
     name, words, unit, factor = "drag", "drag of {size}", "%/s", 1e-2
     si = "1/s"
-    size, most, odds, anywhere = 1, np.inf, -3.0, False
+    size, most, odds, anywhere, periodic = 1, np.inf, -3.0, False, False
 
-    def columns(self, of: Intervals, late: Array) -> Array:
+    def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The coefficient."""
         out = _zeros(of, 1)
         out[:, DRAG] = 1.0
@@ -172,9 +174,9 @@ class PeriodicTorque:
 
     name, words, unit, factor = "periodic_torque", "periodic torque of {size}", "mrad/s2", 1e-3
     si = "rad/s2"
-    size, most, odds, anywhere = 6, np.inf, -3.0, False
+    size, most, odds, anywhere, periodic = 6, np.inf, -3.0, False, True
 
-    def columns(self, of: Intervals, late: Array) -> Array:
+    def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The amplitudes of sine and cosine."""
         out = _zeros(of, 6)
         out[:, SINE] = np.eye(6)
@@ -186,9 +188,9 @@ class SensorOffset:
 
     name, words, unit, factor = "sensor_offset", "measured range jumped by {size}", "mm", 1e-3
     si = "m"
-    size, most, odds, anywhere = 1, 0.2, -5.0, True
+    size, most, odds, anywhere, periodic = 1, 0.2, -5.0, True, False
 
-    def columns(self, of: Intervals, late: Array) -> Array:
+    def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The offset."""
         out = _zeros(of, 1)
         out[:, OFFSET] = 1.0
@@ -200,7 +202,7 @@ class SensorDrift:
 
     name, words, unit, factor = "sensor_drift", "measured range drifts by {size}", "mm/s", 1e-3
     si = "m/s"
-    size, most, odds, anywhere = 1, 2e-3, -5.0, True
+    size, most, odds, anywhere, periodic = 1, 2e-3, -5.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The drift, and the offset since the onset within the interval."""

@@ -69,7 +69,7 @@ class Passed:
         """(n, n) of the state at a knot, given all measurements."""
         P = self.before_P[k]
         out: Array = P - P @ self.information[k] @ P
-        return 0.5 * (out + out.T)
+        return np.asarray(0.5 * (out + out.T))
 
 
 def passed(model: LinearModel) -> Passed:
@@ -92,7 +92,9 @@ def shock_size(score: Array, information: Array, one_sigma: Array) -> tuple[Arra
     return (covariance @ score[..., None])[..., 0], covariance
 
 
-def shock_gain(score: Array, information: Array, one_sigma: Array | None, most: float = np.inf) -> tuple[Array, Array]:
+def shock_gain(
+    score: Array, information: Array, one_sigma: Array | None, most: float = np.inf
+) -> tuple[Array, Array]:
     """Log evidence (...) that a shock gains, and the 1 sigma (...) of its size before the poses.
 
     Args:
@@ -110,4 +112,4 @@ def shock_gain(score: Array, information: Array, one_sigma: Array | None, most: 
         one_sigma = np.minimum(root, most) + 1e-12
     size, covariance = shock_size(score, information, one_sigma)
     scaled = -np.linalg.slogdet(covariance)[1] + 2.0 * p * np.log(one_sigma)
-    return 0.5 * (np.sum(score * size, axis=-1) - scaled), one_sigma
+    return np.asarray(0.5 * (np.sum(score * size, axis=-1) - scaled)), np.asarray(one_sigma)

@@ -42,6 +42,7 @@ _SETTLED = 0.05  # change of the evidence from which on a fit has settled
 _WORST = 0.1  # part of the largest chi-square above which poses are found wrong in one round
 _KNOWN = 150.0  # variance of the motion over that of a pose up to which a wrong pose is tested
 _PRIOR_DOF = 6.0  # weight of the claimed variances, in measured numbers
+_COMMON_DOF = 3.0  # the same of the claimed common errors
 _LEAST_DENSITY = 1e-9  # of random disturbances [rad/s^1.5, m/s^1.5]: without effect over a log
 _LEAST_COMMON, _MOST_COMMON = 1e-3, 1e3  # variance of common errors over that of the others
 _LARGEST_RAD, _LARGEST_LOG = 0.5, 1.0  # largest step of attitude and of the logarithm of inertia
@@ -130,6 +131,8 @@ class Problem:
         self.root = np.linalg.cholesky(poses.C)
         counts = np.ones(len(poses)) if poses.counts is None else poses.counts
         self.single = self.root * np.sqrt(counts)[:, None, None]
+        share = 0.0 if poses.shares is None else float(np.mean(poses.shares))
+        self.claimed_common = max(share / max(1.0 - share, _LEAST_COMMON), _LEAST_COMMON)
         self.R_c = geometry.matrix(poses.q)
 
     def fit(
@@ -173,7 +176,9 @@ class Problem:
         factors = 3.0 * int(wrong.sum()) * float(np.log(levels.factors).sum())
         return -float(logs) - factors - 0.5 * _GROSS * int(wrong.sum())
 
-    def _wrong(self, model: LinearModel, found: Passed, wrong: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _wrong(
+        self, model: LinearModel, found: Passed, wrong: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
         """Which poses are wrong scans: their deletion gains more than a wrong scan costs."""
         out = wrong.copy()
         for k in np.flatnonzero(wrong).tolist():
@@ -224,9 +229,10 @@ class Problem:
         common = np.empty(2)
         for b, part in enumerate((slice(20, 23), slice(23, 26))):
             size = np.where(np.arange(len(flow.keep)) > 0, 1.0 - flow.keep**2, 1.0)
-            squares = float(size @ np.square(found.score[:, part]).sum(axis=1))
-            traces = float(size @ np.einsum("kii->k", found.information[:, part, part]))
-            ratio = squares / max(traces, 1e-300)
+            squares = np.float64(size @ np.square(found.score[:, part]).sum(axis=1))
+            traces = np.float64(size @ np.einsum("kii->k", found.information[:, part, part]))
+            claimed = _COMMON_DOF * self.claimed_common / levels.common[b]
+            ratio = (squares + claimed) / (traces + _COMMON_DOF)
             common[b] = np.clip(levels.common[b] * ratio, _LEAST_COMMON, _MOST_COMMON)
         densities = []
         for value, G in ((levels.torque, flow.torque), (levels.force, flow.force)):
@@ -269,8 +275,10 @@ class Problem:
         """(k, STATES, size) shocks of a kind at each knot, ``late`` in the interval before."""
         return kind.columns(intervals, np.full(len(intervals.times_s), late))
 
-    def _linearised(self, charts: tuple[Chart, ...], events: Sequence[Event]) -> _Flow:
-        hz = next((e.hz for e in events if e.hz), 0.0)
+    def _linearised(
+        self, charts: tuple[Chart, ...], events: Sequence[Event], hz: float = 0.0
+    ) -> _Flow:
+        hz = hz or next((e.hz for e in events if e.hz), 0.0)
         count, lengths = len(charts), np.diff(self.times)
         flat = np.array([c.flat for c in charts])
         flow = _flow(flat, lengths, self.times - self.times[0], hz, self.poses)
@@ -311,9 +319,20 @@ class Problem:
             intervals=Intervals(self.times, turn, torque, force, drag),
         )
 
+    def fit_without(self, fit: Fit, event: Event) -> Fit:
+        """The same charts and levels, without one of the events."""
+        return replace(fit, events=tuple(e for e in fit.events if e is not event))
+
+    def with_frequency(self, fit: Fit, hz: float) -> LinearModel:
+        """The linear model of a fit in which a periodic torque of this frequency may act."""
+        flow = self._linearised(fit.charts, fit.events, hz)
+        return self._model(flow, fit.levels, fit.events, fit.wrong)
+
     def quiet(self, fit: Fit, factor: float) -> LinearModel:
         """The linear model of a fit with other random disturbances, smaller by a factor."""
-        less = replace(fit.levels, torque=factor * fit.levels.torque, force=factor * fit.levels.force)
+        less = replace(
+            fit.levels, torque=factor * fit.levels.torque, force=factor * fit.levels.force
+        )
         flow = self._linearised(fit.charts, fit.events)
         return self._model(flow, less, fit.events, fit.wrong)
 
@@ -337,7 +356,8 @@ class Problem:
 @value_class
 class _Flow:
     """The linearised motion of all knots; ``torque`` and ``force`` are effects of impulses of unit
-    density."""
+    density.
+    """
 
     F: Array
     b: Array
@@ -368,10 +388,9 @@ def _plain(model: LinearModel) -> LinearModel:
     if model.P0[n:, n:].any() or model.Q[:, n:, n:].any():
         return model
     F, b, Q, H = model.F[:, :n, :n], model.b[:, :n], model.Q[:, :n, :n], model.H[:, :, :n]
-    parts = [np.ascontiguousarray(a) for a in (F, b, Q, H)]
-    return LinearModel(
-        *parts[:3], model.z, parts[3], model.R, model.used, model.m0[:n].copy(), model.P0[:n, :n].copy()
-    )
+    F, b, Q, H = (np.ascontiguousarray(a) for a in (F, b, Q, H))
+    m0, P0 = model.m0[:n].copy(), model.P0[:n, :n].copy()
+    return LinearModel(F, b, Q, model.z, H, model.R, model.used, m0, P0)
 
 
 def _flow(charts: Array, lengths: Array, since: Array, hz: float, poses: Poses) -> _Intervals:
@@ -402,7 +421,9 @@ def _flow(charts: Array, lengths: Array, since: Array, hz: float, poses: Poses) 
             ]
         )
     nodes, F = _motion.chains(np.ascontiguousarray(charts[:-1]), steps, counts, paths)
-    out = [np.empty((n, *shape)) for shape in ((20, 20), (20,), (3, 20, 3), (20, 3), (20, 1), (20, 6))]
+    out = [
+        np.empty((n, *shape)) for shape in ((20, 20), (20,), (3, 20, 3), (20, 3), (20, 1), (20, 6))
+    ]
     for count in np.unique(counts).tolist():
         which = np.flatnonzero(counts == count)
         at = (ends - counts)[which][:, None] + np.arange(count)
@@ -465,6 +486,3 @@ def _velocity_middle(times: Array) -> Array:
     half = 0.5 * np.diff(times, prepend=times[0])
     out[:, VELOCITY], out[:, POSITION] = np.eye(3), half[:, None, None] * np.eye(3)
     return out
-
-
-

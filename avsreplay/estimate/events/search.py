@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -11,15 +12,19 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses
 from avsreplay.estimate.chart import Chart
-from avsreplay.estimate.events.kinds import KINDS, STATES, Kind
+from avsreplay.estimate.events.kinds import KINDS, Kind, PeriodicTorque
 from avsreplay.estimate.events.linear import Passed, passed, shock_gain, shock_size
-from avsreplay.estimate.events.problem import Body, Event, Fit, Levels, Problem
+from avsreplay.estimate.events.problem import Event, Fit, Levels, Problem
 from avsreplay.geometry import Array
 
 _LATE = (0.1, 0.3, 0.5, 0.7, 0.9)  # instants of an onset that are compared, as parts of an interval
 _QUIET, _DISTURBED = 0.1, 1.0  # factor on disturbances, and loss of log evidence that shows them
 _TRIED = 3  # kinds of which the best event is fitted
 _LEAST_GAIN = -4.0  # log odds at fixed noise from which an event is fitted
+_FIRST_CYCLES, _STEP_CYCLES = 0.75, 0.5  # of the frequencies that are compared, in a log
+_MOST_FREQUENCIES = 40
+_FINER = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # cycles in a log by which a frequency is improved
+_INSTANTS = 10  # over which the odds of a kind are divided that acts over the whole log
 _MOST_EVENTS = 8
 _START_ROUNDS, _ROUNDS = 25, 8
 _START_DENSITY = 0.1  # random torque of the start, by which the rate changes within a radian
@@ -44,30 +49,22 @@ class Found:
     gain: float
 
 
-def first_fit(problem: Problem, inertia: Chart | None = None) -> Fit:
+def first_fit(problem: Problem) -> Fit:
     """The fit without events. It begins at the measured poses with large random disturbances,
     which the noise levels then reduce.
-
-    Args:
-        problem: the poses.
-        inertia: a chart whose inertia and arm are used to begin with.
     """
     poses = problem.poses
     rates, speeds = _rates(poses)
-    M = np.zeros((3, 3)) if inertia is None else inertia.M
-    arm = np.zeros(3) if inertia is None else inertia.arm_c
-    axes = np.linalg.eigh(M)[1]
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    sphere, arm = np.zeros((3, 3)), np.zeros(3)
     charts = [
-        Chart.of(q, w, t, u, M, arm, axes)
+        Chart.of(q, w, t, u, sphere, arm, np.eye(3))
         for q, w, t, u in zip(poses.q, rates, poses.t, speeds, strict=True)
     ]
     rate = max(float(np.median(np.linalg.norm(rates, axis=1))), 1e-3)
     density = _START_DENSITY * rate**1.5
     bend = np.diff(np.diff(poses.t, axis=0) / np.diff(poses.times_s)[:, None], axis=0)
     speed = max(float(np.quantile(np.linalg.norm(bend, axis=1), 0.2)), 1e-5)
-    shares = 0.0 if poses.shares is None else float(np.mean(poses.shares))
-    common = np.full(2, max(shares / max(1.0 - shares, 0.1), 0.01))
+    common = np.full(2, problem.claimed_common)
     levels = Levels(np.ones(2), common, density, speed)
     return problem.fit(charts, levels, (), np.zeros(len(poses), bool), _START_ROUNDS)
 
@@ -85,7 +82,8 @@ def _rates(poses: Poses) -> tuple[Array, Array]:
 
 def odds(problem: Problem, event: Event) -> float:
     """Log prior odds of an event: those of its kind, divided over the instants."""
-    return event.kind.odds - (np.log(len(problem.times)) if event.kind.anywhere else np.log(10.0))
+    instants = len(problem.times) if event.kind.anywhere else _INSTANTS
+    return event.kind.odds - math.log(instants)
 
 
 def total(problem: Problem, fit: Fit) -> float:
@@ -102,7 +100,7 @@ def candidates(problem: Problem, fit: Fit, found: Passed) -> Iterator[tuple[floa
         found: passes of the linear model of this fit.
     """
     for kind in KINDS:
-        if kind.name == "periodic_torque":
+        if kind.periodic:
             continue
         best: tuple[float, Event] | None = None
         for late in _LATE if kind.anywhere else (0.5,):
@@ -153,7 +151,30 @@ def proposals(problem: Problem, fit: Fit) -> list[tuple[float, Event]]:
         loss = found.log_likelihood - fit.found.log_likelihood
         more = sorted(candidates(problem, fit, found), key=lambda c: -c[0])[:2]
         out += [(value + max(loss, 0.0), event) for value, event in more]
-    return out
+        if not any(e.hz for e in fit.events):
+            out += periodic(problem, fit)
+    return sorted(out, key=lambda c: -c[0])
+
+
+def periodic(problem: Problem, fit: Fit) -> list[tuple[float, Event]]:
+    """The most likely periodic torque, with its log odds at fixed noise."""
+    span = float(problem.times[-1] - problem.times[0])
+    least = 4.0 * float(np.median(np.diff(problem.times)))
+    grid = _FIRST_CYCLES + _STEP_CYCLES * np.arange(_MOST_FREQUENCIES)
+    kind = PeriodicTorque()
+    found = [
+        _at_frequency(problem, fit, kind, hz) for hz in (grid / span).tolist() if hz * least < 1.0
+    ]
+    return [max(found, key=lambda c: c[0])] if found else []
+
+
+def _at_frequency(problem: Problem, fit: Fit, kind: Kind, hz: float) -> tuple[float, Event]:
+    """A periodic torque of a frequency, with its log odds at fixed noise."""
+    found = passed(problem.with_frequency(fit, hz))
+    W = problem.columns(fit.intervals, kind, 0.5)[0]
+    gain, size = shock_gain(W.T @ found.score[0], W.T @ found.information[0] @ W, None, kind.most)
+    event = Event(kind, 0, 0.5, float(size), hz)
+    return float(gain) + odds(problem, event), event
 
 
 def _alike(a: Event, b: Event) -> bool:
@@ -162,11 +183,15 @@ def _alike(a: Event, b: Event) -> bool:
 
 def _settled(problem: Problem, fit: Fit, events: Sequence[Event]) -> Fit:
     """The fit of another set, begun from this one, with the onsets and scales of its events
-    found anew."""
+    found anew.
+    """
     out = problem.fit(fit.charts, fit.levels, events, fit.wrong, _ROUNDS)
     for _ in range(2):
         moved = tuple(relocated(problem, out, e) for e in out.events)
-        if all(a.knot == b.knot and a.late == b.late for a, b in zip(moved, out.events, strict=True)):
+        if all(
+            a.knot == b.knot and a.late == b.late and a.hz == b.hz
+            for a, b in zip(moved, out.events, strict=True)
+        ):
             break
         out = problem.fit(out.charts, out.levels, moved, out.wrong, _ROUNDS)
     return out
@@ -187,10 +212,13 @@ def pruned(problem: Problem, fit: Fit, sets: list[Fit]) -> Fit:
 
 def _onsets(problem: Problem, fit: Fit, event: Event) -> tuple[Array, Array, Array, Array]:
     """Evidence (m,) of the event at other onsets near its own, with the rest of the set as it is:
-    knots, parts, gains, and score with information of the size."""
+    knots, parts, gains, and score with information of the size.
+    """
     found = passed(problem.without(fit, event))
     count = len(problem.times)
-    low, high = (max(event.knot - 6, 1), min(event.knot + 7, count)) if event.kind.anywhere else (0, 1)
+    low, high = (
+        (max(event.knot - 6, 1), min(event.knot + 7, count)) if event.kind.anywhere else (0, 1)
+    )
     knots, lates, scores, infos = [], [], [], []
     for late in _LATE if event.kind.anywhere else (0.5,):
         W = problem.columns(fit.intervals, event.kind, late)[low:high]
@@ -200,11 +228,23 @@ def _onsets(problem: Problem, fit: Fit, event: Event) -> tuple[Array, Array, Arr
         lates.append(np.full(high - low, late))
         scores.append(b)
         infos.append(g)
-    return (np.concatenate(knots), np.concatenate(lates), np.concatenate(scores), np.concatenate(infos))
+    return (
+        np.concatenate(knots),
+        np.concatenate(lates),
+        np.concatenate(scores),
+        np.concatenate(infos),
+    )
 
 
 def relocated(problem: Problem, fit: Fit, event: Event) -> Event:
-    """The event at its most likely onset, with the scale of its size there."""
+    """The event at its most likely onset or frequency, with the scale of its size there."""
+    if event.hz:
+        rest = problem.fit_without(fit, event)
+        span = float(problem.times[-1] - problem.times[0])
+        tried = [event.hz + d / span for d in (0.0, *_FINER)]
+        return max(
+            (_at_frequency(problem, rest, event.kind, hz) for hz in tried), key=lambda c: c[0]
+        )[1]
     knots, lates, b, g = _onsets(problem, fit, event)
     gain, size = shock_gain(b, g, None, event.kind.most)
     k = int(np.argmax(gain))
@@ -232,9 +272,8 @@ def described(problem: Problem, fit: Fit, event: Event) -> Found:
         size=size,
         covariance=covariance,
         onset_s=onset if event.kind.anywhere else 0.0,
-        onset_1s_s=float(np.sqrt(p @ np.square(at - onset) + step**2)) if event.kind.anywhere else 0.0,
+        onset_1s_s=float(np.sqrt(p @ np.square(at - onset) + step**2))
+        if event.kind.anywhere
+        else 0.0,
         gain=float(gain[own].max()) + odds(problem, event),
     )
-
-
-__all__ = ["Body", "Found", "STATES", "Kind", "candidates", "described", "first_fit", "search", "total"]

@@ -14,12 +14,12 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import Poses
 from avsreplay.estimate.chart import Chart, separated, to_errors, to_state
-from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.dynamics import propagate_state, translation
 from avsreplay.estimate.events.problem import Body, Fit, Problem
 from avsreplay.estimate.events.search import Found, described, first_fit, search, total
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.relative_orbit import RelativeOrbit
+from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 from avsreplay.spool import Spool, SpoolFile
@@ -30,7 +30,7 @@ _NEAR_RAD = 1.0  # turn from a knot within which poses are averaged
 _GROSS = 40.0  # chi-square of a pose against the motion above which it is left out of an average
 _REFINED = 4  # rounds of the last fit
 _LOWER = np.tril_indices(6)
-_RECORD = 1 + 7 + 21 + 1  # time, pose, covariance, share
+_RECORD = 1 + 7 + 21 + 1  # count, pose, covariance, share
 
 
 class PoseStore:
@@ -43,21 +43,23 @@ class PoseStore:
             orbit: of the target.
         """
         file = SpoolFile()
-        self._orbit = orbit
+        self._orbit, self._last_ns = orbit, 0
         self._t_ns, self._values = Spool("i8", (), file), Spool("f8", (_RECORD,), file)
 
     def __len__(self) -> int:
         return len(self._t_ns)
 
     def append(self, fix: PoseFix) -> None:
-        """Append a pose, later than those before.
+        """Append a pose; one that is not later than those before is left out.
 
         Args:
             fix: the pose.
         """
-        self._orbit = fix.orbit
+        if len(self) and fix.t_ns <= self._last_ns:
+            return
+        self._orbit, self._last_ns = fix.orbit, fix.t_ns
         self._t_ns.append(fix.t_ns)
-        values = (0.0, *fix.T_ac.q, *fix.T_ac.t, *fix.C[_LOWER], fix.correlated_share)
+        values = (float(fix.count), *fix.T_ac.q, *fix.T_ac.t, *fix.C[_LOWER], fix.correlated_share)
         self._values.append(values)
 
     def arrays(self) -> tuple[NDArray[np.int64], Array]:
@@ -72,6 +74,7 @@ class PoseStore:
             values: of the poses.
         """
         self._t_ns.extend(t_ns)
+        self._last_ns = int(t_ns[-1]) if len(t_ns) else self._last_ns
         self._values.extend(values)
 
     def fixes(self) -> list[PoseFix]:
@@ -80,7 +83,7 @@ class PoseStore:
         C = np.zeros((len(t_ns), 6, 6))
         C[:, _LOWER[0], _LOWER[1]] = C[:, _LOWER[1], _LOWER[0]] = values[:, 8:29]
         return [
-            PoseFix(t, Pose(v[1:5], v[5:8]), c, 0, float(v[29]), orbit=self._orbit)
+            PoseFix(t, Pose(v[1:5], v[5:8]), c, 0, float(v[29]), int(v[0]), self._orbit)
             for t, v, c in zip(t_ns.tolist(), values, C, strict=True)
         ]
 
@@ -97,6 +100,7 @@ class Smoothed:
         rivals: log odds of the next sets of events against this one, and their events' kinds.
         wrong_ns: instants of the poses among the knots that are wrong scans [ns].
         torque, force: root densities of the random disturbances [rad/s^1.5, m/s^1.5].
+        orbit: of the target; None for free motion.
     """
 
     epoch_ns: int
@@ -107,6 +111,7 @@ class Smoothed:
     wrong_ns: tuple[int, ...]
     torque: float
     force: float
+    orbit: RelativeOrbit | None = None
 
     @property
     def end_ns(self) -> int:
@@ -128,10 +133,13 @@ class Smoothed:
         t = (t_ns - self.epoch_ns) * 1e-9
         after = int(np.searchsorted(self.times_s, t, side="left"))
         before = max(after - 1, 0)
-        onsets = [e.onset_s for e in self.events if self.times_s[before] < e.onset_s < self.times_s[after]]
+        onsets = [
+            e.onset_s for e in self.events if self.times_s[before] < e.onset_s < self.times_s[after]
+        ]
         middle = onsets[0] if onsets else 0.5 * (self.times_s[before] + self.times_s[after])
         nearest = self.beliefs[after if t > middle or after == before else before]
-        return propagate_state(nearest.x, (t_ns - nearest.t_ns) * 1e-9)[0]
+        arc = None if self.orbit is None else self.orbit.at(nearest.t_ns)
+        return propagate_state(nearest.x, (t_ns - nearest.t_ns) * 1e-9, arc)[0]
 
     def record(self) -> dict[str, Any]:
         """Return the events as JSON values for ``run.json``."""
@@ -140,19 +148,16 @@ class Smoothed:
             "force_density_mps15": self.force,
             "wrong_poses": len(self.wrong_ns),
             "events": [_event_record(found) for found in self.events],
-            "rivals": [
-                {"log_odds": value, "events": list(names)} for value, names in self.rivals
-            ],
+            "rivals": [{"log_odds": value, "events": list(names)} for value, names in self.rivals],
         }
 
 
-def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams, start: Belief | None = None) -> Smoothed:
+def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams) -> Smoothed:
     """The best motion of all poses of a log, in time order.
 
     Args:
         fixes: the poses.
         params: of the estimator, auto values filled in.
-        start: a belief from whose inertia and arm the fit begins.
 
     Raises:
         UsageError: fewer than four poses.
@@ -162,7 +167,9 @@ def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams, start: Belief | 
         raise UsageError(f"only {len(fixes)} healthy poses", where="--reference fit", hint=hint)
     poses = poses_of(tuple(fixes))
     body = Body(weak_prior(poses, params).one_sigma, params.correlated_rad)
-    some = Problem(poses.some(_spread(len(poses), _MOST_SEARCHED)), body)
+    some = Problem(
+        poses.some(np.isin(np.arange(len(poses)), _spread(len(poses), _MOST_SEARCHED))), body
+    )
     sets = search(some, first_fit(some))
     problem, fit = some, sets[0]
     if len(poses) > _MOST_SEARCHED:
@@ -174,7 +181,10 @@ def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams, start: Belief | 
     return Smoothed(
         epoch_ns=fixes[0].t_ns,
         times_s=problem.times,
-        beliefs=tuple(_belief(t, c, fit.found.covariance(k)) for k, (t, c) in enumerate(zip(t_ns, charts, strict=True))),
+        beliefs=tuple(
+            _belief(t, c, fit.found.covariance(k))
+            for k, (t, c) in enumerate(zip(t_ns, charts, strict=True))
+        ),
         events=tuple(events),
         rivals=tuple(
             (total(some, other) - best, tuple(e.kind.name for e in other.events))
@@ -183,6 +193,7 @@ def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams, start: Belief | 
         wrong_ns=tuple(t for t, wrong in zip(t_ns, fit.wrong.tolist(), strict=True) if wrong),
         torque=fit.levels.torque,
         force=fit.levels.force,
+        orbit=fixes[0].orbit,
     )
 
 
@@ -193,7 +204,7 @@ def _belief(t_ns: int, chart: Chart, P: Array) -> Belief:
 
 
 def _spread(count: int, most: int) -> NDArray[np.int64]:
-    """Places of at most ``most`` of ``count`` poses, equally spread, with the first and the last."""
+    """Places of at most ``most`` of ``count`` poses: equally spread, with both ends."""
     return np.unique(np.round(np.linspace(0, count - 1, min(count, most))).astype(np.int64))
 
 
@@ -203,7 +214,7 @@ def _denser(poses: Poses, some: Problem, fit: Fit) -> tuple[Problem, Fit]:
     charts = [c.moved(y[:20]) for c, y in zip(fit.charts, fit.found.mean, strict=True)]
     nearest = np.searchsorted(some.times, poses.times_s[places], side="right") - 1
     at = [
-        _moved_on(charts[k], poses.times_s[i] - some.times[k])
+        _moved_on(charts[k], some.times[k], poses.times_s[i], poses.arc)
         for k, i in zip(nearest.tolist(), places.tolist(), strict=True)
     ]
     points = _averaged(poses, places, at)
@@ -220,14 +231,14 @@ def _denser(poses: Poses, some: Problem, fit: Fit) -> tuple[Problem, Fit]:
     return problem, problem.fit(at, fit.levels, events, wrong, _REFINED)
 
 
-def _moved_on(chart: Chart, h: float) -> Chart:
-    path = np.eye(6)
-    path[:3, 3:] = h * np.eye(3)
-    return Chart(_motion.transition(chart.flat, h, path)[0])
+def _moved_on(chart: Chart, begin: float, end: float, arc: OrbitArc | None) -> Chart:
+    """The chart of the undisturbed motion at another time [s]."""
+    path = translation(end - begin, None if arc is None else arc.shifted(begin))
+    return Chart(_motion.transition(chart.flat, end - begin, path)[0])
 
 
 def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) -> Poses:
-    """A pose at each place: the mean of those nearest to it, about the motion from a chart there."""
+    """A pose at each place: the mean of those nearest to it, about the motion from its chart."""
     middle = 0.5 * (poses.times_s[places[1:]] + poses.times_s[places[:-1]])
     bounds = np.concatenate([[0], np.searchsorted(poses.times_s, middle), [len(poses)]])
     q, t, C, counts = [], [], [], []
@@ -235,8 +246,8 @@ def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) 
         part = np.arange(bounds[k], bounds[k + 1])
         since = poses.times_s[part] - poses.times_s[places[k]]
         part = part[np.abs(since) * float(np.linalg.norm(chart.w_c)) <= _NEAR_RAD]
-        there = [_moved_on(chart, h).flat for h in (poses.times_s[part] - poses.times_s[places[k]]).tolist()]
-        flat = np.array(there)
+        begin = poses.times_s[places[k]]
+        flat = np.array([_moved_on(chart, begin, t, poses.arc).flat for t in poses.times_s[part]])
         theta = geometry.log(geometry.multiply(geometry.conjugate(poses.q[part]), flat[:, :4]))
         back = geometry.matrix(poses.q[part]).swapaxes(1, 2)
         d = np.hstack([theta, (back @ (flat[:, 7:10] - poses.t[part])[:, :, None])[:, :, 0]])
