@@ -329,6 +329,9 @@ class Outdated(Exception):
     """What was recorded later changes rows of a log that has grown: it is replayed again."""
 
 
+_SAME_EVENT_S = 2.0  # between the time of a manoeuvre in the rows and by all poses
+
+
 @value_class(eq=True)
 class _Finished:
     """Result of a replay; ``record`` is the content of ``run.json``."""
@@ -368,7 +371,7 @@ def _replayed(
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
-            record["smoothed"] = _smoothed_record(run)
+            record["smoothed"] = _smoothed_record(run, summary)
             keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
@@ -527,10 +530,23 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     }
 
 
-def _smoothed_record(run: Run) -> dict[str, Any] | None:
-    """The events of the whole log; None where too few poses are healthy."""
+def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
+    """The events of the whole log, with the time at which each was first known from the scans so
+    far; None where too few poses are healthy.
+    """
     motion = run.smoothed()
-    return None if motion is None else motion.smoothed.record()
+    if motion is None:
+        return None
+    record = motion.smoothed.record(run.taken[0].t_ns)
+    for event in record["events"]:
+        away = 3.0 * event["onset_1s_s"] + _SAME_EVENT_S
+        near = (
+            change.reported_s
+            for change in summary.velocity_changes
+            if abs(change.t_s - event["onset_s"]) <= away
+        )
+        event["first_known_s"] = min(near, default=None)
+    return record
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

@@ -18,7 +18,7 @@ from avsreplay.estimate.events.problem import Event, Fit, Levels, Problem
 from avsreplay.geometry import Array
 
 _LATE = (0.1, 0.3, 0.5, 0.7, 0.9)  # instants of an onset that are compared, as parts of an interval
-_QUIET, _DISTURBED = 0.1, 1.0  # factor on disturbances, and loss of log evidence that shows them
+_QUIET, _DISTURBED = 0.1, 2.0  # factor on disturbances, and loss of log evidence that shows them
 _TRIED = 3  # kinds of which the best event is fitted
 _LEAST_GAIN = -4.0  # log odds at fixed noise from which an event is fitted
 _FIRST_CYCLES, _STEP_CYCLES = 0.75, 0.5  # of the frequencies that are compared, in a log

@@ -141,13 +141,14 @@ class Smoothed:
         arc = None if self.orbit is None else self.orbit.at(nearest.t_ns)
         return propagate_state(nearest.x, (t_ns - nearest.t_ns) * 1e-9, arc)[0]
 
-    def record(self) -> dict[str, Any]:
-        """Return the events as JSON values for ``run.json``."""
+    def record(self, first_ns: int) -> dict[str, Any]:
+        """Return the events as JSON values for ``run.json``, times from ``first_ns`` on."""
+        late_s = (self.epoch_ns - first_ns) * 1e-9
         return {
             "torque_density_radps15": self.torque,
             "force_density_mps15": self.force,
             "wrong_poses": len(self.wrong_ns),
-            "events": [_event_record(found) for found in self.events],
+            "events": [_event_record(found, late_s) for found in self.events],
             "rivals": [{"log_odds": value, "events": list(names)} for value, names in self.rivals],
         }
 
@@ -273,8 +274,9 @@ def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) 
     )
 
 
-def _event_record(found: Found) -> dict[str, Any]:
+def _event_record(found: Found, late_s: float) -> dict[str, Any]:
     kind = found.event.kind
+    found = replace(found, onset_s=found.onset_s + late_s)
     return {
         "kind": kind.name,
         "words": words(found),
