@@ -54,19 +54,20 @@ def __getattr__(name: str) -> Any:
 
 
 def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
-    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all",
-    n_scans=100)``.
+    """Replay a log and yield one row for each scan.
+
+    ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100): ...``
 
     Args:
-        source: log, bag or folder of scans.
-        *assignments: settings ``a.b=c`` as for ``--set``.
-        **options: how to read the log, see log.SourceOptions.
+        source: a log, a bag or a folder of scans.
+        *assignments: settings ``a.b=c`` as for the option ``--set``.
+        **options: how to read the log, as fields of ``log.SourceOptions``.
 
     Yields:
-        One row for every scan.
+        The row of each scan, in the order of the log.
 
     Raises:
-        AvsError: where the log, the model or a setting cannot be used; its ``str`` is one line.
+        AvsError: the log, the model or a setting cannot be used; its ``str`` is one line.
     """
     from pathlib import Path
 

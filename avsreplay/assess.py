@@ -50,7 +50,7 @@ from avsreplay.plan.flights import (
     flown_positions,
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import TargetGeometry
+from avsreplay.plan.limits import TargetGeometry, axis_blocked
 from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.plan.supervisor import RULES, Action
 from avsreplay.plan.uncertainty import Disturbance, draws, wilson
@@ -77,12 +77,12 @@ _QUANTITIES = ("position", "speed", "attitude")
 
 @value_class
 class Leg:
-    """What the robot flew after one scan.
+    """What the robot did after one scan.
 
     Attributes:
-        belief: after the scan.
-        segment: its flight from then on.
-        action, rule: decision of the supervisor.
+        belief: the belief after the scan.
+        segment: the flight of the robot from then on.
+        action, rule: the action of the supervisor and the rule that determined it.
     """
 
     belief: Belief
@@ -96,13 +96,14 @@ class FlightLog:
 
     Attributes:
         legs: one per scan from the first approach to the end of the flight.
-        state: guidance after the last scan of the flight; None before the first.
-        belief: after the last scan.
-        converged: whether it may be used for planning.
-        gammas: of all scans.
-        stamps: of all scans [ns].
-        failing_ns: since when no capture is planned; None where one is.
-        noises: (6,) variances of the last measured poses, metres and half angles.
+        state: the state of guidance after the last scan of the flight; None before the first
+            approach.
+        belief: the belief after the last scan.
+        converged: whether this belief may be used for planning.
+        gammas: gamma of every scan.
+        stamps: instant of every scan [ns].
+        failing_ns: instant since which no capture is planned [ns]; None where one is.
+        noises: (6,) variances of the last measured poses: positions [m2], half angles [rad2].
     """
 
     def __init__(self) -> None:
@@ -126,11 +127,11 @@ class FlightLog:
         """Take one scan.
 
         Args:
-            belief: after it.
-            guidance: after it; it does not change after the capture.
-            gamma: 1 for a healthy scan.
+            belief: the belief after the scan.
+            guidance: the state of guidance after the scan; it does not change after the capture.
+            gamma: 1 for a healthy scan, else 0.
             converged: whether the belief may be used for planning.
-            noise: (6, 6) noise of the measured pose; None where nothing was measured.
+            noise: (6, 6) noise covariance of the measured pose; None where nothing was measured.
         """
         self.gammas.append(gamma)
         self.stamps.append(belief.t_ns)
@@ -168,20 +169,22 @@ class FlightLog:
 
 @value_class
 class Setup:
-    """What is assessed.
+    """The inputs of an assessment.
 
     Attributes:
-        task: what is to be grasped.
-        estimator, guidance: those of the run.
+        task: the task of the gripper.
+        estimator, guidance: estimator and guidance of the run.
         target: geometry of the target about the grasp point, with its surface.
         solid: whether inside and outside of the surface are known.
-        extent_m: of the target.
-        since_ns: instant of the first scan.
-        thrust_noise_mps2: 1 sigma of the thrust error of each axis, as its mean over 1 s.
-        noise: 1 sigma of a measured pose [m, rad of half angle]; None: R0 of the settings.
+        extent_m: extent of the target [m].
+        since_ns: instant of the first scan [ns].
+        thrust_noise_mps2: standard deviation of the thrust error of each axis, as its mean over 1 s
+            [m/s2].
+        noise: standard deviations of a measured pose [m, rad of half angle]; None takes R0 of the
+            settings.
         flights: number of simulated flights where the log ends before the capture.
-        seed: of all draws.
-        advice: grasp points that could be used, in words.
+        seed: seed of all random draws.
+        advice: grasp points that could be used instead, in words.
     """
 
     task: Task
@@ -346,15 +349,16 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
     plan = state.plan if log.converged else None
     plan = free if plan is None and free.status is PlanStatus.INFEASIBLE else plan
     if plan is not None:
-        words = "proven" if plan.status is PlanStatus.INFEASIBLE else "found"
+        proven = plan.status is PlanStatus.INFEASIBLE
+        cause, change = _prevented(setup, belief, plan.lower_bound_s)
         return {
             **found,
             "limit": (
                 f"no capture within {params.horizon_s:g} s with {params.a_max_mps2:g} m/s2"
-                f" ({'proven impossible' if words == 'proven' else 'none found'})"
+                f" ({'proven impossible' if proven else 'none found'}{cause})"
             ),
             "known_s": setup.at_s(log.failing_ns or plan.t_ns),
-            "change": "more thrust or a longer horizon; 'avsreplay plan' names the settings",
+            "change": change,
         }
     after = _planned_s(setup, belief)
     worst, size, cause = _predicted(setup, belief, after)
@@ -371,6 +375,31 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
         "known_s": setup.at_s(belief.t_ns),
         "change": _change(cause),
     }
+
+
+def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
+    """Why no plan is found, as far as the shape of the target shows it, and what would change
+    it.
+    """
+    limits, forecast = setup.guidance.limits, partial(setup.estimator.forecast, belief)
+    scene = planner_input(setup.estimator, belief, setup.target, 1, True, forecast).scene
+    sigma = None
+    if scene.sigma is not None:
+        position, attitude = scene.sigma(np.array([max(after_s, 0.0)]))
+        sigma = float(position[0]), float(attitude[0])
+    blocked = axis_blocked(scene, limits, setup.extent_m, sigma)
+    if blocked is None:
+        return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
+    name, until_m, short_m = blocked
+    if name != "body":
+        cause = f"the {name} is violated by {short_m:.3g} m on the axis of the approach"
+        return f": {cause}", "another fixture or other limits"
+    length = limits.final_range_m or 0.0
+    cause = (
+        f"the corridor ends {length:.3g} m from the grasp point, where the body is"
+        f" {short_m:.3g} m nearer than the clearance"
+    )
+    return f": {cause}", f"limits.final_range_m={1.05 * until_m:.2g}, or a smaller clearance"
 
 
 def _continued(
@@ -423,14 +452,14 @@ def _why_not(setup: Setup, flight: Ended, end_s: float, hit: bool) -> str:
 def simulated(
     setup: Setup, log: FlightLog, state: GuidanceState | None, belief: Belief
 ) -> list[Ended]:
-    """Fly approaches from a belief on, with measured scans, thrust errors, delay and the blackouts
-    of the log, against targets that are drawn from the belief.
+    """Simulate approaches that begin at a belief, with measured scans, thrust errors, delay and the
+    blackouts of the log, against targets that are drawn from the belief.
 
     Args:
         setup: task, estimator, guidance and target.
         log: the flight so far, whose scans give interval and blackouts.
-        state: of guidance at the belief; None: the robot is at its start.
-        belief: from which the targets are drawn.
+        state: the state of guidance at the belief; None if the robot is at its start.
+        belief: the belief from which the targets are drawn.
     """
     rng = setup.rng(3)
     _, drawn = drawn_beliefs(belief, setup.flights, rng)
@@ -527,6 +556,8 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
     contact = setup.contact
     if contact is None:
         return None
+    if not log.legs:  # the robot has not left its start
+        return np.zeros(DRAWS, dtype=bool)
     z = setup.rng(4).standard_normal((DRAWS, 6))
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
     parts: list[Array] = []

@@ -1,5 +1,5 @@
-"""The assessment of a capture: whether the robot would have grasped the target, how surely, and if
-not, why.
+"""The assessment of a capture: whether the robot would have grasped the target, with which
+probability, and if not, why.
 
 It is computed once, after the last scan (``assess``), stored in ``run.json``, and printed in the
 same words wherever it appears.
@@ -19,7 +19,7 @@ LIKELY, POSSIBLE = 0.9, 0.5  # least probabilities of a capture that is called l
 
 
 class Chance(Enum):
-    """The answer in one word."""
+    """How likely a capture is, in one word."""
 
     LIKELY = "likely"
     POSSIBLE = "possible"
@@ -34,9 +34,9 @@ class InFact:
 
     Attributes:
         captured: whether the gripper closed within the tolerances and without contact.
-        errors: when it closed; None where it did not.
-        touched: whether it touched the body before; None where this was not checked.
-        text: in words.
+        errors: errors at the instant at which it closed; None where it did not close.
+        touched: whether the robot touched the body before; None where this was not checked.
+        text: the same in words.
     """
 
     captured: bool
@@ -146,7 +146,7 @@ class Assessment:
         return [(name, text) for name, text in out if text]
 
     def record(self) -> dict[str, Any]:
-        """Plain values for JSON; a number that is not known is None."""
+        """Return the assessment as plain values for JSON; a number that is not known is None."""
         own = {
             name: getattr(self, name)
             for name in ("probability", "basis", "at_s", "contact", "limit", "known_s", "change")
@@ -209,11 +209,7 @@ class Assessment:
 
 
 def chance_of(probability: float) -> Chance:
-    """Return a probability in one word.
-
-    Args:
-        probability: of a capture.
-    """
+    """Return how likely a capture is, in one word, from its probability."""
     if probability >= LIKELY:
         return Chance.LIKELY
     return Chance.POSSIBLE if probability >= POSSIBLE else Chance.UNLIKELY

@@ -27,14 +27,14 @@ from avsreplay.toml_document import Document, build, load, override, toml_value
 
 
 class Guess(Enum):
-    """Where the initial guess of the registration comes from."""
+    """The source of the initial guess of the registration."""
 
     PREDICTED = "predicted"  # closed loop: the filter's prior
     LAST = "last"  # open loop: the last healthy pose
 
 
 class Against(Enum):
-    """What errors are computed against."""
+    """The motion against which errors are computed."""
 
     TRUTH = "truth"
     FIT = "fit"
@@ -95,7 +95,11 @@ class RunConfig(Settings):
         return self.task.with_gripper(self.robot).described(self.plan, self.limits)
 
     def region_start(self) -> tuple[float, ...]:
-        """Return the point where the region begins [m]. Raises SettingError if it is none."""
+        """Return the point at which the region begins (3,) in {A} [m].
+
+        Raises:
+            SettingError: the setting is no point.
+        """
         try:
             at = tuple(float(word) for word in self.region.split(","))
         except ValueError:

@@ -51,7 +51,9 @@ class JobFile:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The files and folders on which its result depends, without those of its settings."""
+        """The files and folders on which the result of the job depends, without those that its
+        settings name.
+        """
         named = [self.given.get(key) for key in _PATHS]
         return (self.log, *(p for p in (*named, self.config) if p and p != Path("auto")))
 

@@ -1,14 +1,14 @@
-"""Size of the scans against that of the model: unit, background and crop, each with the option to
-add.
+"""Comparison of the size of the scans with that of the model: unit, background and crop, each with
+the option to add.
 
 Sizes are compared as diameters (largest distance between two points), which do not depend on the
 attitude. A scan shows one side of the target, so that its diameter is between about 0.4 and 1.1 of
-the model's. Where sizes permit several units, a search for the pose decides.
+that of the model. Where sizes permit several units, a search for the pose decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ _SMALLEST_TARGET_M = 0.05  # a smaller model is too small, and not the unit of t
 
 @value_class(eq=True)
 class Advice:
-    """One finding.
+    """One finding of a check before a run.
 
     Attributes:
         grade: "ok", "check" or "fail".
@@ -81,11 +81,30 @@ class Advice:
         return f"{self.text}; add {self.option}" if self.option else self.text
 
 
+# position (3,) of the target at the first scan [m] from the examined scan in which it was found and
+# its position there, None where it cannot be followed to the first scan
+FollowBack = Callable[[int, Array], Array | None]
+
+
+@value_class
+class Sighting:
+    """Where the target seems to be in one of the examined scans.
+
+    Attributes:
+        scan: number of the scan among the examined ones.
+        points: (n, 3) points of the target, or of its model at the pose that was found [m].
+    """
+
+    scan: int
+    points: Array
+
+
 def compare_sizes(
     clouds: Sequence[NDArray[Any]],
     surface: Surface | None,
     registrar: Registrar | None,
     options: SourceOptions,
+    follow_back: FollowBack | None = None,
 ) -> list[Advice]:
     """Compare the size of scans with that of the model.
 
@@ -94,6 +113,7 @@ def compare_sizes(
         surface: model of the target, None if there is none.
         registrar: of the model; one is made if it is None and needed.
         options: how the log is read: unit and crop.
+        follow_back: the position of a target that moves at the first scan, for ``--region``.
 
     Returns:
         The findings.
@@ -117,12 +137,14 @@ def compare_sizes(
         return other or [_agreeing(said, ratio)]
     whole = _units(ratio, unit)
     left = ratio > MOST_OF_MODEL and (ratio < _LEFT_OVER or not whole)  # not a wrong unit
-    if left and (found := _located(clouds, surface, registrar)):
-        why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
+    located = _located(clouds, surface, registrar) if left else []
+    if 2 * len(located) >= len(clouds):
+        why = f"the model was found in {len(located)} of {len(clouds)} examined scans"
         among = Advice("ok", "size", f"{said}; {why}, among other points")
-        return [_crop_advice(clouds, found, why) or among]
+        region = _region_advice(located, len(clouds), why, follow_back)
+        return [region or _crop_advice(clouds, [each.points for each in located], why) or among]
     return (
-        _background_advice(clouds, model_m, ratio, said)
+        _background_advice(clouds, model_m, ratio, said, located, follow_back)
         or _unit_advice(
             {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)},
             clouds,
@@ -135,22 +157,32 @@ def compare_sizes(
 
 
 def _background_advice(
-    clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, said: str
+    clouds: Sequence[NDArray[Any]],
+    model_m: float,
+    ratio: float,
+    said: str,
+    located: Sequence[Sighting],
+    follow_back: FollowBack | None,
 ) -> list[Advice]:
     """What the size of the scans, ``ratio`` times that of the model, says of points around the
-    target; empty where another unit explains it.
+    target, which was ``located`` in some of them; empty where another unit explains it.
     """
     targets = (
         [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds]
         if ratio > MOST_OF_MODEL
         else []
     )
-    inside = [points for points in targets if points is not None]
+    inside = [Sighting(k, points) for k, points in enumerate(targets) if points is not None]
     if ratio > _LEFT_OVER and len(inside) * 2 <= len(clouds):
         inside = _groups(clouds, model_m)
     grouped = len(inside) * 2 > len(clouds)
-    if grouped and (crop := _crop_advice(clouds, inside, _of_size(model_m))):
-        return [crop]
+    if grouped:
+        why = f"a group of points has the size of the model in {len(inside)} of {len(clouds)} scans"
+        if region := _region_advice(inside, len(clouds), why, follow_back, located):
+            return [region]
+        points = [each.points for each in inside]
+        if crop := _crop_advice(clouds, points, _of_size(model_m)):
+            return [crop]
     if grouped or _WHOLE < ratio <= MOST_OF_MODEL:
         text = (
             f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or"
@@ -324,11 +356,11 @@ def _units(ratio: float, given: float) -> list[float]:
 
 def _grouped_units(
     clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, given: float, most: float = np.inf
-) -> dict[float, Sequence[Array]]:
+) -> dict[float, Sequence[Sighting]]:
     """Units, at most ``most`` times the given one, in which groups of points in most scans have the
     model's size.
     """
-    units = dict[float, Sequence[Array]]()
+    units = dict[float, Sequence[Sighting]]()
     for scale in _UNITS:
         factor = scale / given
         if scale == given or factor > most or not MOST_OF_MODEL < ratio / factor < _LARGEST_SCENE:
@@ -338,24 +370,24 @@ def _grouped_units(
     return units
 
 
-def _groups(clouds: Sequence[NDArray[Any]], size_m: float) -> list[Array]:
+def _groups(clouds: Sequence[NDArray[Any]], size_m: float) -> list[Sighting]:
     """Groups of points of a size, one of a scan; none where less than half of the scans have one.
 
     A group that grows with the gap is a part of something larger.
     """
-    found = list[Array]()
+    found = list[Sighting]()
     for k, cloud in enumerate(clouds):
         if 2 * (k - len(found)) >= len(clouds):
             return []
         one = part_of_size(cloud, size_m, _ONE_SIDE, _GAPS[0])
         two = None if one is None else part_of_size(cloud, size_m, _ONE_SIDE, _GAPS[1])
         if one is not None and two is not None and len(two) < 1.2 * len(one):
-            found.append(one)
+            found.append(Sighting(k, np.asarray(one, dtype=np.float64)))
     return found
 
 
 def _unit_advice(
-    units: Mapping[float, Sequence[Array]],
+    units: Mapping[float, Sequence[Sighting]],
     clouds: Sequence[NDArray[Any]],
     surface: Surface,
     options: SourceOptions,
@@ -388,7 +420,7 @@ def _unit_advice(
     size = metres * scale / given * model_m
     crop = None
     if groups:
-        inside = [metres * np.asarray(group, dtype=np.float64) for group in groups]
+        inside = [metres * group.points for group in groups]
         crop = _crop_advice([metres * cloud for cloud in clouds], inside, _of_size(size))
     return [unit, crop] if crop else [unit]
 
@@ -410,9 +442,8 @@ def _of_size(model_m: float) -> str:
 
 def _located(
     clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None
-) -> list[Array]:
-    """The model's vertices where a search finds them in the scans; empty if they are found in less
-    than half of them.
+) -> list[Sighting]:
+    """The model's vertices where a search finds them in the scans.
 
     The search looks at the connected parts of the scan with the size of the model, and tests every
     pose: size alone does not distinguish the target from other objects.
@@ -421,10 +452,36 @@ def _located(
     for k, cloud in enumerate(clouds):
         pose = registrar.acquire(_thinned(cloud))
         if pose.measured:
-            found.append(pose.T_ac.apply(surface.vertices))
-        if 2 * (k + 1 - len(found)) > len(clouds):
-            return []
+            found.append(Sighting(k, pose.T_ac.apply(surface.vertices)))
     return found
+
+
+def _region_advice(
+    found: Sequence[Sighting],
+    examined: int,
+    why: str,
+    follow_back: FollowBack | None,
+    located: Sequence[Sighting] = (),
+) -> Advice | None:
+    """The region that follows a target that moves farther than its size, and is not found in all
+    examined scans; None where it does not.
+
+    The position at the first scan is that of the first ``located`` or else found target that can be
+    followed back to it.
+    """
+    size_m = max(diameter(each.points, trimmed=False) for each in found)
+    centres = np.array([each.points.mean(axis=0) for each in found])
+    moved_m = float(np.ptp(centres, axis=0).max())
+    if len(found) == examined or moved_m <= size_m:
+        return None
+    text = f"{why}, and moves by {_metres(moved_m)}: no fixed crop keeps it"
+    for each in (*located, *found):
+        at = follow_back(each.scan, each.points.mean(axis=0)) if follow_back else None
+        if at is not None:
+            return Advice(
+                "check", "background", text, "--region " + ",".join(f"{v:.2f}" for v in at)
+            )
+    return Advice("check", "background", text, "--region X,Y,Z")
 
 
 def _crop_advice(
@@ -433,16 +490,7 @@ def _crop_advice(
     """The crop that keeps the target in all examined scans; None if hardly any point lies
     outside it.
     """
-    size_m = max(diameter(points, trimmed=False) for points in targets)
-    centres = np.array([points.mean(axis=0) for points in targets])
-    if len(targets) < len(clouds) and np.ptp(centres, axis=0).max() > size_m:
-        at = ", ".join(f"{v:.1f}" for v in centres[0])
-        text = (
-            f"{why} in {len(targets)} of {len(clouds)} examined scans, first at ({at}) m, and moves"
-            f" by {_metres(float(np.ptp(centres, axis=0).max()))}: no fixed crop keeps it"
-        )
-        return Advice("check", "background", text, "--region X,Y,Z")
-    margin = _MARGIN * size_m
+    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = (
         max(min(r.min() for r in ranges) - margin, 0.0),

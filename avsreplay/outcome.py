@@ -20,6 +20,7 @@ from avsreplay.records import (
     Forecast,
     Innovation,
     Manoeuvre,
+    Moves,
     Scan,
     Verdict,
 )
@@ -59,8 +60,10 @@ class Plan:
             constraint with it; NaN and "" without constraints.
         abort_margin_m: Lower bound of the smallest margin of ``withdrawal_clearance_m`` if the
             robot withdraws at any instant of the plan [m]; NaN: not checked, without a clearance.
-        escapes: (m, 4) instants of the plan [s after t_ns], ascending, and the directions in {A} in
-            which the robot withdraws there; None: not planned.
+        passive_margin_m, passive_safe_s: The same of a robot that coasts after a cut of its thrust
+            [m], and the time from t_ns up to which a cut is safe [s].
+        escapes: (m, 4) begins of ranges of instants of the path [s after its begin], ascending, and
+            the direction in {A} in which the robot withdraws in each; None: not planned.
         steps: Number of steps of the search.
         attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN
             where not planned.
@@ -83,6 +86,8 @@ class Plan:
     margin_m: float = math.nan
     binding: str = ""
     abort_margin_m: float = math.nan
+    passive_margin_m: float = math.nan
+    passive_safe_s: float = math.nan
     escapes: Array | None = None
     steps: int = 0
     attitude_s: float = math.nan
@@ -118,6 +123,8 @@ class MonitorReport:
             limit.
         unconverged: blocks whose covariance is above its limit, and two rates where both explain
             the poses.
+        alias: the slower and the faster of two angular rates [rad/s] that both explain the poses;
+            None where only one does.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
 
@@ -132,6 +139,7 @@ class MonitorReport:
     covariance_converged: bool
     predictive_converged: bool
     unconverged: tuple[str, ...]
+    alias: tuple[float, float] | None
     forecast: Forecast
 
 
@@ -177,6 +185,9 @@ class Outcome:
             {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
+        moves: what the poses show of the target's motion.
+        disturbances: root densities of the random torque [rad/s^1.5] and force [m/s^1.5] that the
+            estimate allows for; None where it states none.
         sigma_hits: how often a bound of the inertia ratios limited the gain.
         r_floors: how often an eigenvalue of R was raised to its floor.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
@@ -198,6 +209,8 @@ class Outcome:
     pose_covariance: Array
     body: BodyParameters
     estimator: str
+    moves: Moves
+    disturbances: tuple[float, float] | None
     sigma_hits: int
     r_floors: int
     reinitialised: int
@@ -211,7 +224,7 @@ class Outcome:
 
 @value_class(eq=True)
 class PoseError:
-    """Difference of two poses: distance of their origins [m] and angle between their
+    """Difference of two poses: the distance of their origins [m] and the angle between their
     attitudes [deg].
     """
 
@@ -221,8 +234,8 @@ class PoseError:
 
 @value_class(eq=True)
 class CaptureError:
-    """Gripper against true grasp point at the planned instant; NaN where the truth is not
-    known at that instant.
+    """Errors of the gripper relative to the true grasp point at the planned instant; NaN where the
+    truth is not known at that instant.
     """
 
     distance_m: float
@@ -232,16 +245,17 @@ class CaptureError:
 
 @value_class(kw_only=True)
 class Score:
-    """An outcome compared with ground truth; None where there is no truth for it.
+    """The comparison of an outcome with ground truth; a value is None where there is no truth for
+    it.
 
     Attributes:
-        fault: label of the injected fault.
+        fault: kind of the injected fault at the scan.
         reference: "truth", or "fit" (a motion fitted to all healthy poses).
-        estimate, registration: errors of the estimated and of the measured pose.
-        nees, nees_blocks: normalised estimation error squared, for the best order of the principal
-            axes, and by block.
-        planned: error of a plan made at this scan at its planned instant.
-        captured: of a capture since the last scan.
+        estimate, registration: errors of the estimated and of the registered pose.
+        nees, nees_blocks: normalised estimation error squared, for the order of the principal axes
+            in which it is smallest, in total and for each block of the state.
+        planned: error of a plan that was made at this scan, at its planned instant.
+        captured: error of a capture since the scan before.
     """
 
     fault: str | None = None

@@ -1,9 +1,9 @@
 """The processing chain: one scan in, one outcome out. Read ``step`` first.
 
-scan -> registration -> innovation -> verdict (gamma) -> estimate -> monitors -> guidance ->
-outcome. The predicted pose is the initial guess of the registration; that is the only feedback,
-apart from the convergence flag of the previous scan, which lets the filter take over from the batch
-fit. Nothing here has access to ground truth.
+scan -> registration -> innovation -> rules on the scan -> estimate, tracker -> verdict (gamma) ->
+monitors -> guidance -> outcome. The predicted pose is the initial guess of the registration; that
+is the only feedback, apart from the convergence flag of the previous scan, which lets the filter
+take over from the batch fit. Nothing here has access to ground truth.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from avsreplay.estimate.kinematic import Motion, kinematic_track
 from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
+from avsreplay.estimate.track import moves
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.aliasing import Instants, in_words, other_rate
+from avsreplay.monitor.aliasing import Turns, in_words, two_rates
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,
@@ -36,7 +37,7 @@ from avsreplay.monitor.convergence import (
     ConvergenceTrack,
     violations,
 )
-from avsreplay.monitor.fault_detection import FaultDetector
+from avsreplay.monitor.fault_detection import Examined, FaultDetector
 from avsreplay.monitor.gramian import Gramian, from_trajectory, measure, observe
 from avsreplay.monitor.gramian import gramian as empty_gramian
 from avsreplay.outcome import MonitorReport, Outcome
@@ -44,13 +45,14 @@ from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segme
 from avsreplay.plan.limits import Scene, TargetGeometry
 from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.records import (
+    Admission,
     Alignment,
     Belief,
+    Finding,
     Forecast,
     Innovation,
-    Reason,
+    Moves,
     Scan,
-    Verdict,
 )
 from avsreplay.region import Followed, Region
 from avsreplay.register.backend import measured_alignment
@@ -93,7 +95,7 @@ class MonitorState:
     convergence: ConvergenceTrack
     violations: int = 0
     motion: FittedMotion | None = None
-    instants: Instants = Instants()
+    turns: Turns = Turns()
 
 
 @value_class
@@ -132,6 +134,7 @@ class Monitors:
         state: MonitorState,
         estimator: AnyEstimator,
         prior: Prediction,
+        alignment: Alignment,
         innovation: Innovation | None,
         gamma: int,
         track: Track,
@@ -145,6 +148,7 @@ class Monitors:
             state: state of the monitors before the scan.
             estimator: estimator of the run.
             prior: prediction at the scan.
+            alignment: of the scan.
             innovation: of the measurement; None where nothing was measured.
             gamma: 1 if the fault detector accepts the measurement, else 0.
             track: estimate after the scan.
@@ -167,8 +171,10 @@ class Monitors:
         if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
             forecast = estimator.track_forecast(track, np.array([planned.after_s()]), grasp_c)
         possible = with_change(forecast, belief, track.change_P)
-        instants = state.instants.after(belief.t_ns) if healthy else state.instants
-        w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
+        turns = state.turns
+        if alignment.measured:
+            turns = turns.after(belief.t_ns, alignment.T_ac.q)
+        alias = two_rates(turns)
         judged = self.convergence.judge(
             state.convergence,
             belief,
@@ -188,11 +194,12 @@ class Monitors:
             converged=judged.converged,
             covariance_converged=judged.covariance_converged,
             predictive_converged=judged.predictive_converged,
-            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(w, alias)),
+            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(alias)),
+            alias=alias,
             forecast=forecast,
         )
         violated = state.violations + len(failed)
-        return MonitorState(gramian, seen, judged, violated, motion, instants), report
+        return MonitorState(gramian, seen, judged, violated, motion, turns), report
 
     def _gramian(
         self,
@@ -260,6 +267,11 @@ class Following:
     used: int = 0
     shown: Track | None = None
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether the last pose is used because the track confirms it."""
+        return self.driven and self.contradicted
+
 
 @value_class
 class PipelineState:
@@ -313,17 +325,20 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
+    prior, innovation, examined = _examined(stages, state, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
-    if acquired is None and not verdict.gamma and lost:
+    if acquired is None and examined.admission is not Admission.ADMITTED and lost:
         points = _deskewed(stages, state, scan, predicted)
         near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
         measurement = _acquire(stages, state, scan, points, "acquired", near)
-        prior, innovation, verdict = _judge(stages, scan, predicted, measurement, repeated)
-    track, verdict = stages.estimator.step(
-        track, prior, innovation, verdict, state.monitors.convergence.converged
+        prior, innovation, examined = _examined(
+            stages, state, scan, predicted, measurement, repeated
+        )
+    track, finding = stages.estimator.step(
+        track, prior, innovation, examined.admission, state.monitors.convergence.converged
     )
-    following, verdict = _followed_on(stages, state, scan, measurement, track, verdict)
+    following = _followed_on(stages, state, scan, measurement, track, finding)
+    verdict = stages.faults.judge(examined, finding, following.confirmed)
     gamma, used = verdict.gamma, measurement.alignment if verdict.gamma else None
     track = track.changed(
         errors=errors.with_scan(used, stages.registrar.index.extent_m, scan.sensor)
@@ -335,7 +350,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     belief = stages.estimator.published(track)
     planned = _planned_time(stages, state.guidance, belief)
     seen = innovation, gamma, track, belief, planned, stages.grasp_c
-    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
+    monitors, report = stages.monitors.observe(
+        state.monitors, stages.estimator, prior, measurement.alignment, *seen
+    )
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
@@ -343,7 +360,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         known = planner_input(
             stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
-        guidance = stages.guidance.step(guidance, known)
+        guidance = stages.guidance.stated(stages.guidance.step(guidance, known), known)
     outcome = Outcome(
         scan=scan,
         start_ns=state.start_ns,
@@ -356,6 +373,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         pose_covariance=stages.estimator.pose_covariance(belief),
         body=body_parameters(belief),
         estimator=track.mode,
+        moves=Moves.DRIVEN if following.shown is not None else moves(track),
+        disturbances=stages.estimator.disturbances_of(track),
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
         reinitialised=track.reinitialised,
@@ -401,33 +420,31 @@ def _followed_on(
     scan: Scan,
     measurement: Measurement,
     track: Track,
-    verdict: Verdict,
-) -> tuple[Following, Verdict]:
-    """What is known of the target whatever moves it after a scan, and the final verdict.
+    finding: Finding,
+) -> Following:
+    """What is known of the target whatever moves it after a scan.
 
     A pose that the track confirms is used also where the estimate of the free body finds no
     explanation for it, and from then on where that one is in doubt.
     """
     tracker, before = stages.tracker, state.following
     if tracker is None:
-        return before, verdict
+        return before
     kinematics, confirmed = tracker.after(before.kinematics, scan.t_ns, measurement.alignment)
-    if verdict.gamma:
+    if finding.used:
         kinematics = tracker.used(kinematics, scan.t_ns)
-    contradicted = confirmed and verdict.reason in (Reason.POSE_JUMP, Reason.DOUBTFUL)
-    unexplained = contradicted and verdict.reason is Reason.POSE_JUMP
-    used = 0 if contradicted else before.used + verdict.gamma
+    contradicted = confirmed and finding in (Finding.UNEXPLAINED, Finding.OPEN)
+    unexplained = contradicted and finding is Finding.UNEXPLAINED
+    used = 0 if contradicted else before.used + finding.used
     driven = unexplained or (before.driven and used < FREE_AGAIN)
     shown = None
     if driven and kinematics is not None:
-        if contradicted:
-            verdict = Verdict(1, Reason.OK)
         known = kinematics.t_ns == scan.t_ns or tracker.predicted(kinematics, scan.t_ns) is not None
         if known:
             motion = tracker.motion(kinematics, scan.t_ns)
             of = stages.estimator.frame, stages.estimator.params
             shown = kinematic_track(*of, track, scan.t_ns, motion)
-    return Following(kinematics, contradicted, driven, used, shown), verdict
+    return Following(kinematics, contradicted, driven, used, shown)
 
 
 def _seen(
@@ -440,7 +457,15 @@ def _seen(
     if before is None or not measurement.alignment.measured:
         return None
     prior = stages.estimator.predict(before, scan.t_ns)
-    return prior, stages.estimator.innovate(prior, measurement.alignment)
+    alignment = _weighed(stages, state, measurement.alignment)
+    return prior, stages.estimator.innovate(prior, alignment)
+
+
+def _weighed(stages: Stages, state: PipelineState, alignment: Alignment) -> Alignment:
+    """The pose with the covariance that the tracker finds instead of the claimed one."""
+    if stages.tracker is None:
+        return alignment
+    return stages.tracker.weighed(state.following.kinematics, alignment)
 
 
 def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
@@ -627,25 +652,26 @@ def _measurement(
     return Measurement(alignment, origin, instants)
 
 
-def _judge(
+def _examined(
     stages: Stages,
+    state: PipelineState,
     scan: Scan,
     predicted: Prediction,
     measurement: Measurement,
     repeated: bool,
-) -> tuple[Prediction, Innovation | None, Verdict]:
+) -> tuple[Prediction, Innovation | None, Examined]:
     """The prior at the instant of the measurement, the innovation (None: nothing measured)
-    and the verdict.
+    and what the rules on the scan alone find.
     """
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
-    alignment = measurement.alignment
+    alignment = _weighed(stages, state, measurement.alignment)
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return (
         predicted,
         innovation,
-        stages.faults.judge(scan.status, alignment, innovation, predicted.belief, repeated),
+        stages.faults.examine(scan.status, alignment, innovation, predicted.belief, repeated),
     )
 
 

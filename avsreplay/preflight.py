@@ -10,12 +10,14 @@ import numpy as np
 
 from avsreplay.build import grasp_patches, task_and_target
 from avsreplay.config import RunConfig
+from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES
 from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.model_size import Advice, compare_sizes, find_model, in_found_unit
 from avsreplay.records import Scan, ScanStatus, Surface
+from avsreplay.region import Region
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
 
@@ -24,6 +26,8 @@ SCANS = 5
 OFF_THE_MODEL = 0.25
 _POSES, _PAIRS = 200, 50  # measured poses, and pairs of successive ones, that are examined
 LARGEST_STEP = 0.25  # from one pose to the next, over the extent (docs/poses.md)
+_FOLLOWED = 300  # most scans over which a target is followed back to the first one
+_LOST = 5  # scans without points of the target after which it is lost
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 
 
@@ -33,6 +37,7 @@ def preflight(
     registrar: Registrar | None = None,
     *,
     search: bool = False,
+    followed: bool = False,
 ) -> list[Advice]:
     """Check a log and a model before a run.
 
@@ -42,6 +47,7 @@ def preflight(
         registrar: of the model; with it the share of points on the model is measured where the
             first pose is known.
         search: look for the model in some of the scans, and propose grasp points.
+        followed: a region follows the target, so that points around it are expected.
 
     Returns:
         The findings in the order of the checks.
@@ -52,6 +58,8 @@ def preflight(
     if source.options.poses:
         return [*_poses(source, surface), *_grasp(surface, search), *general]
     sizes = _contents(source, scans, surface, registrar, search)
+    if followed:
+        sizes = [each for each in sizes if each.about != "background"]
     model = None if surface is None else in_found_unit(surface, sizes, source.options)
     found = [*sizes, *_faces(surface), *_grasp(model, search), *general]
     share = None if registrar is None else _share_on_model(source, registrar)
@@ -136,11 +144,17 @@ def _contents(
         [s for s in scans if s.status is ScanStatus.DAMAGED],
         list(map(source.in_own_frame, scans)),
     )
-    finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
+    full = [k for k, cloud in enumerate(clouds) if len(cloud) >= 10]
+    finite = [clouds[k][np.isfinite(clouds[k]).all(axis=1)] for k in full]
+
+    def follow_back(k: int, at: Array) -> Array | None:
+        scan = scans[full[k]]
+        return None if surface is None else _followed_back(source, scan, surface, at)
+
     found = (
         []
         if broken and len(broken) == len(scans)
-        else compare_sizes(finite, surface, registrar, source.options)
+        else compare_sizes(finite, surface, registrar, source.options, follow_back)
     )
     if not finite and (dropped := max((scan.dropped_points for scan in scans), default=0)):
         text = (
@@ -157,6 +171,31 @@ def _contents(
         )
         found.insert(0, Advice("check" if found else "fail", "scans", text))
     return found
+
+
+def _followed_back(source: Source, scan: Scan, surface: Surface, at: Array) -> Array | None:
+    """The position of the target at the first scan in {A} [m], followed back in time from a scan.
+
+    Args:
+        source: the log.
+        scan: the one in which the target was found.
+        surface: model of the target.
+        at: (3,) where it was found, in the frame of the sensor [m].
+
+    Returns:
+        The position, None where the target is lost on the way.
+    """
+    start = at if scan.sensor is None else scan.sensor.apply(at[None])[0]
+    region = Region(start, surface.vertices.min(axis=0), surface.vertices.max(axis=0))
+    seen, lost = None, 0
+    for seq in reversed(_spread(scan.seq + 1, _FOLLOWED)):
+        before = source.scan_at(seq)
+        if len(before.points):
+            kept, seen = region.cut(before.points, -before.t_ns, seen, None)
+            lost = 0 if kept.any() else lost + 1
+        if lost > _LOST:
+            return None
+    return None if seen is None else seen.centre
 
 
 def _poses(source: Source, surface: Surface | None) -> list[Advice]:

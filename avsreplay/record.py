@@ -29,11 +29,11 @@ scans.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordOptions:
-    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or
-    source.
+    """How to write a log, see ``log.LogWriter``.
 
     Attributes:
-        faults: injected into the scans, with labels.
+        model: model file that replaces the model of the scenario or source.
+        faults: faults that are injected into the scans and labelled.
         fault_seed: seed of the random numbers of these faults.
     """
 
@@ -53,16 +53,16 @@ class Recorded:
         path: the log.
         scans: number of clouds.
         points: total number of points.
-        empty: clouds without points.
-        damaged: scans of the source that could not be used and were omitted.
-        span_s: time from first to last scan.
-        bytes: file size.
-        model: name of the model, None without.
-        faults: labels as (kind, start [s], end [s] after the first scan, harmful), without those
-            outside of the recording.
-        losses: of the source.
-        note: a remark for the user.
-        lost: what of the source could not be read.  Both are empty if there is nothing.
+        empty: number of clouds without points.
+        damaged: number of scans of the source that could not be used and were left out.
+        span_s: time from the first to the last scan [s].
+        bytes: size of the file.
+        model: name of the model, None without one.
+        faults: labels as (kind, start [s], end [s] after the first scan, whether its scans are
+            unusable), without those outside of the recording.
+        losses: parts of the source that could not be read.
+        note: a remark for the user, "" if there is none.
+        lost: what of the source could not be read, in words; "" if nothing was lost.
     """
 
     path: str
@@ -89,16 +89,16 @@ def record(
     reading: SourceOptions | None = None,
     ticker: Ticker | None = None,
 ) -> Recorded:
-    """Record a source to a log.
+    """Record a simulation or a recorded source to a log.
 
     Args:
-        source: None for the built-in scenario, a scenario (.toml), or a recorded source (bag, log,
-            folder).
-        output: log to write (.mcap).
-        seed: replaces the seed of the scenario.
-        options: how to write.
+        source: a scenario (.toml), a recorded source (bag, log, folder), or None for the built-in
+            scenario.
+        output: the log to write (.mcap).
+        seed: seed that replaces that of the scenario.
+        options: how to write the log.
         reading: how to read a recorded source; its duration replaces that of a scenario.
-        ticker: shows progress.
+        ticker: shows the progress.
 
     Returns:
         What was written.

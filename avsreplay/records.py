@@ -83,7 +83,7 @@ class AlignStatus(Enum):
 
 
 class Reason(Enum):
-    """Why gamma is 0 (``OK``: gamma is 1): the first condition that holds, in this order."""
+    """Why gamma is 0 (``OK``: gamma is 1): the first rule that holds, in this order."""
 
     OK = "ok"
     NO_SCAN = "no_scan"  # empty or damaged scan
@@ -95,14 +95,48 @@ class Reason(Enum):
     HALVES_DIFFER = (
         "halves_differ"  # the poses from two halves of the scan differ by more than their errors
     )
-    POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
-    DOUBTFUL = (
-        "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
-    )
+    CLOCK = "clock"  # the stamp steps back or jumps
     SENSOR_BIAS = (
         "sensor_bias"  # the measured poses have a constant offset that motion does not explain
     )
-    CLOCK = "clock"  # the stamp steps back or jumps
+    WRONG_SCAN = "wrong_scan"  # neither a motion nor an error of the sensor explains the poses
+    POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
+    DOUBTFUL = (
+        "doubtful"  # unlikely innovation: whether scan, sensor or target is the cause is open
+    )
+
+
+class Moves(Enum):
+    """What the poses show of the target's motion."""
+
+    FREE = "free"  # nothing contradicts free motion
+    ACCELERATED = "accelerated"  # a constant torque or force acts
+    DISTURBED = "disturbed"  # random torques or forces act
+    DRIVEN = "driven"  # no free motion explains the poses, which agree with one another
+
+
+class Admission(Enum):
+    """How the rules that use a scan alone permit the estimator to use its pose."""
+
+    REFUSED = "refused"  # nothing
+    LARGE = "large"  # to use it where it explains the innovation, which reaches its limit
+    ADMITTED = "admitted"  # to use it
+
+
+class Finding(Enum):
+    """The decision of the estimator on a pose, from this pose and those before it."""
+
+    UNTESTED = "untested"  # it was rejected, or its innovation reaches the limit: no further test
+    AGREES = "agrees"  # the predicted pose, within its errors
+    EXPLAINED = "explained"  # by a change or a disturbance of the motion, or by larger noise
+    OPEN = "open"  # not decided yet
+    OFFSET = "offset"  # an error of the sensor that lasts
+    UNEXPLAINED = "unexplained"  # neither a motion nor an error of the sensor explains it
+
+    @property
+    def used(self) -> bool:
+        """Return whether the estimate has used the pose."""
+        return self in (Finding.AGREES, Finding.EXPLAINED)
 
 
 @value_class
@@ -110,10 +144,11 @@ class Surface:
     """A target model in {C}: a triangle mesh, or a point cloud if ``faces`` is empty.
 
     Attributes:
-        vertices: (n, 3) [m].
-        faces: (m, 3) vertex indices, int32; outwards where they form a closed part.
-        name, sha256, data: of the file.
-        reversed: faces that were reversed so that they point outwards; None: not yet examined.
+        vertices: (n, 3) vertices or points [m].
+        faces: (m, 3) vertex indices, int32; those of a closed part point outwards.
+        name, sha256, data: name, SHA-256 and bytes of the file of the model.
+        reversed: number of faces that were reversed so that they point outwards; None if this was
+            not yet examined.
     """
 
     vertices: Array
@@ -134,15 +169,15 @@ class State:
     """Motion and parameters of a target (eq:x): the mean to which the 20 error states refer.
 
     Attributes:
-        q_ab: (4,) attitude of {B}.
-        w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
-        r_a: (3,) centre of mass, rho_o [m].
-        v_a: (3,) its velocity [m/s].
+        q_ab: (4,) attitude of {B} in {A}, quaternion ``[x y z w]``.
+        w_b: (3,) angular rate of {B} relative to {A}, in {B} [rad/s].
+        r_a: (3,) position of the centre of mass in {A}, the paper's rho_o [m].
+        v_a: (3,) velocity of the centre of mass in {A} [m/s].
         sigma: (2,) inertia ratios.
-        c_b: (3,) fixture in {B}, varrho [m].
-        q_bc: (4,) mu, {C} to {B}.
-        flat: (22,) these numbers one after the other, of which the others are views: the state of
-            the extension.
+        c_b: (3,) origin of {C} in {B}, the paper's varrho [m].
+        q_bc: (4,) attitude of {C} in {B}, the paper's mu.
+        flat: (22,) all these numbers in this order; the other arrays are views of it, and the C++
+            extension works on it.
     """
 
     q_ab: Array
@@ -205,16 +240,17 @@ class Scan:
 
     Attributes:
         seq: index in the replay, from 0.
-        t_ns: instant on the selected clock.
-        log_ns: time of reception.
-        points: (n, 3) finite, possibly strided, in {A} [m].
-        sensor: its pose in {A}; None: {A} is its own frame.
-        times_s, intensities, places: (n,) instant after ``t_ns`` [s], intensity, share of the
-            message before; or None.
-        dropped_points: non-finite ones.
-        frame: of the message, or "".
-        note: what was wrong.
-        pose: in place of them.
+        t_ns: instant of the scan on the selected clock [ns].
+        log_ns: time at which the log received it [ns].
+        points: (n, 3) finite points in {A} [m]; the array may be strided.
+        sensor: pose of the sensor in {A}; None if the frame of the sensor is {A}.
+        times_s: (n,) instant of each point after ``t_ns`` [s], or None.
+        intensities: (n,) intensity of each point, or None.
+        places: (n,) share of the message that precedes each point, or None.
+        dropped_points: number of points that were left out because they were not finite.
+        frame: frame that the message names, or "".
+        note: what was wrong with the message, or "".
+        pose: the measured pose, in place of points.
     """
 
     seq: int
@@ -232,7 +268,7 @@ class Scan:
     sensor: Pose | None = None
 
     def keep(self, kept: NDArray[np.bool_]) -> Scan:
-        """Return the scan with some of its points (n,)."""
+        """Return the scan with the points that ``kept`` (n,) selects."""
         each = (self.times_s, self.intensities, self.places)
         times, seen, places = (None if column is None else column[kept] for column in each)
         return replace(
@@ -266,12 +302,19 @@ class Truth:
 
 @value_class
 class LogHeader:
-    """The metadata of a log; with them it can be replayed without options.
+    """The metadata of a log, with which it can be replayed without options.
 
-    Model ``surface``, TOML text of its ``scenario`` ("": recorded), its ``seed``, injected faults
-    ``labels``, initial belief ``start``, ``truth`` at the first scan, ``notes`` by name,
-    ``fixed_frame`` of start, truth, poses ("": that of clouds). ``sensor_at_stamp``: points with
-    times are in the frame of the sensor at the stamp of their cloud.
+    Attributes:
+        surface: the model of the target.
+        scenario: TOML text of the scenario, "" for a recorded log.
+        seed: seed of the scenario.
+        labels: the injected faults.
+        start: the initial belief.
+        truth: the true state at the first scan.
+        notes: remarks by name.
+        fixed_frame: frame of start, truth and poses; "" if it is that of the clouds.
+        sensor_at_stamp: whether points with times are in the frame of the sensor at the stamp of
+            their cloud.
     """
 
     surface: Surface | None = None
@@ -287,15 +330,15 @@ class LogHeader:
 
 @value_class
 class Fit:
-    """What a back end returns.
+    """What a registration back end returns.
 
     Attributes:
-        T_ca: pose that takes the scan {A} into the model {C}.
-        iterations: passes made.
-        converged: its own flag.
-        matches: of ``IcpResult`` or None.
-        work: in point searches, 0: unknown.
-        rough: of a part of the scan only.
+        T_ca: pose of {A} in {C}: takes the points of the scan into the frame of the model.
+        iterations: number of iterations.
+        converged: whether the back end itself reports convergence.
+        matches: correspondences of an ``IcpResult``, or None.
+        work: number of point searches, 0 if unknown.
+        rough: whether only a part of the scan was used.
     """
 
     T_ca: Pose
@@ -311,20 +354,22 @@ class Alignment:
     """A pose with its quality, measured in the same way for every back end (register.quality).
 
     Attributes:
-        T_ac: measured; ICP iterates its inverse.
-        well_off: of 1,000 points, those over two gates from the model.
-        info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d);
-            possibly singular.
-        covariance: (6, 6) of d; None if degenerate.
-        dof: of it.
-        systematic: its part from errors of model and ranges.
-        message: why it failed or is not accepted.
-        free_directions: not determined, in words; free: columns d (6, k).
-        members: of an ambiguous one, the poses T_ac that explain the scan, the registered first.
-        equal: no scan can tell them apart, because exact symmetries of the model carry one onto
-            another.
-        split_nis, size: see ``quality``; with the 1 sigma of the size.
-        size_1s: error of the size, until it is fitted.
+        T_ac: the measured pose of {C} in {A}.
+        well_off: of 1,000 points, the number of those farther than two gates from the model.
+        info: (6, 6) information of the error d = [theta; v] in {C} [rad, m], with T_ac_true = T_ac
+            @ Exp(d); it may be singular.
+        covariance: (6, 6) covariance of d; None for a degenerate alignment.
+        dof: degrees of freedom of this covariance as an estimate.
+        systematic: the part of the covariance that errors of the model and of the ranges cause.
+        message: why the registration failed or is not accepted, "" otherwise.
+        free_directions: in words, the directions of motion that the scan does not determine.
+        free: (6, k) these directions as columns d.
+        members: of an ambiguous alignment, the poses T_ac that explain the scan, the registered one
+            first.
+        equal: whether no scan can tell these poses apart, because exact symmetries of the model
+            carry one onto another.
+        split_nis, size, size_1s: see ``register.quality``; the size of the target relative to the
+            model and its standard deviation.
     """
 
     T_ac: Pose
@@ -356,14 +401,14 @@ class Alignment:
 
     @property
     def inlier_ratio(self) -> float:
-        """Return inliers / points, 0 for an empty scan."""
+        """Return the share of inliers among the points, 0 for an empty scan."""
         return self.inliers / self.points if self.points else 0.0
 
 
 @value_class
 class Belief:
-    """Mean x and covariance P (20, 20) of the error states at an instant; dq_v and dmu_v are
-    HALF-angle vectors.
+    """Mean and covariance (20, 20) of the error states at an instant; dq_v and dmu_v are vectors of
+    half angles.
     """
 
     t_ns: int
@@ -379,17 +424,18 @@ class Innovation:
     """Innovation alpha = z - h(x-) of z = (rho, deta_v) [m, half angle] and its covariance.
 
     Attributes:
-        alpha: (6,).
-        S: (6, 6) = H P H' + R.
-        R: (6, 6) noise used.
-        nis: alpha' S^-1 alpha.
-        distance_m: |d rho|.
-        angle_rad: rotation.
-        weight: Cauchy weight.
-        share: correlated part of R.
-        rms_m, free: of the alignment.
-        dof: degrees of freedom of R as an estimate, inf if known.
-        chi2: the NIS, T^2 of Hotelling, as chi-square.
+        alpha: (6,) the innovation.
+        S: (6, 6) its covariance H P H' + R.
+        R: (6, 6) covariance of the measurement noise that was used.
+        nis: normalised innovation squared, alpha' S^-1 alpha.
+        distance_m: length of its position part [m].
+        angle_rad: angle of its attitude part [rad].
+        weight: Cauchy weight of the measurement.
+        share: share of R that is correlated between neighbouring views.
+        rms_m, free: fit error and undetermined directions of the alignment.
+        dof: degrees of freedom of R as an estimate, infinite if R is known.
+        chi2: the NIS, which follows Hotelling's T^2 where R is estimated, converted to a chi-square
+            value.
     """
 
     alpha: Array
@@ -408,7 +454,7 @@ class Innovation:
 
 @value_class
 class Verdict:
-    """Result of the fault detector: gamma 1 (healthy) or 0 (faulty), and the reason."""
+    """The decision of the fault detector: gamma 1 (healthy) or 0 (faulty), and the reason."""
 
     gamma: int
     reason: Reason
@@ -419,11 +465,11 @@ class Manoeuvre:
     """A change of the target's velocity that free motion does not explain.
 
     Attributes:
-        t_ns, t_1s_s: most likely instant, 1 sigma [s].
-        detected_ns: of the decision.
-        P: (6, 6) of (rate, velocity).
-        velocity, rate: (3,) change of the mass centre's velocity in {A} [m/s], and of the angular
-            rate in {B} [rad/s].
+        t_ns, t_1s_s: most likely instant [ns] and its standard deviation [s].
+        detected_ns: instant of the scan at which it was detected [ns].
+        P: (6, 6) covariance of the changes (rate, velocity).
+        velocity: (3,) change of the velocity of the centre of mass in {A} [m/s].
+        rate: (3,) change of the angular rate in {B} [rad/s].
     """
 
     t_ns: int

@@ -33,13 +33,13 @@ _GAIN, _RATE_GAIN = 0.6, 0.2  # of the follower: position and velocity
 
 @value_class
 class Followed:
-    """What is known of the target between scans.
+    """The motion of the points of the target from scan to scan.
 
     Attributes:
-        t_ns: instant of the last scan in which its points were found.
-        centre: (3,) mean of its points [m].
-        velocity: (3,) of that mean [m/s].
-        scans: in how many its points were found.
+        t_ns: instant of the last scan in which its points were found [ns].
+        centre: (3,) mean of its points in {A} [m].
+        velocity: (3,) velocity of this mean in {A} [m/s].
+        scans: number of scans in which its points were found.
     """
 
     t_ns: int

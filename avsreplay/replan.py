@@ -1,11 +1,11 @@
-"""Planning from the saved beliefs of a result: one plan, its distribution over the belief,
-its errors, the approach.
+"""Planning from the saved beliefs of a result: a plan, the distribution of its errors over the
+belief, its errors against the truth, and the simulated approach.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -22,26 +22,24 @@ from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
-from avsreplay.plan.constrained import constrained
+from avsreplay.plan.constrained import constrained, linearised_s, with_safety
 from avsreplay.plan.flights import Ended, Execution, Miss, miss
 from avsreplay.plan.flights import execute as plan_execute
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
     CONSTRAINTS,
-    SampledScene,
     Scene,
     TargetGeometry,
     in_fixture_axes,
     margin,
     margins,
 )
-from avsreplay.plan.path import RobotPath, path_of
+from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
-from avsreplay.plan.withdrawal import COAST_S, Certificate, Space, coasting
 from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
@@ -53,7 +51,7 @@ _NO_MODEL = Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int32), "", "")
 
 
 class Replanning:
-    """Planner for a saved result with other settings."""
+    """The planner for a saved result, with settings that may differ from those of the run."""
 
     def __init__(
         self,
@@ -127,6 +125,19 @@ class Replanning:
         belief = self.belief(index)
         return self._planned(self._scene(belief), belief.t_ns)
 
+    def stated(self, index: int, made: Plan) -> Plan:
+        """Return a plan with the margins of a robot that withdraws or coasts from any of its
+        instants.
+
+        Args:
+            index: index of the scan from which the plan was made.
+            made: the plan.
+        """
+        if not made.found:
+            return made
+        scene, own = self._scene(self.belief(index)), (self.params, self.limits)
+        return with_safety(scene, made, self.path(made), *own, self.saved.extent_m)
+
     def start_margin(self, index: int) -> float:
         """Return the margin of the limits at the start [m or m/s]: negative where one is violated,
         infinite without.
@@ -177,22 +188,6 @@ class Replanning:
         belief, estimator = self.belief(index), self.saved.estimator
         scene = Scene(estimator.motion(belief), estimator.attitude(belief))
         return self.arm.last_metres(self.path(made), scene, self.limits)
-
-    def passive(self, index: int, made: Plan) -> Certificate | None:
-        """Return the margin of a robot that coasts after a cut of its thrust at any instant of a
-        plan; None without a plan or a clearance.
-
-        Args:
-            index: index of the scan from which the plan was made.
-            made: the plan.
-        """
-        if not made.found or self.limits.clearance_m is None:
-            return None
-        params, scene = self.params, self._scene(self.belief(index))
-        span_s = made.t_go_s + 1.5 * COAST_S
-        sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
-        space = Space(sampled, self.limits, params.a_max_mps2, self.saved.extent_m)
-        return coasting(space, self.path(made), made.latency_s)
 
     def path(self, made: Plan) -> RobotPath:
         """Return the path of a plan from the start.
@@ -259,15 +254,23 @@ class Replanning:
         _, drawn = drawn_beliefs(belief, count, np.random.Generator(np.random.PCG64(seed)))
         path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
 
-        def planner(scene: Scene) -> Plan:
-            return self._planned(scene, belief.t_ns, path)
-
+        time_to_go = self._time_to_go(belief, made, path)
         futures = [self._scene(b) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
         return spread(
-            path, futures, planner, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
+            path, futures, time_to_go, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
         )
+
+    def _time_to_go(self, belief: Belief, made: Plan, path: RobotPath) -> Callable[[Scene], float]:
+        """Return the time to go to a target that was drawn from a belief: by the linearised
+        problem about a plan under constraints, else by a plan of its own.
+        """
+        if not isinstance(path, StepPath) or self.arm is not None or made.delayed_by:
+            return lambda scene: self._planned(scene, belief.t_ns, path).t_go_s
+        own = path, self.params, self.limits, self.saved.extent_m
+        mean_s = linearised_s(self._scene(belief), *own)
+        return lambda scene: made.t_go_s + linearised_s(scene, *own) - mean_s
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
         """Return the error of a plan made at scan ``index`` against the truth; None without

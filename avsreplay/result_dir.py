@@ -93,7 +93,7 @@ def mean_vector(x: State) -> Array:
 
 
 class BeliefTable(Sequence[Belief]):
-    """Beliefs, of which only the last ones are in memory."""
+    """A sequence of beliefs, of which only the last ones are in memory."""
 
     def __init__(self, arrays: Mapping[str, Spool] | None = None) -> None:
         """Start without beliefs.
@@ -231,7 +231,7 @@ class Beliefs:
 
 
 class ViewWriter:
-    """Keeps a thinned model, thinned clouds and planned paths for the report page."""
+    """Collects the thinned model, thinned clouds and planned paths that the report page shows."""
 
     def __init__(self, surface: Surface, before: View | None = None) -> None:
         """Start without scans.

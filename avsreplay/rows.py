@@ -46,13 +46,13 @@ class Column:
     """Metadata of a row field.
 
     Attributes:
-        name: field name, with its unit as suffix where it has one.
-        text: its meaning, one or more sentences.
-        unit: as printed in table headings, "" if none.
+        name: name of the field, with its unit as suffix where it has one.
+        text: meaning of its values, one or more sentences.
+        unit: unit as printed in table headings, "" if there is none.
         fmt: format specification for tables.
-        rtol, atol: relative and absolute golden tolerance; both 0 means exact.
-        table: shown in the per-scan table.
-        section: the section that begins with it, None if it continues one.
+        rtol, atol: relative and absolute golden tolerance; if both are 0, values must be equal.
+        table: whether the table of scans shows it.
+        section: the section of docs/columns.md that begins with it, None if it continues one.
         words: meaning of every value of a column that holds one of a few words.
     """
 
@@ -334,6 +334,12 @@ _DRIFT = _change(
     atol=1e-9,
 )
 
+_MOTION_WORDS = {
+    "free": "Nothing contradicts free motion.",
+    "accelerated": "A constant torque or force acts on the target.",
+    "disturbed": "Random torques or forces act on the target.",
+    "driven": "No free motion explains the poses, which agree with one another.",
+}
 _STATUS_WORDS = {
     "aligned": "The scan was registered.",
     "measured": "The pose comes from the log itself; nothing was registered.",
@@ -370,13 +376,14 @@ _REASON_WORDS = {
     "halves_differ": (
         "The poses from two halves of the scan differ by more than their errors explain."
     ),
-    "pose_jump": "The pose is too far from the prediction.",
+    "clock": "The time stamp steps back or jumps.",
+    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
+    "wrong_scan": "Neither a motion nor an error of the sensor explains the last poses.",
+    "pose_jump": "The pose is too far from the prediction, and what explains it is not decided.",
     "doubtful": (
-        "The innovation is large, and it is not decided yet whether the scan, the "
+        "The innovations are unlikely, and it is not decided yet whether the scan, the "
         "sensor or the target is the cause."
     ),
-    "sensor_bias": "The measured poses have a constant offset that motion does not explain.",
-    "clock": "The time stamp steps back or jumps.",
 }
 _GUESS_WORDS = {
     "start": "The initial state that the log states.",
@@ -429,8 +436,8 @@ _ACTION_WORDS = {
 
 @value_class(eq=True)
 class Row:
-    """The result of one scan. None: does not apply (no truth, no measurement, no plan, no
-    fault).
+    """The result of one scan. A value is None where it does not apply: without truth, measurement,
+    plan or fault.
     """
 
     seq: int = _exact(
@@ -602,6 +609,23 @@ class Row:
             ),
         ),
         words=_ESTIMATOR_WORDS,
+    )
+    motion: str | None = _exact(
+        lambda o, s: o.moves.value,
+        "What the poses show of the motion of the target.",
+        words=_MOTION_WORDS,
+    )
+    torque_noise_radps15: float | None = _number(
+        lambda o, s: None if o.disturbances is None else o.disturbances[0],
+        "Root density of the random torque that the estimate allows for.",
+        "rad/s^1.5",
+        atol=1e-9,
+    )
+    force_noise_mps15: float | None = _number(
+        lambda o, s: None if o.disturbances is None else o.disturbances[1],
+        "Root density of the random force that the estimate allows for.",
+        "m/s^1.5",
+        atol=1e-9,
     )
     x_m: float | None = _ESTIMATED[0]
     y_m: float | None = _ESTIMATED[1]
@@ -883,6 +907,16 @@ class Row:
         lambda o, s: ", ".join(o.monitors.unconverged) or None,
         "Names of the blocks of states whose covariance is above its limit.",
     )
+    alias_slow_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[0],
+        "Slower of two angular rates that both explain the poses; empty where only one does.",
+        "rad/s",
+    )
+    alias_fast_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[1],
+        "Faster of these two rates.",
+        "rad/s",
+    )
     grasp_pos_1s_m: float | None = _number(
         lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
         (
@@ -952,13 +986,28 @@ class Row:
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
         (
-            "Smallest margin of the clearance if the robot aborts at any time of the plan before "
-            "the corridor."
+            "Certified smallest margin of the required distance to the body if the robot withdraws "
+            "at any instant of the plan; from within the corridor less is required."
         ),
         "m",
         ".4f",
         0.0,
         0.01,
+    )
+    passive_margin_m: float | None = column(
+        lambda o, s: None if o.plan is None else finite(o.plan.passive_margin_m),
+        (
+            "Certified smallest margin of this distance if the thrust is cut at any instant of the "
+            "plan and the robot coasts for 30 s."
+        ),
+        "m",
+        ".4f",
+        0.0,
+        0.01,
+    )
+    passive_safe_s: float | None = _seconds(
+        _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.passive_safe_s)),
+        "Time since the first scan up to which a cut of the thrust keeps this distance.",
     )
     gripper_ready_s: float | None = _seconds(
         _if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)),
@@ -1046,7 +1095,7 @@ _VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 
 
 def columns() -> tuple[Column, ...]:
-    """Every column in order."""
+    """Return every column in order."""
     return tuple(
         dataclasses.replace(f.metadata["column"], name=f.name) for f in dataclasses.fields(Row)
     )
@@ -1054,7 +1103,9 @@ def columns() -> tuple[Column, ...]:
 
 @cache
 def field_types() -> Mapping[str, tuple[type, bool]]:
-    """Column name -> (str, int, float or bool; whether it may be null)."""
+    """Return for every column the type of its values (str, int, float or bool) and whether a value
+    may be null.
+    """
     hints = typing.get_type_hints(Row)
     names = (field.name for field in dataclasses.fields(Row))
     return MappingProxyType({name: _split(hints[name]) for name in names})

@@ -1,10 +1,10 @@
-"""One run, for command line, API and sweeps: opens the log, builds the stages, folds the
-scans and scores them.
+"""One run, for command line, Python and sweeps: opens the log, builds the stages, processes scan
+after scan and computes the errors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -69,16 +69,16 @@ Progress = Callable[[Iterable[Scan], int, str], Iterable[Scan]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """What to run.
+    """The definition of a run.
 
     Attributes:
         source: log, bag or folder of scans.
         options: how to read it.
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
-        prefetch: scans decoded ahead on a thread; the pipeline then has one, too. 0: one thread.
-            Same result.
-        growing: the log, if it is still written; a scan is replayed when it is there.
+        prefetch: number of scans that are decoded ahead on a thread; the pipeline then has a
+            thread, too. 0 uses one thread; the result is the same.
+        growing: the log, if it is still written; a scan is replayed as soon as it is there.
     """
 
     source: Path
@@ -90,18 +90,19 @@ class Job:
 
 
 class Run:
-    """An open run; a context manager. ``rows`` may be iterated once.
+    """An open run, which is a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        config: effective configuration.
-        surface: model of the target.
+        config: the effective configuration.
+        surface: the model of the target.
         registrar: registers scans against that model.
-        model_check: check of the model by the rows so far.
+        model_check: result of the check of the model by the rows so far.
         done: number of scans processed so far.
-        taken: their rows.
-        task: what is to be grasped, compared with the model.
+        taken: the rows of these scans.
+        task: the task of the gripper, compared with the model.
         flight: the flight of guidance so far, for the assessment of the capture.
-        acceleration: fitted to the poses, None where it is given.
+        acceleration: acceleration of the target that was fitted to the poses; None where it is
+            given.
     """
 
     def __init__(self, job: Job) -> None:
@@ -239,30 +240,38 @@ class Run:
         ):  # the pipeline has a thread of its own; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
-            if self._image is None and outcome.verdict.gamma:
-                self._follow(outcome)
-            self._healthy.add(state, outcome)
-            truth = self._truth_of(outcome.scan)
-            if self.job.growing:
-                self.job.growing.take(outcome.scan, self._true(outcome.scan))
             with shielded():
-                self.model_check.add(outcome.scan, outcome.alignment)
-            row = Row.of(outcome, self._scored.score(state, outcome, truth))
-            if truth.state is not None:
-                self._end = outcome.belief, truth.state
-            scan = ReplayedScan(outcome, state, truth, row)
-            for listener in listeners:
-                listener(scan)
-            self.flight.take(
-                at_grasp(outcome.belief, self.task.grasp_c),
-                state.guidance,
-                outcome.verdict.gamma,
-                outcome.monitors.converged,
-                None if outcome.innovation is None else outcome.innovation.R,
-            )
-            self.taken.append(row)
-            self._state, self.done = state, self.done + 1
+                row = self._take(state, outcome, listeners)
             yield row
+
+    def _take(self, state: PipelineState, outcome: Outcome, listeners: Sequence[Listener]) -> Row:
+        """Score a processed scan and hand it to everything that collects scans; the state of the
+        run is then that after this scan.
+        """
+        if self._image is None and outcome.verdict.gamma:
+            self._follow(outcome)
+        self._healthy.add(state, outcome)
+        assert self._scored is not None
+        truth = self._truth_of(outcome.scan)
+        if self.job.growing:
+            self.job.growing.take(outcome.scan, self._true(outcome.scan))
+        self.model_check.add(outcome.scan, outcome.alignment)
+        row = Row.of(outcome, self._scored.score(state, outcome, truth))
+        if truth.state is not None:
+            self._end = outcome.belief, truth.state
+        scan = ReplayedScan(outcome, state, truth, row)
+        for listener in listeners:
+            listener(scan)
+        self.flight.take(
+            at_grasp(outcome.belief, self.task.grasp_c),
+            state.guidance,
+            outcome.verdict.gamma,
+            outcome.monitors.converged,
+            None if outcome.innovation is None else outcome.innovation.R,
+        )
+        self.taken.append(row)
+        self._state, self.done = state, self.done + 1
+        return row
 
     def smoothed(self) -> Reference | None:
         """The best motion of all scans so far and its events; None with fewer than four healthy

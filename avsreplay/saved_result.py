@@ -49,16 +49,17 @@ class Saved:
     """The part of a result directory that planning uses.
 
     Attributes:
-        name: Name of the directory, for messages.
-        rows, beliefs: One per scan.
-        times_s, poses: Recorded true poses of {C} and their times after the first scan [s].
-        estimator: Estimator with the settings of the run.
-        plan, supervisor, limits, robot, task: Settings of the run.
-        noise: 1 sigma of a measured pose [m, rad of half angle], None where it is not known.
-        assessment: That of the run; None where the result has none.
-        extent_m: Diagonal of the target's bounding box [m].
-        surface: Thinned model of the target, None where the result has none.
-        warnings: Known defects of the result: not verified, or made from a damaged log.
+        name: name of the directory, for messages.
+        rows, beliefs: one of each per scan.
+        times_s, poses: recorded true poses of {C} in {A} and their times after the first scan [s].
+        estimator: estimator with the settings of the run.
+        plan, supervisor, limits, robot, task: settings of the run.
+        noise: standard deviations of a measured pose [m, rad of half angle], None where they are
+            not known.
+        assessment: the assessment of the run; None where the result has none.
+        extent_m: diagonal of the target's bounding box [m].
+        surface: thinned model of the target, None where the result has none.
+        warnings: known defects of the result: not verified, or made from a damaged log.
     """
 
     name: str

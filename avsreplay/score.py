@@ -1,5 +1,5 @@
-"""Every value that needs ground truth: errors, NEES and plan misses. ``pipeline.step`` has none of
-it.
+"""Every value that needs ground truth: errors, NEES and errors of plans. ``pipeline.step`` has no
+access to ground truth.
 
 The reference is the truth in the log, or a motion fitted to all healthy poses of the log
 (``run.fit_reference``).

@@ -108,7 +108,6 @@ def arithmetic_is_native():
 
 def serve():
     """Answer requests, one line each, until standard input ends."""
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
     import avsreplay.__main__
     import avsreplay.cli.run
     import avsreplay.run  # noqa: F401

@@ -16,16 +16,22 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
-from command_server import CommandServer
 
-from avsreplay.records import Surface
-from avsreplay.register.contract import boxes, example_pose, view
-from avsreplay.rows import Row
+ROOT = Path(__file__).resolve().parents[1]
+# Tests and the processes that they start import the package that is installed, in place or from a
+# wheel: the clone, which "python -m" puts on the path, has no compiled extensions.
+sys.path[:] = [entry for entry in sys.path if Path(entry or os.curdir).resolve() != ROOT]
+os.environ["PYTHONSAFEPATH"] = "1"
+
+from command_server import CommandServer  # noqa: E402
+
+from avsreplay.records import Surface  # noqa: E402
+from avsreplay.register.contract import boxes, example_pose, view  # noqa: E402
+from avsreplay.rows import Row  # noqa: E402
 
 hypothesis.settings.register_profile("without deadline", deadline=None)  # no test asserts a time
 hypothesis.settings.load_profile("without deadline")
 
-ROOT = Path(__file__).resolve().parents[1]
 SERVER = CommandServer()
 DATA = ROOT.parent / "shared" / "data"
 
@@ -200,6 +206,7 @@ def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, objec
         "fault": "full_occlusion" if blind else None,
         "points": 0 if blind else 4000,
         "estimator": "filter",
+        "motion": "free",
         "converged": k >= 10,
         "action": "approach",
         "supervisor_rule": "track",

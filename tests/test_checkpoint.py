@@ -9,6 +9,7 @@ import json
 import math
 import pickle
 import signal
+import sys
 from collections import Counter
 from dataclasses import replace
 from itertools import islice
@@ -355,3 +356,34 @@ def test_no_module_of_the_package_reads_code_from_bytes():
             if any(name.partition(".")[0] in {*CODE_FROM_BYTES, "eval", "exec"} for name in names):
                 found.append(f"{path.name}:{node.lineno}")
     assert found == []
+
+
+@pytest.mark.usefixtures("stoppable")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize("place", ["a listener", "the pipeline"])
+def test_a_second_ctrl_c_leaves_no_part_of_a_scan(fixtures_folder, tmp_path, monkeypatch, place):
+    """Wherever it arrives, the rows are those of whole scans, and the run continues from them."""
+    work = job(fixtures_folder / "tumble.mcap", n_scans=8)
+    assert replay(work, tmp_path / "whole") == 8
+
+    def twice(*_):
+        if len(run.taken) == 4:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    with Run(work) as run, ResultWriter(ResultDirectory(tmp_path / "r"), run) as writer:
+        listeners = writer.listeners
+        if place == "a listener":
+            listeners = listeners[0], twice, *listeners[1:]
+        else:
+            published = run.estimator.published
+            monkeypatch.setattr(
+                type(run.estimator), "published", lambda _, track: twice() or published(track)
+            )
+        rows = run.taken
+        assert _collect(run.rows(listeners), rows)
+        assert len(rows) == (5 if place == "a listener" else 4)
+        monkeypatch.undo()
+        writer.finish({**run.facts(), "rows so far": len(rows)}, resumable=True)
+    assert replay(work, tmp_path / "r", resume=True) == 8
+    assert files(tmp_path / "r") == files(tmp_path / "whole")

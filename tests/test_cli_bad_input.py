@@ -147,7 +147,7 @@ def test_without_arguments_the_help_is_printed(cli):
 
 
 def test_a_log_or_a_folder_without_rows_is_no_result(cli, log, tmp_path):
-    check_one_line(cli("plan", log), 3, "avsreplay run LOG -o DIR")
+    check_one_line(cli("plan", log), 3, "is a log, not a result", "avsreplay run")
     check_one_line(cli("plan", tmp_path), 3, "holds no rows.jsonl")
 
 
@@ -261,8 +261,14 @@ def test_a_scenario_and_a_result_are_no_logs(cli, tmp_path, fixtures_folder):
     assert (
         cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "-o", tmp_path / "r").code == 0
     )
-    result = cli("info", tmp_path / "r")
-    assert (result.code, "is the result of a run, not a log" in result.err) == (3, True)
+    for name in ("", "run.json", "rows.jsonl"):
+        result = cli("info", tmp_path / "r" / name)
+        assert (result.code, "is the result of a run, not a log" in result.err) == (3, True)
+
+
+def test_a_mode_given_as_start_time_names_the_option_for_modes(cli, log):
+    check_one_line(cli("run", log, "--start", "cold"), 2, "--start-mode cold")
+    check_one_line(cli("info", log, "--start", "cold"), 2, "no time in seconds")
 
 
 def test_a_rate_for_a_log_with_times_is_refused(cli, log):

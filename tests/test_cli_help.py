@@ -93,7 +93,7 @@ def test_an_argument_too_many_names_its_option(fixtures_folder):
 @pytest.mark.parametrize("command", ["plan", "report", "compare"])
 def test_a_log_is_no_result_and_the_message_says_how_to_make_one(command, fixtures_folder):
     said = refused(command, fixtures_folder / "tumble.mcap")
-    assert "avsreplay run LOG -o DIR" in said
+    assert "is a log, not a result; replay it first: avsreplay run " in said
     assert "rows.jsonl" not in said
 
 

@@ -69,7 +69,7 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
         "test_docs.py::test_the_estimator_of_the_tutorial_keeps_the_contract"
     ),
     "python3 -m venv .venv": ".ci/run",
-    "pip install -q '.[test]'": ".ci/run",
+    'pip install -q "$(ls dist/*.whl)[test]"': ".ci/run",
 }
 
 

@@ -24,7 +24,7 @@ from avsreplay.estimate.measurement import (
 )
 from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
 from avsreplay.geometry import Pose
-from avsreplay.records import Belief, Innovation, Reason, State, Verdict
+from avsreplay.records import Admission, Belief, Innovation, State
 
 WHITE = np.ones(2)
 QUIET = EstimatorParams(
@@ -130,7 +130,7 @@ def run(
         seen = estimator.innovate(
             prediction, tumbling.alignment(x.T_ac, rng, pos_m, np.radians(rot_deg), reported)
         )
-        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), True)
+        track, _ = estimator.step(track, prediction, seen, Admission.ADMITTED, True)
         yield track, seen
 
 
@@ -168,7 +168,7 @@ def test_one_noisy_scan_does_not_change_the_error_that_all_poses_have_in_common(
         seen = estimator.innovate(
             prediction, tumbling.alignment(x.T_ac, rng, noise_1s, np.radians(0.1))
         )
-        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), True)
+        track, _ = estimator.step(track, prediction, seen, Admission.ADMITTED, True)
         track = replace(track, levels=noise_levels.NO_LEVELS)  # common errors as claimed
         variances.append(float(np.trace(estimator.published(track).P - track.belief.P)))
     assert np.trace(track.R[:3, :3]) > 50.0 * 3.0 * 0.002**2

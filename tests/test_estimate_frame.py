@@ -19,7 +19,7 @@ from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.mixture import Component, mixture_forecast
 from avsreplay.estimate.params import Start
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus, Belief, Reason, Verdict
+from avsreplay.records import Admission, Alignment, AlignStatus, Belief
 
 FAR = np.array([12.0, -5.0, 9.0])
 AHEAD = np.array([0.0, 5.0, 30.0])
@@ -55,7 +55,7 @@ def followed(
     for t, alignment in seen:
         prediction = estimator.predict(track, round(t * 1e9))
         innovation = estimator.innovate(prediction, alignment)
-        track, _ = estimator.step(track, prediction, innovation, Verdict(1, Reason.OK), False)
+        track, _ = estimator.step(track, prediction, innovation, Admission.ADMITTED, False)
         nis.append(innovation.chi2)
     return nis, track
 

@@ -33,7 +33,7 @@ from avsreplay.estimate.mixture import (
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Belief, Reason, State, Verdict
+from avsreplay.records import Admission, Belief, State
 
 C = np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
 ROOT = np.linalg.inv(np.linalg.cholesky(C))
@@ -281,7 +281,7 @@ def after_scans(times: Array, states: list[State], seed: int) -> tuple[Estimator
         seen = estimator.innovate(
             prediction, tumbling.alignment(x.T_ac, rng, 2e-3, np.radians(0.1))
         )
-        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), False)
+        track, _ = estimator.step(track, prediction, seen, Admission.ADMITTED, False)
     return estimator, track
 
 

@@ -11,13 +11,24 @@ import pytest
 
 from avsreplay.geometry import Pose
 from avsreplay.monitor.fault_detection import (
+    RULES,
     FaultDetector,
     FaultParams,
     Policy,
     pose_limit,
     weighted_norm,
 )
-from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, State
+from avsreplay.records import (
+    Admission,
+    Alignment,
+    AlignStatus,
+    Belief,
+    Finding,
+    Innovation,
+    Reason,
+    ScanStatus,
+    State,
+)
 
 PRIOR = Belief(
     0,
@@ -42,8 +53,16 @@ def judge(
     status=ScanStatus.OK,
     **params,
 ):
-    detector = FaultDetector(FaultParams(**params), 8.0)
-    return detector.judge(status, alignment, seen() if innovation is None else innovation, PRIOR)
+    innovation = seen() if innovation is None else innovation
+    return judged(FaultDetector(FaultParams(**params), 8.0), status, alignment, innovation)
+
+
+def judged(detector, status, alignment, innovation, repeated=False, finding=None, followed=False):
+    """The verdict where the estimate uses each admitted pose, or has found something else."""
+    examined = detector.examine(status, alignment, innovation, PRIOR, repeated)
+    admitted = examined.admission is Admission.ADMITTED
+    found = finding or (Finding.AGREES if admitted else Finding.UNTESTED)
+    return detector.judge(examined, found, followed)
 
 
 def test_a_good_scan_is_healthy() -> None:
@@ -76,7 +95,7 @@ def test_missing_and_empty_scans_are_faults() -> None:
     assert judge(status=ScanStatus.DAMAGED).reason is Reason.NO_SCAN
     assert judge(status=ScanStatus.CLOCK).reason is Reason.CLOCK
     assert (
-        FaultDetector(FaultParams(), 8.0).judge(ScanStatus.OK, None, None, PRIOR).reason
+        judged(FaultDetector(FaultParams(), 8.0), ScanStatus.OK, None, None).reason
         is Reason.NOT_ALIGNED
     )
 
@@ -86,13 +105,13 @@ def test_a_scan_that_repeats_the_one_before_is_frozen_unless_its_pose_is_the_pre
 ):
     detector, moved = FaultDetector(FaultParams(), 8.0), seen(0.001)
     assert moved.chi2 > 6.0
-    judged = [
-        detector.judge(ScanStatus.OK, GOOD, innovation, PRIOR, repeated)
+    found = [
+        judged(detector, ScanStatus.OK, GOOD, innovation, repeated)
         for innovation, repeated in ((moved, True), (moved, False), (seen(), True))
     ]
-    assert [v.reason for v in judged] == [Reason.FROZEN, Reason.OK, Reason.OK]
+    assert [v.reason for v in found] == [Reason.FROZEN, Reason.OK, Reason.OK]
     printed = FaultDetector(FaultParams(policy=Policy.ALL), 8.0)
-    assert printed.judge(ScanStatus.OK, GOOD, moved, PRIOR, True).gamma == 1
+    assert judged(printed, ScanStatus.OK, GOOD, moved, True).gamma == 1
 
 
 def test_a_degenerate_view_is_not_a_fault() -> None:
@@ -104,6 +123,41 @@ def test_the_first_reason_that_holds_is_given() -> None:
     assert judge(worst, seen(5.0)).reason is Reason.NOT_CONVERGED
     assert judge(replace(worst, converged=True), seen(5.0)).reason is Reason.FEW_INLIERS
     assert judge(replace(GOOD, rms_m=1.0), seen(5.0)).reason is Reason.FIT_ERROR
+
+
+NEAR, FAR = seen(0.001), seen(5.0)
+
+
+@pytest.mark.parametrize(
+    ("innovation", "finding", "reason"),
+    [
+        (NEAR, Finding.AGREES, Reason.OK),
+        (FAR, Finding.EXPLAINED, Reason.OK),
+        (NEAR, Finding.OPEN, Reason.DOUBTFUL),
+        (FAR, Finding.OPEN, Reason.POSE_JUMP),
+        (FAR, Finding.UNTESTED, Reason.POSE_JUMP),
+        (NEAR, Finding.OFFSET, Reason.SENSOR_BIAS),
+        (FAR, Finding.OFFSET, Reason.SENSOR_BIAS),
+        (NEAR, Finding.UNEXPLAINED, Reason.WRONG_SCAN),
+        (FAR, Finding.UNEXPLAINED, Reason.WRONG_SCAN),
+    ],
+)
+def test_the_reason_is_that_which_decided(innovation, finding, reason) -> None:
+    """The estimate decides on what no other rule refuses, and the pose test while it has not."""
+    detector = FaultDetector(FaultParams(), 8.0)
+    found = judged(detector, ScanStatus.OK, GOOD, innovation, finding=finding)
+    assert (found.gamma, found.reason) == (int(reason is Reason.OK), reason)
+    confirmed = judged(detector, ScanStatus.OK, GOOD, innovation, finding=finding, followed=True)
+    assert confirmed.gamma == 1
+    late = judged(detector, ScanStatus.CLOCK, GOOD, innovation, finding=finding, followed=True)
+    assert (late.gamma, late.reason) == (0, Reason.CLOCK)
+
+
+def test_every_reason_has_a_rule_and_the_last_rule_always_holds() -> None:
+    assert {rule.reason for rule in RULES} == set(Reason)
+    never = FaultDetector(FaultParams(policy=Policy.ALL), 8.0)
+    open_ = judged(never, ScanStatus.OK, GOOD, FAR, finding=Finding.OPEN)
+    assert open_.reason is Reason.DOUBTFUL
 
 
 def test_weighted_norm_uses_the_full_angle() -> None:

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan._cone import Body
 from avsreplay.plan.cone_programme import solve
-from avsreplay.plan.constrained import constrained
+from avsreplay.plan.constrained import constrained, linearised_s, with_safety
 from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
-from avsreplay.plan.withdrawal import KEPT_SHARE, Space, coasting, withdrawal
+from avsreplay.plan.withdrawal import KEPT_SHARE, Space, coasting, escapes_at, withdrawal
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from plan_scenes import problems
@@ -114,6 +114,23 @@ def test_cone_holds_between_nodes_and_costs_time():
     near = distance <= 2.0
     assert near.sum() > 100
     assert np.max((off - math.tan(math.radians(25.0)) * along - 0.01)[near]) <= 1e-6
+
+
+@pytest.mark.parametrize("towards", [-1.0, 1.0])
+def test_the_linearised_time_to_go_follows_that_of_new_plans(towards):
+    """A target that is displaced along the way by 4 cm."""
+    scene, limits = body(), Limits(cone_deg=25.0, cone_range_m=2.0, mouth_m=0.01)
+    shift = np.array([0.0, 0.0, 0.04 * towards])
+
+    def goal(t):
+        position, velocity = scene.goal(t)
+        return position + shift, velocity
+
+    moved = replace(scene, goal=goal)
+    plan, other = (constrained(s, ORIGIN, ORIGIN, PARAMS, limits) for s in (scene, moved))
+    own = path_of(plan, ORIGIN, ORIGIN), PARAMS, limits, 8.0
+    found = linearised_s(moved, *own) - linearised_s(scene, *own)
+    assert found == pytest.approx(other.t_go_s - plan.t_go_s, rel=0.15)
 
 
 def test_last_metres_go_along_the_axis():
@@ -320,12 +337,13 @@ def test_a_withdrawal_from_any_instant_keeps_the_stated_margin(phase):
     limits = Limits(final_deg=15.0, clearance_m=0.3).resolved(2.0)
     plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits, extent_m=2.0)
     path = path_of(plan, ORIGIN, ORIGIN)
+    plan = with_safety(scene, plan, path, PARAMS, limits, 2.0)
     assert plan.abort_margin_m >= 0.0
     for t in np.linspace(0.0, plan.t_go_s, 300, endpoint=False):
         (r,), (v,) = path.at(np.array([t]))
         later = scene.after(t)
         space = Space(SampledScene(later, 60.0, 0.2, 45.0), limits, PARAMS.a_max_mps2, 2.0)
-        planned = path.escapes[np.abs(path.escapes[:, 0] - t).argmin(), 1:]
+        (planned,) = escapes_at(path.escapes, np.array([t]))
         away = withdrawal(space, r, v, 1.0, planned=planned).path
         times = np.arange(0.0, away.t_go_s + 0.05, 0.05)
         turn = Rotation.from_quat(later.attitude(times))

@@ -3,6 +3,7 @@ the rows of a run.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,12 @@ import pytest
 from avsreplay import geometry, replay
 from avsreplay.build import target_geometry
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.limits import Scene, margins
+from avsreplay.plan.limits import Scene, axis_blocked, margins
 from avsreplay.plan.path import path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.records import Surface
-from avsreplay.simulate.target import builtin_surface
+from avsreplay.simulate.target import Shape, builtin_surface
 
 X = np.array([1.0, 0.0, 0.0])
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -201,3 +202,49 @@ def test_every_plan_of_a_run_obeys_the_limits():
     free = [row for row in replay(TUMBLE, *soon) if row.capture_time_s is not None]
     assert min(r.capture_time_s for r in planned) >= min(r.capture_time_s for r in free) - 1e-6
     assert all(row.plan_margin_m is None for row in free)
+
+
+def test_a_corridor_that_ends_inside_the_part_at_the_grasp_point_is_named():
+    """The pin of the bracket stands at its grasp point; the named length leads out of it."""
+    surface = builtin_surface(Shape.BRACKET)
+    target = target_geometry(surface, (1.0, 0.0, 0.0))
+    scene = still(surface=target.surface)
+    limits = Limits(final_deg=15.0, clearance_m=0.06, final_range_m=0.01).resolved(surface.extent)
+    name, until_m, short_m = axis_blocked(scene, limits, surface.extent)
+    assert name == "body"
+    assert until_m > 0.01
+    assert short_m > 0.0
+    longer = replace(limits, final_range_m=1.05 * until_m)
+    assert axis_blocked(scene, longer, surface.extent) is None
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.01, 0.1])
+def test_an_uncertain_target_narrows_the_corridor_at_most_to_half(sigma):
+    limits = Limits(final_deg=15.0, final_range_m=0.5, mouth_m=0.02).resolved(2.0)
+    x = np.linspace(0.0, 0.5, 11)
+    y = np.column_stack([x, 0.3 * (math.tan(math.radians(15.0)) * x + 0.02), 0.0 * x])
+    exact = margins(still(), limits, y, y).first[:, 1]
+    known = sigma + 0.0 * x, 0.0 * x
+    found = exact - margins(still(), limits, y, y, known).first[:, 1]
+    width = math.tan(math.radians(15.0)) * x + 0.02
+    assert found == pytest.approx(np.minimum(3.0 * sigma, 0.5 * width))
+
+
+def test_a_plan_for_an_uncertain_target_stays_inside_the_corridor_of_displaced_targets():
+    """Displacements up to what the plan allows for; the plan for an exact target leaves it."""
+    limits = Limits(final_deg=12.0, final_range_m=0.6, mouth_m=0.06).resolved(2.0)
+    known = replace(still(), sigma=lambda t: (np.full(len(t), 0.01), np.zeros(len(t))))
+    start, zero = np.array([4.0, 1.0, 1.0]), np.zeros(3)
+    params, shift = PlanParams(a_max_mps2=0.05), 0.029
+
+    def worst(scene):
+        plan = constrained(scene, start, zero, params, limits, extent_m=2.0)
+        times = np.linspace(0.0, plan.t_go_s, 400)[:-1]
+        r = path_of(plan, start, zero).at(times)[0]
+        y = (r - scene.goal(times)[0]) @ geometry.matrix(scene.attitude(times)[:1])[0]
+        angles = np.linspace(0.0, 2.0 * np.pi, 13)
+        moved = [y + shift * np.array([0.0, np.cos(a), np.sin(a)]) for a in angles]
+        return min(margins(scene, limits, m, m).values[:, 1].min() for m in moved)
+
+    assert worst(known) >= -1e-3
+    assert worst(still()) < -0.01

@@ -285,3 +285,40 @@ def test_a_capture_hours_ahead_is_found():
     params = PlanParams(horizon_s=5e4, grid_s=10.0)
     plan = rendezvous(goal, np.zeros(3), np.zeros(3), params)
     assert plan.t_go_s == pytest.approx(40_000.0, rel=1e-9)
+
+
+def spinning(rate, arm=0.3):
+    """A grasp point that turns about an inclined axis, in closed form."""
+    axis = np.array([math.sin(0.3), 0.0, math.cos(0.3)])
+    e = np.array([math.cos(0.3), 0.0, -math.sin(0.3)])
+    f = np.cross(axis, e)
+
+    def goal(t):
+        c, s = np.cos(rate * t)[:, None], np.sin(rate * t)[:, None]
+        return np.array([0.0, 0.0, 5.0]) + arm * (c * e + s * f), arm * rate * (c * f - s * e)
+
+    return goal
+
+
+@pytest.mark.parametrize("turns_per_sample", [0.3, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("share", [0.1, 1.2])
+def test_a_target_that_turns_far_between_two_samples_is_captured(turns_per_sample, share):
+    """The spacing of the samples follows the target, also where it turns a whole number of times
+    from one to the next. A thrust beyond the centripetal one can follow it; a smaller one meets it
+    once.
+    """
+    rate = 2.0 * math.pi * turns_per_sample / PlanParams().grid_s
+    goal, zero = spinning(rate), np.zeros(3)
+    plan = rendezvous(goal, zero, zero, PlanParams(a_max_mps2=share * 0.3 * rate**2))
+    assert plan.status is PlanStatus.OPTIMAL
+    path = CostatePath.of(plan, zero, zero)
+    (r,), (v,) = path.at(np.array([plan.t_go_s]))
+    (rho,), (rate_at,) = goal(np.array([plan.t_go_s]))
+    assert np.linalg.norm(r - rho) < 1e-8
+    assert np.linalg.norm(v - rate_at) < 1e-8
+
+
+def test_a_fast_target_is_proven_out_of_reach_of_a_weak_robot():
+    """Its speed of 2.4 m/s cannot be reached in 40 s with 0.05 m/s2."""
+    plan = rendezvous(spinning(8.0), np.zeros(3), np.zeros(3), PlanParams(horizon_s=40.0))
+    assert plan.status is PlanStatus.INFEASIBLE

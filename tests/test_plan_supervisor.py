@@ -106,6 +106,22 @@ def test_a_hold_keeps_its_begin_and_loses_it_when_it_ends():
     assert memory.held_since_s is None
 
 
+@pytest.mark.parametrize("scans", [1, 2])
+def test_holds_of_single_scans_use_no_attempt(scans):
+    """Twenty holds that are shorter than a gap that is bridged, in one approach."""
+    supervisor, memory = Supervisor(PARAMS), SupervisorMemory()
+    t, held = 0.0, 0
+    for _ in range(20):
+        for converged in (*[True] * 4, *[False] * scans):
+            t += 0.2
+            facts = dataclasses.replace(GOOD, t_s=t, converged=converged)
+            memory, decision = supervisor.decide(memory, facts)
+            held += decision.rule == "convergence_lost"
+    assert held == 20 * scans
+    assert memory.attempts == 1
+    assert memory.action is not Action.ABORT
+
+
 def test_lengths_scale_with_the_target():
     small, big = SupervisorParams().resolved(0.2), SupervisorParams().resolved(8.0)
     assert big.capture_pos_m == pytest.approx(0.02)

@@ -619,3 +619,23 @@ def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
     assert advice.about == "background"
     wanted = ("--region",) if approaches else ("--crop-box", "--crop-range")
     assert advice.option.split()[0] in wanted
+
+
+def test_the_region_begins_where_the_target_is_at_the_first_scan():
+    """The target comes from 30 to 6 sizes over 41 scans; in the first one it has few points."""
+    surface, pose = boxes(), example_pose()
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    seen = pose.apply(view(surface, 600, pose.inverse().t)) - pose.t
+    x, y = np.meshgrid(np.linspace(-6, 6, 40), np.linspace(-6, 6, 40))
+    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -2.0)], axis=1) * size
+    clouds = []
+    for k in range(41):
+        at = np.array([(30.0 - 0.6 * k) * size, 0.0, 0.0])
+        clouds.append(np.concatenate([seen[:: 40 if k < 8 else 1] + at, floor + at]))
+    advice = _found(preflight(Log(clouds), surface), "background")
+    option, position = advice.option.split()
+    assert option == "--region"
+    first = np.array([float(v) for v in position.split(",")])
+    assert np.linalg.norm(first - [30.0 * size, 0.0, 0.0]) < 0.5 * size
+    followed = preflight(Log(clouds), surface, followed=True)
+    assert not [each for each in followed if each.about == "background"]

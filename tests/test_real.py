@@ -226,3 +226,27 @@ def test_a_carton_in_a_depth_scene_is_found_with_the_crop_that_info_proposes(
     there = geometry.matrix(expected) @ centre + [-0.150, 0.223, -0.041]
     assert np.linalg.norm(geometry.matrix(q) @ centre + t - there) < 0.01
     assert np.degrees(geometry.angle(geometry.multiply(geometry.conjugate(expected), q))) < 3.0
+
+
+@pytest.mark.slow
+def test_a_parked_van_is_followed_from_42_m_with_the_options_that_info_writes(
+    shared_data, tmp_path, cli
+):
+    """Two commands, with ground and neighbours in the scans. The labels are known to 0.2 m and
+    2 deg (the data's README).
+    """
+    import json
+    import runpy
+    from unittest import mock
+
+    source = shared_data / "kitti-van-parked"
+    van, job = tmp_path / "van.ply", tmp_path / "van.toml"
+    words = ["make_model.py", "96", "112", str(van), "--mirror", "--data", str(source)]
+    with mock.patch("sys.argv", words):
+        runpy.run_path(str(source / "make_model.py"), run_name="__main__")
+    scans = source / "scans"
+    cli("info", scans, "--model", van, "--cloud-model", "--end", 8.95, "--write", job)
+    done = cli("run", job, "--truth", source / "truth_labels.tum", "--json")
+    used = [row for row in json.loads(done.out)["rows"] if row["gamma"]]
+    assert len(used) >= 80
+    assert np.median([row["reg_pos_err_m"] for row in used]) < 0.2

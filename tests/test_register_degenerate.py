@@ -153,9 +153,9 @@ def test_the_estimate_of_a_body_of_revolution_states_that_its_rotation_is_not_de
         points = scan_of(surface, T_ac, k)
         found = first if k == 0 else registrar.register(points, prior.belief.x.T_ac, k)
         innovation = estimator.innovate(prior, found)
-        verdict = judge.judge(ScanStatus.OK, found, innovation, prior.belief)
-        track, verdict = estimator.step(track, prior, innovation, verdict, False)
-        used += verdict.gamma
+        examined = judge.examine(ScanStatus.OK, found, innovation, prior.belief)
+        track, finding = estimator.step(track, prior, innovation, examined.admission, False)
+        used += finding.used
     belief = estimator.published(track)
     assert used >= 28
     assert np.linalg.norm((poses[-1].inverse() @ belief.x.T_ac).t) < 0.002

@@ -160,8 +160,8 @@ def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
     for pattern in (
         r"full_occlusion .* 6/6 .*detected +0\.00 +0\.00",
         r"range_bias .* 0/1 .*missed +\S +\S$",
-        r"clutter .* 0/1 .*harmless, used",
-        r"2 injected, 1 detected, 1 missed; 6 of 7 harmful scans",
+        r"clutter .* 0/1 .*usable, used",
+        r"2 injected, 1 detected, 1 missed; 6 of 7 unusable scans",
     ):
         assert re.search(pattern, text, re.MULTILINE), pattern
 

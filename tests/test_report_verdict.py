@@ -195,7 +195,10 @@ def test_a_missed_fault_fails_and_is_named(make_rows):
     rows = [dataclasses.replace(r, fault="range_bias") if 50 <= r.seq <= 55 else r for r in rows]
     found = _judged(rows, labels=[*_labels(rows), missed])
     assert found.grade is Grade.FAIL
-    assert "1 of 2 harmful faults were not detected, the first: range bias at 10.0 s" in found.line
+    assert (
+        "1 of 2 faults with unusable scans were not detected, the first: range bias at 10.0 s"
+        in found.line
+    )
 
 
 def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
@@ -361,8 +364,11 @@ def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
         changed = [dataclasses.replace(r, **used) if r.seq == at else r for r in rows]
         found = verdict_of(changed, Summary.fold(changed, labels=labels), HEADER)
         assert found.grade is Grade[grade], found.line
-        assert ("scans with a harmful fault were used" in found.line) == (grade != "PASS")
-    assert "1 of 6 scans with a harmful fault were used, with a position error up to " in found.line
+        assert ("scans that faults make unusable were used" in found.line) == (grade != "PASS")
+    assert (
+        "1 of 6 scans that faults make unusable were used, with a position error up to "
+        in found.line
+    )
 
 
 def test_a_rejected_measurement_is_no_moment_of_its_own(make_rows):
@@ -404,3 +410,21 @@ def test_any_rows_get_a_verdict(make_rows):
             dataclasses.replace(r, gamma=int(rng.integers(2)), fault=None) for r in make_rows(n)
         ]
         assert _judged(rows, labels=None, header=None).line
+
+
+def test_what_the_poses_show_of_the_motion_is_said(make_rows):
+    """No free motion, random disturbances, two rates; each is a reason of its own."""
+
+    def texts(rows):
+        return " ".join(reason.text for reason in verdict_of(rows, Summary.fold(rows)).reasons)
+
+    free = make_rows(40, blackout=range(0))
+    assert "move freely" not in texts(free)
+    replaced = dataclasses.replace
+    driven = [replaced(r, motion="driven") if r.seq >= 30 else r for r in free]
+    assert "no free motion explains the poses of 10 of 40 scans, first at" in texts(driven)
+    pushed = [replaced(r, motion="disturbed", torque_noise_radps15=1e-4) for r in free]
+    assert "does not move freely: random torques or forces act, 0.0001 rad/s^1.5" in texts(pushed)
+    assert "both explain" not in texts(free)
+    fast = [replaced(r, alias_slow_radps=5.57, alias_fast_radps=7.0) for r in free]
+    assert "rates of 5.57 and 7 rad/s both explain the poses" in texts(fast)

@@ -25,6 +25,18 @@ def test_importing_the_package_does_nothing():
     }
 
 
+def test_tests_and_their_processes_import_the_package_that_is_installed():
+    import avsreplay
+    import avsreplay.register._kernel as kernel
+
+    code = (
+        "import avsreplay, avsreplay.register._kernel as k; print(avsreplay.__file__, k.__file__)"
+    )
+    done = run(sys.executable, "-c", code)
+    assert done.stdout.split() == [avsreplay.__file__, kernel.__file__], done.stderr
+    assert str(ROOT) not in sys.path
+
+
 def test_help_loads_no_heavy_library():
     code = (
         "import sys\nfrom avsreplay.cli.main import group\n"

@@ -1,1 +1,1 @@
-"""The command line; no other package prints or exits."""
+"""The command line. Only this package prints or ends the process."""

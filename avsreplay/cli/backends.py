@@ -1,5 +1,5 @@
-"""``avsreplay backends`` and ``avsreplay bench``: the registration back ends, their laws,
-speed and error on a log.
+"""``avsreplay backends`` and ``avsreplay bench``: the registration back ends, their contract, and
+their speed and error on a log.
 """
 
 from __future__ import annotations
@@ -92,12 +92,12 @@ def _check(name: str, as_json: bool) -> None:
 
 
 def report_laws(kind: str, name: str, findings: Sequence[LawResult], as_json: bool) -> None:
-    """Print the laws of a contract and what was found of a part.
+    """Print the laws of a contract and the result of each.
 
     Args:
-        kind: of the part, the key of its name in JSON.
-        name: of the part.
-        findings: of the laws.
+        kind: kind of the part, the key of its name in JSON.
+        name: name of the part.
+        findings: the results of the laws.
         as_json: print JSON.
 
     Raises:
@@ -124,11 +124,7 @@ def _finding_row(finding: LawResult) -> tuple[str, ...]:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON document.
-
-    Args:
-        value: of plain JSON values.
-    """
+    """Print a value as one JSON document."""
     click.echo(json.dumps(value, indent=2))
 
 
@@ -136,8 +132,8 @@ def print_plain_table(title: str, heads: tuple[str, ...], rows: Iterable[Iterabl
     """Print a table of texts.
 
     Args:
-        title: above the table.
-        heads: of the columns.
+        title: title above the table.
+        heads: headings of the columns.
         rows: one text for each column.
     """
     from avsreplay.report.table import Table, make_console, print_table
@@ -269,12 +265,17 @@ def bench_command(
 
 
 def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
-    """Time every back end on every scan that has points; all back ends process a scan before the
-    next scan is taken.
+    """Measure the time of every back end on every scan that has points. All back ends process a
+    scan before the next scan is taken.
 
-    A scan is its points (n, 3) in {A} [m] and the true pose T_ac, or None.
+    Args:
+        names: names of the back ends.
+        surface: model of the target.
+        scans: points (n, 3) of each scan in {A} [m] and its true pose T_ac, or None.
 
-    Raises UsageError or MissingBackend for a name that cannot be built, before anything is timed.
+    Raises:
+        UsageError, MissingBackend: a back end does not exist or is not installed; this is found
+            before anything is measured.
     """
     from avsreplay.cli.options import tracked
     from avsreplay.errors import UsageError

@@ -37,7 +37,12 @@ ASSIGNED = {
 
 
 def declared(owner: str, key: str) -> Entry:
-    """The declaration of a setting: ``owner`` is ``module:class``, ``key`` its dotted key."""
+    """Return the declaration of a setting.
+
+    Args:
+        owner: class that declares it, as ``module:class``.
+        key: its dotted key.
+    """
     from avsreplay.settings import entries
 
     module, _, name = owner.partition(":")

@@ -342,10 +342,10 @@ def _faults(info: LogInfo) -> Table:
     from avsreplay.report.table import Table
 
     rows = tuple(
-        (shown(kind), f"{start:.3f}", f"{end:.3f}", "yes" if harmful else "no")
+        (shown(kind), f"{start:.3f}", f"{end:.3f}", "no" if harmful else "yes")
         for kind, start, end, harmful in info.faults
     )
-    return Table("Injected faults", ("fault", "start\n[s]", "end\n[s]", "harmful"), rows)
+    return Table("Injected faults", ("fault", "start\n[s]", "end\n[s]", "scans\nusable"), rows)
 
 
 DOCTOR_EPILOG = """\b

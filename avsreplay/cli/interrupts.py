@@ -10,11 +10,13 @@ _ignored: list[bool] = []
 
 
 def hear() -> list[int]:
-    """Let SIGTERM and SIGHUP, unless they are ignored, act as SIGINT; return the list that
-    receives their numbers.
+    """Make SIGTERM and SIGHUP act as SIGINT, unless they are ignored.
 
-    A shell starts a command in the background with SIGINT ignored. It stays so, but a SIGINT that
-    stands for one of the other signals counts.
+    A shell starts a command in the background with SIGINT ignored. It stays ignored, but a SIGINT
+    that stands for one of the other signals counts.
+
+    Returns:
+        The list that receives the numbers of the signals.
     """
     del _received[:], _ignored[:]
     with contextlib.suppress(ValueError):  # a thread other than the main one sets no handler

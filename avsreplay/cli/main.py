@@ -155,8 +155,8 @@ PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", 
 
 
 def versions() -> dict[str, str]:
-    """Versions of the package, Python and its dependencies; "missing" where one is not
-    installed.
+    """Return the versions of the package, of Python and of the dependencies, by name; "missing" for
+    one that is not installed.
     """
     import platform
     from importlib import metadata

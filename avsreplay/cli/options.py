@@ -4,6 +4,7 @@ interruption between scans.
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
 import tempfile
@@ -54,6 +55,23 @@ class Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
+class Seconds(click.ParamType[float]):
+    """A time in seconds."""
+
+    name = "float"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """A float; for a start mode the usage error names the option that takes it."""
+        modes = [p for p in (ctx.command.params if ctx else ()) if "--start-mode" in p.opts]
+        try:
+            return float(value)
+        except ValueError:
+            hint = f"; to choose how the estimate begins, use --start-mode {value}" if modes else ""
+            self.fail(f"'{value}' is no time in seconds{hint}", param, ctx)
+
+
 def added(*options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds ``options`` to a command in this order."""
 
@@ -81,7 +99,7 @@ truth_options = added(
 """Options for the true poses."""
 scan_options = added(
     source_setting("-t", "--topic", common=True),
-    source_setting("--start", "start_s", type=float, common=True),
+    source_setting("--start", "start_s", type=Seconds(), common=True),
     source_setting("--end", "end_s", type=float),
     source_setting("--duration", "duration_s", type=float, common=True),
     source_setting("-n", "--n-scans", type=int, common=True),
@@ -124,7 +142,10 @@ _CHOICES = {
 
 
 def read_options(flags: Mapping[str, Any]) -> SourceOptions:
-    """The given (not None) options as ``SourceOptions``.
+    """Return the options that were given (not None) as ``SourceOptions``.
+
+    Args:
+        flags: options by the names of their fields.
 
     Raises:
         UsageError: a value is not allowed.
@@ -283,8 +304,12 @@ PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield the items and show the progress on stderr; ``total`` 0 means that their number is
-    unknown.
+    """Yield items and show the progress on stderr.
+
+    Args:
+        items: the items.
+        total: their number, 0 if it is unknown.
+        what: what is being done, in words.
     """
     if not sys.stderr.isatty():
         yield from _with_lines(items, total, what)
@@ -324,45 +349,50 @@ _GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
 
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
+    """Yield a function that returns whether Ctrl-C was pressed; the scan in progress is finished.
 
-    A scan that takes longer than ``_GRACE_S`` after the first one is given up; its row is missing.
+    A scan that takes longer than ``_GRACE_S`` after this, or until a second Ctrl-C, is given up:
+    its row is missing. What collects scans is never left with a part of one.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
         stop: called at the first Ctrl-C.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed a second time, or before the first result.
+        KeyboardInterrupt: the scan in progress was given up.
     """
     asked: list[int] = []
+    ended = threading.Event()
 
     def ask(number: int, _frame: object) -> None:
         if not interrupts.counts():
             return
         asked.append(number)
+        if ended.is_set():
+            return
         stop()
         if not rows or len(asked) > 1:
-            request_stop()
-            raise KeyboardInterrupt
-        late.start()
+            interrupt.stop()
+        elif not late.is_alive():
+            late.start()
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    from avsreplay.register.interrupt import request_stop
+    from avsreplay.register import interrupt
 
-    late = threading.Timer(_GRACE_S, request_stop)
+    late = threading.Timer(_GRACE_S, _thread.interrupt_main)  # as a second Ctrl-C
     late.daemon = True
     before = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: bool(asked)
     finally:
-        signal.signal(signal.SIGINT, before)
+        ended.set()  # what arrives from here on does not leave this block half done
         late.cancel()
         if late.is_alive():
             late.join()
-        request_stop(False)
+        signal.signal(signal.SIGINT, before)
+        interrupt.request_stop(False)
 
 
 _LIVE_HEAD = "  scan     t [s]  state             rms [mm]     nis pos err [mm] rot err [deg]"

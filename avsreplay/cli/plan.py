@@ -178,7 +178,7 @@ def plan_command(
     robot, arm = with_arm(saved.robot)
     planning = _planning(replace(saved, robot=robot), flags, arm)
     index = saved.index_at(at_s)
-    made = _usable(lambda: planning.plan_at(index))
+    made = _usable(lambda: planning.stated(index, planning.plan_at(index)))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
     assessment = _usable(lambda: planning.assess(index, flights, seed))
@@ -189,10 +189,7 @@ def plan_command(
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    passive = planning.passive(index, made)
-    answer = Answer(
-        planning, at_s, made, assessment, spread, joints, hindsight, execution, changes, passive
-    )
+    answer = Answer(planning, at_s, made, assessment, spread, joints, hindsight, execution, changes)
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:
@@ -333,7 +330,7 @@ def _animate(answer: Answer, index: int, path: Path) -> str:
         raise UsageError(
             "there is no plan to show", where=str(path), hint=f"its status is {made.status.value}"
         )
-    facts = plan_facts(planning, answer.at_s, made, answer.passive)
+    facts = plan_facts(planning, answer.at_s, made)
     title = f"{planning.saved.name}: flight planned at {answer.at_s:.2f} s"
     page = build_flight_page(
         title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts

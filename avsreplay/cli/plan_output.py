@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from avsreplay.plan.flights import Execution, Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread
-    from avsreplay.plan.withdrawal import Certificate
     from avsreplay.replan import Replanning
     from avsreplay.report.table import Table
 
@@ -48,12 +47,11 @@ class Answer:
         at_s: instant of planning [s after the first scan].
         made: the plan.
         assessment: whether the robot would capture, by the whole flight.
-        spread: the one plan flown blind, over the belief; None without a plan.
-        joints: of an arm during the last metres; None without an arm.
+        spread: the plan flown without replanning, over draws from the belief; None without a plan.
+        joints: joints of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
         execution: the simulated approach; None without ground truth.
         changes: single changes with which a plan is found, where there is none.
-        passive: margin of a robot that coasts after a cut of its thrust; None where not checked.
     """
 
     planning: Replanning
@@ -65,7 +63,6 @@ class Answer:
     hindsight: list[tuple[float, Plan, Miss | None]]
     execution: Execution | None
     changes: list[PossibleChange]
-    passive: Certificate | None = None
 
 
 def document(answer: Answer) -> str:
@@ -81,9 +78,6 @@ def document(answer: Answer) -> str:
         "capture": answer.assessment.record(),
         "made_at_s": answer.at_s,
         "plan": _plan_record(answer.made, answer.at_s),
-        "passive": None
-        if answer.passive is None
-        else {"margin_m": answer.passive.margin_m, "safe_until_s": answer.passive.safe_s},
         "changes": [{"option": c.option, "capture_time_s": c.capture_s} for c in answer.changes],
         "limits": settings.dump(planning.limits),
         "params": settings.dump(planning.params),
@@ -124,6 +118,8 @@ def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
         "margin_m": made.margin_m,
         "limit": made.binding or None,
         "abort_margin_m": made.abort_margin_m,
+        "passive_margin_m": made.passive_margin_m,
+        "passive_safe_s": made.passive_safe_s,
         "attitude_s": made.attitude_s,
         "delayed_by": made.delayed_by or None,
     }
@@ -145,7 +141,7 @@ def print_answer(answer: Answer) -> None:
     print_line(console, f"{answer.assessment.sentence}.")
     console.print()
     print_table(console, facts_table("Capture", answer.assessment.described()))
-    facts = plan_facts(answer.planning, answer.at_s, answer.made, answer.passive)
+    facts = plan_facts(answer.planning, answer.at_s, answer.made)
     for found in (answer.joints, answer.spread):
         facts += found.described() if found else []
     if not answer.made.found:
@@ -184,9 +180,7 @@ def prevented(changes: list[PossibleChange]) -> str:
     return f"{together}; a capture is found with {found}"
 
 
-def plan_facts(
-    planning: Replanning, at_s: float, made: Plan, passive: Certificate | None
-) -> list[tuple[str, str]]:
+def plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
     """Return the figures of a plan as names and texts."""
     facts = [("robot", planning.robot_line), ("status", _status(made))]
     if made.found:
@@ -212,19 +206,19 @@ def plan_facts(
             )
         )
     if made.found:
-        facts += _safety(made, passive)
+        facts += _safety(made)
     return facts
 
 
-def _safety(made: Plan, passive: Certificate | None) -> list[tuple[str, str]]:
+def _safety(made: Plan) -> list[tuple[str, str]]:
     """Active safety, that of a withdrawal, and passive safety, that of coasting."""
     active = coasts = "not checked: no clearance to the body is set (limits.clearance_m)"
     if abs(made.abort_margin_m) < float("inf"):
         active = f"withdrawal from any instant: margin {made.abort_margin_m:.4f} m of the clearance"
-    if passive is not None:
-        coasts = f"coasting after a cut of the thrust: margin {passive.margin_m:.4f} m"
-        if passive.safe_s < float("inf"):
-            coasts += f"; not safe from {passive.safe_s:.2f} s after planning on"
+    if abs(made.passive_margin_m) < float("inf"):
+        coasts = f"coasting after a cut of the thrust: margin {made.passive_margin_m:.4f} m"
+        if made.passive_margin_m < 0.0:
+            coasts += f"; not safe from {made.passive_safe_s:.2f} s after planning on"
     return [("active safety", active), ("passive safety", coasts)]
 
 

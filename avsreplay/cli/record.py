@@ -157,7 +157,8 @@ def _sentence(done: Recorded) -> str:
         f"model: {done.model or 'none'}" + (f", seed {done.seed}" if done.seed is not None else ""),
     ]
     lines += [
-        f"fault: {kind} from {start:.1f} s to {end:.1f} s, {'harmful' if harmful else 'harmless'}"
+        f"fault: {kind} from {start:.1f} s to {end:.1f} s, its scans are"
+        f" {'unusable' if harmful else 'usable'}"
         for kind, start, end, harmful in done.faults
     ]
     return "\n".join([*lines, f"note: {done.note}"] if done.note else lines)

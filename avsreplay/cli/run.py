@@ -27,7 +27,7 @@ from avsreplay.cli.options import (
 from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from avsreplay.log import GrowingLog
     from avsreplay.model_size import Advice
@@ -76,7 +76,9 @@ class Tables(click.ParamType[tuple[str, ...]]):
 
 
 class Requirement(click.ParamType[str | float]):
-    """``pass``, ``check`` or ``any``, or ``capture=P`` with the least probability of a capture."""
+    """The value of ``--require``: ``pass``, ``check`` or ``any``, or ``capture=P`` with the least
+    probability of a capture.
+    """
 
     name = "pass|check|any|capture=P"
 
@@ -315,7 +317,12 @@ def _checked(run: Run) -> list[Advice]:
     """
     from avsreplay.preflight import preflight
 
-    checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
+    followed = bool(run.config.region)
+    checked = (
+        preflight(run.source, run.surface, run.registrar, followed=followed)
+        if len(run.source)
+        else []
+    )
     found = [advice for advice in checked if advice.grade != "ok"]
     for each in run.source.meaning.inferences:
         if each.grade == "ok":
@@ -326,7 +333,7 @@ def _checked(run: Run) -> list[Advice]:
 
 
 class Outdated(Exception):
-    """What was recorded later changes rows of a log that has grown: it is replayed again."""
+    """A log that has grown gives other rows than before; it is replayed again."""
 
 
 _SAME_EVENT_S = 2.0  # between the time of a manoeuvre in the rows and by all poses
@@ -361,12 +368,22 @@ def _replayed(
         if keeper and wanted.resume:
             _resume(run, keeper)
         rows, kept = run.taken, run.done
-        interrupted = _take_scans(run, keeper, viewer, live_allowed=not wanted.as_json)
+        found: list[tuple[tuple[str, ...], str]] = []
+        interrupted = _take_scans(
+            run,
+            keeper,
+            viewer,
+            live_allowed=not wanted.as_json,
+            then=lambda: found.append(_model_notes(run, advice)),
+        )
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
         summary = run.summary()
-        record = _record(run, summary) | {"preflight": _findings(run, advice, rows, summary)}
+        notes, remark = found[0] if found else ((), "")
+        for note in (*notes, remark) if remark else notes:
+            click.echo(f"avsreplay: {note}", err=True)
+        record = _record(run, summary) | {"preflight": _findings(run, advice, summary, notes)}
         if interrupted:
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
@@ -384,8 +401,10 @@ def _take_scans(
     viewer: RerunStream | None,
     *,
     live_allowed: bool,
+    then: Callable[[], None],
 ) -> bool:
-    """Replay the scans that follow those taken; return whether this was interrupted.
+    """Replay the scans that follow those taken, then call ``then``; return whether this was
+    interrupted.
 
     Raises:
         Outdated: the log has grown, and what was recorded later changes rows.
@@ -400,7 +419,7 @@ def _take_scans(
     growing = run.job.growing
     live = growing is not None and live_allowed
     found = run.rows(listeners, None if live else tracked)
-    interrupted = _collect(found, run.taken, growing, live=live)
+    interrupted = _collect(found, run.taken, growing, live=live, then=then)
     if growing and not interrupted and growing.outdated():
         raise Outdated
     changed = run.rescore() if growing else []
@@ -410,14 +429,14 @@ def _take_scans(
 
 
 def _findings(
-    run: Run, advice: list[Advice], rows: Sequence[Row], summary: Summary
+    run: Run, advice: list[Advice], summary: Summary, notes: Sequence[str]
 ) -> list[dict[str, str]]:
-    """What the checks before and after the replay found, with grades."""
+    """What the checks before the replay, of the model and of the times found, with grades."""
     of_model = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
     graded = [
         *((each.grade, each.sentence) for each in advice),
-        *((of_model, note) for note in _model_notes(run, advice)),
-        *(("check", note) for note in _untimed_notes(run, rows)),
+        *((of_model, note) for note in notes),
+        *(("check", note) for note in _untimed_notes(run, run.taken)),
     ]
     return [{"grade": grade, "text": text} for grade, text in graded]
 
@@ -436,19 +455,16 @@ def _resume(run: Run, keeper: ResultWriter) -> None:
     click.echo(f"avsreplay: continuing after {run.done} of {len(run)} scans", err=True)
 
 
-def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows unless size or background explain them;
-    also said on stderr.
+def _model_notes(run: Run, advice: list[Advice]) -> tuple[tuple[str, ...], str]:
+    """Return the findings on the model from the rows, and a remark on it; nothing where size or
+    background explain them.
     """
     if any(
         a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail")
         for a in advice
     ):
-        return ()
-    notes, remark = run.model_check.notes(), run.model_check.remark()
-    for note in (*notes, remark) if remark else notes:
-        click.echo(f"avsreplay: {note}", err=True)
-    return notes
+        return (), ""
+    return run.model_check.notes(), run.model_check.remark()
 
 
 def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
@@ -475,11 +491,13 @@ def _collect(
     growing: GrowingLog | None = None,
     *,
     live: bool = False,
+    then: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Take all rows, which the run keeps; True if the user interrupted after one or more.
+    """Take all rows, which the run keeps, and call ``then``; True if the user interrupted after one
+    or more rows.
 
-    An interrupt takes effect between two scans, so that all results hold the same scans; a second
-    one at once. With ``live`` a line is printed for each row.
+    All results hold the same scans: an interrupt takes effect between two of them. With ``live`` a
+    line is printed for each row.
     """
     from avsreplay.cli.options import interruptible, say_live
 
@@ -492,7 +510,8 @@ def _collect(
                 if live:
                     say_live(row)
                 if stopped() and not growing:
-                    return True
+                    break
+            then()
             return stopped()
     except KeyboardInterrupt:
         if not rows:

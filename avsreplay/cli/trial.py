@@ -1,4 +1,4 @@
-"""What ``avsreplay info`` advises is tried: a few scans are replayed with the options that it
+"""``avsreplay info`` tries what it advises: a few scans are replayed with the options that it
 prints.
 """
 
@@ -22,14 +22,14 @@ SCANS = 10  # scans that are replayed
 
 @value_class(eq=True)
 class Trial:
-    """A replay of a few scans.
+    """The result of a replay of a few scans.
 
     Attributes:
         scans: number of scans.
-        used: of them in the estimate.
+        used: number of scans that the estimate used.
         inlier_ratio: median share of the points on the model, None where no scan is registered.
-        pos_err_m, rot_err_deg: median errors of the registered pose, None without truth.
-        extent_m: size of the model.
+        pos_err_m, rot_err_deg: median errors of the registered pose [m, deg], None without truth.
+        extent_m: size of the model [m].
         broken: why the replay ended, "" if it did not.
         reason: most frequent reason why scans were not used, "" if all were.
     """
@@ -177,7 +177,7 @@ def try_advice(
 
 
 def _of_rows(rows: Sequence[Row], extent_m: float) -> Trial:
-    unused = [row.reason if row.status == "ok" else row.status for row in rows if not row.gamma]
+    unused = [row.reason or row.status for row in rows if not row.gamma]
     reason = max(sorted(set(unused)), key=unused.count) if unused else ""
     return Trial(
         len(rows),

@@ -10,7 +10,8 @@ except ImportError:
     raise MissingBackend(
         "the C++ extensions are not built",
         where="avsreplay.estimate._motion",
-        hint="run 'pip install .' in the source folder (needs a C++17 compiler)",
+        hint="run 'pip install .' in the source folder (needs a C++17 compiler), then Python"
+        " outside of it",
     ) from None
 
 from avsreplay.estimate.dynamics import with_change

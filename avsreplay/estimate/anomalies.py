@@ -64,7 +64,7 @@ from avsreplay.estimate.track import (
 )
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
-from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
+from avsreplay.records import Admission, Belief, Finding, Manoeuvre
 
 _FEWEST, _MOST = 3, 5  # least and most doubtful scans at a decision
 _RMS_STEP, _LEAST_SPREAD = (
@@ -75,7 +75,6 @@ _LEAST_RISE = (
     2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
 )
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
-_TESTED = (Reason.OK, Reason.POSE_JUMP)
 _STEPS = (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS)
 _DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)
 _USED = (*_DISTURBANCES, Hypothesis.NOISIER)
@@ -103,16 +102,20 @@ class AnomalyTest:
         self._priors = ChangePriors.of(params, extent_m)
 
     def step(
-        self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]
-    ) -> tuple[Track, Verdict]:
-        """The track after a measured scan, and the verdict on it.
+        self,
+        track: Track,
+        epoch: Epoch,
+        admission: Admission,
+        update: Callable[[Track], Track],
+    ) -> tuple[Track, Finding]:
+        """The track after a measured scan, and what was found of its pose.
 
-        ``update`` applies the scan to a track.
+        ``update`` applies an admitted scan to a track; a refused one only predicts.
         """
-        if not self.enabled or verdict.reason not in _TESTED:
-            return (
-                self._accepted(track, epoch, update) if verdict.gamma else update(track)
-            ), verdict
+        if not self.enabled or admission is Admission.REFUSED:
+            if admission is Admission.ADMITTED:
+                return self._accepted(track, epoch, update), Finding.AGREES
+            return update(track), Finding.UNTESTED
         if track.bias is not None:
             bias = continued(
                 track.bias, epoch, lambda *scans: self._windowed(track, *scans), self._priors
@@ -120,30 +123,39 @@ class AnomalyTest:
             if bias is not None:
                 return self._still_biased(track.changed(belief=epoch.prediction.belief), bias)
             track = track.changed(bias=None)
+        large = admission is Admission.LARGE or (
+            ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track)
+        )
         doubtful = track.changed(belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
-        large = verdict.reason is Reason.POSE_JUMP
-        if not (ready(track) and track.recent):
-            large = large or (ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track))
-            return (
-                self._undecidable(doubtful)
-                if large
-                else (self._accepted(track, epoch, update), verdict)
-            )
-        large = large or epoch.innovation.chi2 > GATE * nis_scale(track)
-        if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
-            return self._accepted(track, epoch, update), verdict
-        window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
-        window, ranked = self._explained(track, window, first)
+        comparable = ready(track) and bool(track.recent)
+        if large and not comparable:
+            return self._undecidable(doubtful)
+        if comparable and (large or self._suspected(track, epoch)):
+            window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
+            window, ranked = self._explained(track, window, first)
+            if large or self._contradicted(track, window, ranked):
+                return self._decided(doubtful, window, ranked)
+        return self._accepted(track, epoch, update), Finding.AGREES
+
+    def _suspected(self, track: Track, epoch: Epoch) -> bool:
+        """Whether a scan is tested though its own innovation is not large."""
+        return bool(track.doubtful) or long_run((*track.recent, epoch), nis_scale(track))
+
+    def _contradicted(
+        self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]
+    ) -> bool:
+        """Whether the last scans together show that free motion is not their explanation, though
+        the innovation of the last one is not large.
+        """
         best = ranked[0].hypothesis
-        changed = best in _STEPS and odds_over_free(ranked) >= OVER_FREE
-        free = next(e for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-        changed = changed and (bool(track.doubtful) or linear(free.chi2, free.dof, window))
-        noisier = best is Hypothesis.NOISIER and certain(ranked)
-        if not (
-            large or changed or (track.doubtful and (noisier or best is Hypothesis.SENSOR_BIAS))
+        if track.doubtful and (
+            best is Hypothesis.SENSOR_BIAS or (best is Hypothesis.NOISIER and certain(ranked))
         ):
-            return self._accepted(track, epoch, update), verdict
-        return self._decided(doubtful, window, ranked)
+            return True
+        if best not in _STEPS or odds_over_free(ranked) < OVER_FREE:
+            return False
+        free = next(e for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+        return bool(track.doubtful) or linear(free.chi2, free.dof, window)
 
     def with_possible_change(self, track: Track) -> Track:
         """The track with the possible change of the velocities within its accepted scans."""
@@ -182,7 +194,7 @@ class AnomalyTest:
         arc = None if orbit is None else orbit.at(start.t_ns)
         return window_of(scans, accepted, start, *self.batch.noise_levels(track), arc)
 
-    def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Verdict]:
+    def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Finding]:
         """The track after one more scan of a sensor error, unless a manoeuvre explains its scans
         better.
         """
@@ -190,22 +202,22 @@ class AnomalyTest:
         window, best = found or ((), None)
         if best is not None and best.changes and scans_after(window, best) >= FEWEST_TO_FIT:
             reported = self._reported(track.changed(bias=None), window, best)
-            return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
-        return track.changed(bias=bias), Verdict(0, Reason.SENSOR_BIAS)
+            return self._manoeuvred(reported, window, best), Finding.EXPLAINED
+        return track.changed(bias=bias), Finding.OFFSET
 
-    def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
+    def _undecidable(self, track: Track) -> tuple[Track, Finding]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones
         may agree by themselves.
         """
         if len(track.doubtful) < _FEWEST:
-            return track, Verdict(0, Reason.DOUBTFUL)
+            return track, Finding.OPEN
         return self._by_agreement(track)
 
     def _decided(
         self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]
-    ) -> tuple[Track, Verdict]:
+    ) -> tuple[Track, Finding]:
         """The track after a decision, or still in doubt."""
-        doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
+        doubtful, in_doubt = len(track.doubtful), (track, Finding.OPEN)
         best, explained = ranked[0], ranked[0].explains
         if doubtful < _MOST and not certain(ranked):
             return in_doubt
@@ -215,16 +227,16 @@ class AnomalyTest:
         if manoeuvre and best.changes:
             reported = self._reported(track, window, best)
             if scans_after(window, best) >= FEWEST_TO_FIT:
-                return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
+                return self._manoeuvred(reported, window, best), Finding.EXPLAINED
             if doubtful < 2 * _MOST:
-                return reported, Verdict(0, Reason.DOUBTFUL)
+                return reported, Finding.OPEN
         if doubtful < _FEWEST:
             return in_doubt
         free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
         if free or (best.hypothesis in _USED and explained):
-            return self._used(self._allowing(track, best), track.doubtful), Verdict(1, Reason.OK)
+            return self._used(self._allowing(track, best), track.doubtful), Finding.EXPLAINED
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
-            return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
+            return self._biased(track, window, best), Finding.OFFSET
         return self._by_agreement(track)
 
     def _allowing(self, track: Track, found: Explanation) -> Track:
@@ -282,7 +294,7 @@ class AnomalyTest:
             belief=belief, recent=window[: best.onset], bias=bias
         )
 
-    def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
+    def _by_agreement(self, track: Track) -> tuple[Track, Finding]:
         """The track initialised anew from the doubtful poses if they agree with one another;
         else they are bad.
         """
@@ -296,10 +308,9 @@ class AnomalyTest:
             if anew is None and levels.count:
                 anew = self._started(track, track.doubtful[-_FEWEST:], levels)
         if anew is not None:
-            return anew.changed(reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
-        return with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :]), Verdict(
-            0, Reason.POSE_JUMP
-        )
+            return anew.changed(reinitialised=track.reinitialised + 1), Finding.EXPLAINED
+        left = with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :])
+        return left, Finding.UNEXPLAINED
 
     def _with_rejected(self, track: Track) -> Track:
         """The track with the doubtful poses in its list of rejected ones."""

@@ -283,7 +283,7 @@ class Problem:
         linearisation.
         """
         self.factors = factors
-        self.core.noise((float(factors[0]), float(factors[1])), redescend, self._slack)
+        self.core.noise((float(factors[0]), float(factors[1])), redescend, self._slack * GATE)
 
     def cost(self, chart: Chart) -> float:
         """Half chi-square of initial values, including the prior."""

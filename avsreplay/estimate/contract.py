@@ -23,7 +23,7 @@ from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.plugged import AnyEstimator, estimator_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.parts import LawResult
-from avsreplay.records import Alignment, AlignStatus, Belief, Reason, State, Verdict
+from avsreplay.records import Admission, Alignment, AlignStatus, Belief, State
 
 EXTENT_M = 2.0
 POSES, PERIOD_S, BODIES = 80, 0.5, 6
@@ -132,8 +132,8 @@ def _beliefs(name: str, body: Stream, healthy: Sequence[bool] | None = None) -> 
         prior = estimator.predict(track, t_ns)
         seen = estimator.innovate(prior, alignment)
         used = healthy is None or healthy[k]
-        verdict = Verdict(1, Reason.OK) if used else Verdict(0, Reason.NOT_ALIGNED)
-        track, _ = estimator.step(track, prior, seen if used else None, verdict, False)
+        admission = Admission.ADMITTED if used else Admission.REFUSED
+        track, _ = estimator.step(track, prior, seen if used else None, admission, False)
         found.append(estimator.published(track))
     return found
 
@@ -254,7 +254,7 @@ def _forecast(name: str, bodies: Sequence[Stream]) -> LawResult:
         for alignment, t_ns in zip(body.alignments, body.times_ns, strict=True):
             prior = estimator.predict(track, t_ns)
             seen = estimator.innovate(prior, alignment)
-            track, _ = estimator.step(track, prior, seen, Verdict(1, Reason.OK), False)
+            track, _ = estimator.step(track, prior, seen, Admission.ADMITTED, False)
         belief = estimator.published(track)
         sigma = float(estimator.track_forecast(track, np.array([LATER_S])).pos_1s_m[0])
         there = estimator.motion(belief)(np.array([LATER_S]))[0][0]

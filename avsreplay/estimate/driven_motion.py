@@ -25,6 +25,7 @@ from avsreplay.estimate.driven_fit import (
 )
 from avsreplay.estimate.dynamics import torque_density
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, definite
+from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.noise_levels import NoiseLevels, mean_share
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.work import Parts
@@ -103,7 +104,7 @@ def fit_jointly(
         chart, u = Chart(joint.chart), joint.u
         if last:
             break
-    joint.noise((float(factors[0]), float(factors[1])), True, 1.0)  # Cauchy's weights
+    joint.noise((float(factors[0]), float(factors[1])), True, GATE)  # Cauchy's weights
     joint.linearise(chart.flat, u)
     yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
     return _linear_fit(poses, seen, prior, factors, joint, onset_s)
@@ -125,7 +126,7 @@ def _joint(
         seen.times_s, seen.q, seen.t, seen.root, seen.info, mean, prior.info, onset_s, widths
     )
     follow_orbit(core, seen)
-    core.noise((float(factors[0]), float(factors[1])), slack is not None, slack or 1.0)
+    core.noise((float(factors[0]), float(factors[1])), slack is not None, (slack or 1.0) * GATE)
     return core
 
 

@@ -50,7 +50,15 @@ from avsreplay.estimate.track import (
     undetermined,
 )
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
+from avsreplay.records import (
+    Admission,
+    Alignment,
+    Belief,
+    Finding,
+    Forecast,
+    Innovation,
+    Trajectory,
+)
 
 
 class Estimator:
@@ -183,39 +191,42 @@ class Estimator:
         track: Track,
         prediction: Prediction,
         innovation: Innovation | None,
-        verdict: Verdict,
+        admission: Admission,
         converged: bool,
-    ) -> tuple[Track, Verdict]:
-        """The posterior and the final verdict. The cause of a large innovation is decided with the
-        next scans.
+    ) -> tuple[Track, Finding]:
+        """The posterior, and what was found of the pose. The cause of a large innovation is decided
+        with the next scans.
 
         Args:
             track: after the last scan.
             prediction: of this scan.
             innovation: None where the scan gave no pose.
-            verdict: of the fault rule on this scan alone.
+            admission: by the rules on this scan alone.
             converged: t_1 was reached at the last scan.
 
         Returns:
-            The track, and the verdict: gamma 0 and reason ``doubtful`` while a decision is pending.
+            The track and the finding.
         """
         if innovation is None:
-            return self.update(track, prediction, None, 0), verdict
+            return self.update(track, prediction, None, 0), Finding.UNTESTED
         epoch = Epoch(
             track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, converged
         )
-        after, verdict = self.anomalies.step(
+        admitted = int(admission is Admission.ADMITTED)
+        after, finding = self.anomalies.step(
             track,
             epoch,
-            verdict,
-            lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True),
+            admission,
+            lambda t: self.update(t, prediction, innovation, admitted, converged, True),
         )
         after = after.changed(
-            undetermined=undetermined(track, innovation, verdict.gamma, self._length_m)
+            undetermined=undetermined(track, innovation, finding.used, self._length_m)
         )
-        after = self.anomalies.with_possible_change(after) if verdict.gamma else after
-        due = verdict.gamma == 1 and after.mode in ("fit", "filter")
-        return self.disturbances.advanced(after, self._robust) if due else after, verdict
+        if not finding.used:
+            return after, finding
+        after = self.anomalies.with_possible_change(after)
+        due = after.mode in ("fit", "filter")
+        return self.disturbances.advanced(after, self._robust) if due else after, finding
 
     def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is
@@ -397,6 +408,15 @@ class Estimator:
         return self.batch.check_against_batch(
             self.batch.filtered(track, prediction, innovation), spread
         )
+
+    def disturbances_of(self, track: Track) -> tuple[float, float] | None:
+        """Root densities of the random torque [rad/s^1.5] and force [m/s^1.5] in use.
+
+        Args:
+            track: after a scan.
+        """
+        torque, force = self.batch.noise_levels(track)
+        return torque, force
 
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that the filter does not carry.

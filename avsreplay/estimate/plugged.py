@@ -30,7 +30,15 @@ from avsreplay.estimate.plugin import Context, Method, load_method
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.parts import ESTIMATORS, OWN, PRINTED
-from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
+from avsreplay.records import (
+    Admission,
+    Alignment,
+    Belief,
+    Finding,
+    Forecast,
+    Innovation,
+    Trajectory,
+)
 from avsreplay.settings import NoParameters
 
 
@@ -96,11 +104,13 @@ class PluggedEstimator:
         track: Track,
         prediction: Prediction,
         innovation: Innovation | None,
-        verdict: Verdict,
+        admission: Admission,
         converged: bool,
-    ) -> tuple[Track, Verdict]:
-        """The posterior, and the verdict of the fault rule on this scan alone."""
-        return self.update(track, prediction, innovation, verdict.gamma, converged), verdict
+    ) -> tuple[Track, Finding]:
+        """The posterior after an admitted pose; a plug-in finds no causes of a large innovation."""
+        used = admission is Admission.ADMITTED and innovation is not None
+        after = self.update(track, prediction, innovation, int(used), converged)
+        return after, Finding.AGREES if used else Finding.UNTESTED
 
     def update(
         self,
@@ -117,6 +127,10 @@ class PluggedEstimator:
             T_ac = measured_pose(x, innovation.alpha)
             plugged = self._method.update(plugged, T_ac, in_fixture(innovation.R, T_ac.q, x.q_bc))
         return self._track(plugged, track.changed)
+
+    def disturbances_of(self, track: Track) -> tuple[float, float] | None:  # noqa: ARG002
+        """None: what a plug-in allows for is its own."""
+        return None
 
     def published(self, track: Track) -> Belief:
         """The belief in {A}."""

@@ -20,7 +20,7 @@ from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre
+from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = (
     5,
@@ -208,13 +208,13 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
     return frozen(2.0 * length_m * (a @ left[:, : len(cosines)][:, cosines > _ALIKE]) / scale)
 
 
-def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
+def undetermined(track: Track, innovation: Innovation, used: bool, length_m: float) -> Array:
     """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in
     ``common_motions``.
     """
     return (
         common_motions(track.undetermined, innovation.free, length_m)
-        if gamma
+        if used
         else track.undetermined
     )
 
@@ -314,6 +314,13 @@ def in_doubt(track: Track) -> bool:
         or track.change_probability > 0.5
         or (track.bias is not None and track.bias.doubted)
     )
+
+
+def moves(track: Track) -> Moves:
+    """Return what the poses of a track show of the motion."""
+    if track.drift is not None:
+        return Moves.ACCELERATED
+    return Moves.DISTURBED if track.levels.certain else Moves.FREE
 
 
 def with_history(then: Track, now: Track) -> Track:

@@ -21,7 +21,7 @@ _PER_THREAD = (
 
 
 class BadMessage(ValueError):
-    """A message or record whose bytes do not match its type."""
+    """The bytes of a message or record do not match its type."""
 
 
 def shown(text: object) -> str:

@@ -64,7 +64,11 @@ class Camera:
     unit_m: float = MILLIMETRE
 
     def check(self) -> Camera:
-        """Return the camera. Raises ValueError if it is none."""
+        """Return the camera.
+
+        Raises:
+            ValueError: its values do not describe a camera.
+        """
         numbers = (*self.focal, *self.centre, *self.coefficients, self.unit_m)
         if not all(math.isfinite(v) for v in numbers) or min(*self.focal, self.unit_m) <= 0.0:
             raise ValueError("the camera is not calibrated: its focal length is not positive")

@@ -64,13 +64,13 @@ def spread(count: int, most: int) -> list[int]:
 
 @value_class(eq=True)
 class Inference:
-    """One thing that was found about the clouds of a log.
+    """One finding about the meaning of the clouds of a log.
 
     Attributes:
         about: "byte order", "unit", "point times" or "missing returns".
         finding: what was found, in words.
         evidence: the values from which it follows, or that it was given.
-        option: with which it is stated or overridden.
+        option: option with which it is set or overridden.
         grade: "ok", "check" (the user should look at it) or "fail" (the values do not decide).
     """
 
@@ -88,14 +88,14 @@ class Inference:
 
 @value_class(eq=True)
 class Meaning:
-    """What the numbers of the clouds of a log mean.
+    """The meaning of the numbers in the clouds of a log.
 
     Attributes:
-        swapped: the bytes of each value are in the other order than declared.
+        swapped: whether the bytes of each value are in the other order than declared.
         unit_m: one unit of the coordinates [m].
-        time: how the instants of the points are read; None: they have none.
-        codes: of missing returns.
-        inferences: how this was found.
+        time: how the instants of the points are read; None if the points have none.
+        codes: values that stand for missing returns.
+        inferences: the findings from which this follows.
     """
 
     swapped: bool = False
@@ -106,12 +106,12 @@ class Meaning:
 
     @property
     def decided(self) -> tuple[Any, ...]:
-        """Everything but the evidence and the limit of the times, for a comparison."""
+        """Everything except the evidence and the limit of the times, for a comparison."""
         time = None if self.time is None else replace(self.time, limit_s=0.0)
         return self.swapped, self.unit_m, time, self.codes
 
     def record(self) -> dict[str, Any]:
-        """Return the content of ``run.json`` about it."""
+        """Return what ``run.json`` states about it."""
         return {
             "byte_order": "reversed" if self.swapped else "declared",
             "unit_m": self.unit_m,
@@ -125,18 +125,21 @@ class Meaning:
 
     @property
     def refused(self) -> Inference | None:
-        """The first thing that the values do not decide."""
+        """The first finding that the values do not decide; None if all are decided."""
         return next((each for each in self.inferences if each.grade == "fail"), None)
 
 
 @value_class
 class Cloud:
-    """A canonical cloud: returns (n, 3) [m] in ``frame``, their times [s] after the stamp and
-    intensities, or None.
+    """A canonical cloud.
 
-    ``places`` (n,) is the share of the message that stands before each point, for points without
-    times. ``dropped`` counts what was no return. ``pose`` is set instead of the points where the
-    source holds measured poses.
+    Attributes:
+        points: (n, 3) returns in ``frame`` [m].
+        times_s: (n,) their times after the stamp [s], or None.
+        intensities: (n,) their intensities, or None.
+        places: (n,) share of the message that precedes each point, for points without times.
+        dropped: number of points that were no return.
+        pose: measured pose in place of points, where the source has poses.
     """
 
     stamp_ns: int
@@ -159,12 +162,12 @@ class Cloud:
 
 @np.errstate(invalid="ignore", over="ignore")  # any bytes may stand where a number is expected
 def infer(sample: Sequence[TimedCloud], period_s: float | None, options: SourceOptions) -> Meaning:
-    """Return what the numbers of the clouds of a log mean.
+    """Infer what the numbers of the clouds of a log mean.
 
     Args:
         sample: some clouds, spread over the log, in the order of their stamps.
-        period_s: time between two scans [s]; None: unknown.
-        options: what the user states.
+        period_s: time between two scans [s]; None if it is unknown.
+        options: what the user has set.
     """
     sample = [one for one in sample if len(one.raw)]
     if not sample:

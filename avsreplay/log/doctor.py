@@ -44,9 +44,7 @@ class Severity(Enum):
 
 @value_class(eq=True)
 class Finding:
-    """One finding: severity, subject, text, and the file offsets or scan numbers that it
-    refers to.
-    """
+    """A finding: severity, subject, text, and the file offsets or scan numbers it concerns."""
 
     severity: Severity
     about: str

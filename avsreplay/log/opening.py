@@ -36,6 +36,8 @@ from avsreplay.log.topics import chosen_topic, optional_topic
 from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface
 
+RESULT_SUFFIXES = (".json", ".jsonl", ".npz", ".html")  # of files of a result, but of no log
+
 
 def open_source(
     path: str | Path,
@@ -49,9 +51,9 @@ def open_source(
     Args:
         path: the file or folder.
         options: how it is read.
-        upto: number of bytes that are read of an MCAP file that still grows.
         inspect: also open a log without a cloud topic, or with several of which none was chosen; it
-            has no scans then.
+            then has no scans.
+        upto: number of bytes that are read of an MCAP file that still grows; None reads all.
 
     Returns:
         The source; close it after use.
@@ -59,8 +61,8 @@ def open_source(
     Raises:
         UnreadableInput: it does not exist, is of no known format, has no cloud topic, or
             (``strict``) is damaged.
-        UsageError: there are several cloud topics and none was chosen, a requested topic or
-            frame does not exist, or the values of the clouds do not tell what they mean.
+        UsageError: there are several cloud topics and none was chosen, a requested topic or frame
+            does not exist, or the values of the clouds do not show what they mean.
     """
     path, options = Path(path), options or SourceOptions()
     if path.name == BAG_METADATA and path.is_file():  # of a bag, whose folder is meant
@@ -95,7 +97,7 @@ def _refuse_undecided(source: Source) -> None:
 def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
-    if (path / "run.json").is_file():
+    if _is_result(path):
         raise _no_log(path)
     if options.poses and path.is_file() and not _is_log(path):
         return _open_pose_file(path, options)
@@ -106,6 +108,12 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
             "neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans"
         )
     return _messages(path, options, inspect, upto)
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a path is the directory of a result, or one of its files that can be no log."""
+    folder = path.parent if path.suffix in RESULT_SUFFIXES else path
+    return (folder / "run.json").is_file()
 
 
 def _no_log(path: Path) -> UnreadableInput:

@@ -104,12 +104,12 @@ class PointTime:
     """How the instants of the points are read.
 
     Attributes:
-        fields: the field, or those of seconds and of their fraction.
-        unit: of the values; of the fraction if there are two fields.
-        origin: from what they count.
-        offset_ns: of another clock: its time minus that of the stamps [ns].
-        cycle_ns: the values count within this time [ns]; 0: without end.
-        limit_s: an instant farther from the stamp than this is not valid [s].
+        fields: name of the field, or of the fields of seconds and of their fraction.
+        unit: unit of the values, or of the fraction if there are two fields.
+        origin: the instant from which the values count.
+        offset_ns: time of another clock minus that of the stamps [ns].
+        cycle_ns: the values repeat after this time [ns]; 0 if they do not.
+        limit_s: an instant farther than this from the stamp is not valid [s].
     """
 
     fields: tuple[str, ...]
@@ -159,14 +159,14 @@ class TimedCloud:
 
 @value_class(eq=True)
 class Reading:
-    """What the values of one field say.
+    """What the values of one field show about times.
 
     Attributes:
-        name: of the field or fields.
-        time: how it is read; None if it is not.
+        name: name of the field or fields.
+        time: how it is read; None if it does not hold times.
         evidence: the values from which this follows.
-        refused: why the values leave it open, "" if they do not.
-        step_s: the smallest difference of two instants that it resolves [s].
+        refused: why the values leave it undecided, "" if they decide it.
+        step_s: smallest difference of two instants that it resolves [s].
     """
 
     name: str

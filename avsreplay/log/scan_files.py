@@ -159,33 +159,42 @@ def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = Non
         UnreadableInput: there are no scans, or a named file does not exist.
     """
     if names:
-        missing = [n for n in names if not (folder / n).is_file() or Path(n).name != n]
-        if missing:
-            hint = "remove its line or add the file"
-            raise UnreadableInput(
-                f"the pose file names the scan '{shown(missing[0])}', which does not exist",
-                where=shown(folder),
-                hint=hint,
-            )
-        return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
+        return _named(folder, names)
     files = [p for p in folder.iterdir() if p.is_file()]
-    found = [p for p in files if p.suffix.lower() in SCAN_FORMATS] or [
-        p for p in files if p.suffix.lower() == DEPTH_FORMAT
-    ]
     if model is not None and model.exists():
-        found = [p for p in found if not p.samefile(model)]
+        files = [p for p in files if not p.samefile(model)]
+    by_format = {
+        suffix: [p for p in files if p.suffix.lower() == suffix]
+        for suffix in (*SCAN_FORMATS, DEPTH_FORMAT)
+    }
+    depth = by_format.pop(DEPTH_FORMAT)  # pictures beside clouds are not scans
+    found = max(by_format.values(), key=len) or depth
     if not found:
-        logs = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in LOG_FORMATS)
-        kinds = f"{', '.join(SCAN_FORMATS)} or depth {DEPTH_FORMAT} files"
-        hint = f"scans are {kinds}; a log is an MCAP or a ROS bag"
-        if logs:
-            more = ", ..." if len(logs) > LISTED else ""
-            hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
-        raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
-    formats = (*SCAN_FORMATS, DEPTH_FORMAT)
-    counts = {s: sum(p.suffix.lower() == s for p in found) for s in formats}
-    common = max(formats, key=lambda s: counts[s])
-    return sorted((p for p in found if p.suffix.lower() == common), key=lambda p: by_number(p.name))
+        raise _no_scans(folder)
+    return sorted(found, key=lambda p: by_number(p.name))
+
+
+def _named(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The named scans of a folder, in order."""
+    missing = [n for n in names if not (folder / n).is_file() or Path(n).name != n]
+    if missing:
+        raise UnreadableInput(
+            f"the pose file names the scan '{shown(missing[0])}', which does not exist",
+            where=shown(folder),
+            hint="remove its line or add the file",
+        )
+    return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
+
+
+def _no_scans(folder: Path) -> UnreadableInput:
+    """What is said of a folder without scans."""
+    logs = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in LOG_FORMATS)
+    kinds = f"{', '.join(SCAN_FORMATS)} or depth {DEPTH_FORMAT} files"
+    hint = f"scans are {kinds}; a log is an MCAP or a ROS bag"
+    if logs:
+        more = ", ..." if len(logs) > LISTED else ""
+        hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
+    return UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
 
 
 def by_number(name: str) -> tuple[tuple[int, ...], str]:

@@ -238,46 +238,43 @@ class Source:
             The problem and the option that may solve it, "" if there is none; None without a
             problem.
         """
-        track, options = self._ground_truth.track, self.options
         if all(self.truth_of(scan).pose is None for scan in scans):
-            why, gap = (
-                ("", False)
-                if track is None or not scans
-                else track.uncovered([scan.t_ns for scan in scans])
-            )
-            stamps = (
-                why
-                and not gap
-                and options.truth_file is None
-                and options.clock is ClockChoice.HEADER
-            )
-            option = "--truth-gap SECONDS" if gap else "--clock log" if stamps else ""
-            return (
-                (f"no examined scan of {len(scans)} has a true pose{why}", option)
-                if scans
-                else None
-            )
-        at = (
-            ""
-            if track is None or options.truth_file or options.sensor_topic
-            else track.frame.lstrip("/")
-        )
-        clouds, frames = (
-            (options.fixed_frame or scans[0].frame).lstrip("/"),
-            self._ground_truth.frames,
-        )
-        transforms = any(
-            topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics()
-        )
-        if self._apart(at, clouds):
-            text = f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'"
-            return f"{text}, and no transform of the log connects them", ""
-        if at in ("", clouds) or not clouds or not (at in frames if frames else transforms):
+            return self._without_truth(scans) if scans else None
+        return self._in_other_frame(scans[0].frame)
+
+    def _without_truth(self, scans: Sequence[Scan]) -> tuple[str, str]:
+        """Why none of some scans has a true pose, and the option that may solve it."""
+        track, options = self._ground_truth.track, self.options
+        if track is None:
+            why, gap = "", False
+        else:
+            why, gap = track.uncovered([scan.t_ns for scan in scans])
+        option = "--truth-gap SECONDS" if gap else ""
+        if why and not gap and options.truth_file is None and options.clock is ClockChoice.HEADER:
+            option = "--clock log"
+        return f"no examined scan of {len(scans)} has a true pose{why}", option
+
+    def _in_other_frame(self, frame: str) -> tuple[str, str] | None:
+        """Whether the true poses are in another frame than clouds in a frame, and the option that
+        may solve it.
+        """
+        track, options = self._ground_truth.track, self.options
+        if track is None or options.truth_file or options.sensor_topic:
             return None
-        return (
-            f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'",
-            f"--fixed-frame {shown(at)}",
-        )
+        at, clouds = track.frame.lstrip("/"), (options.fixed_frame or frame).lstrip("/")
+        text = f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'"
+        if self._apart(at, clouds):
+            return f"{text}, and no transform of the log connects them", ""
+        if not at or not clouds or at == clouds:
+            return None
+        frames = self._ground_truth.frames
+        known = at in frames if frames else self._has_transforms()
+        return (text, f"--fixed-frame {shown(at)}") if known else None
+
+    def _has_transforms(self) -> bool:
+        """Whether the log has messages of /tf."""
+        topics = self._clouds.topics()
+        return any(topic.type.endswith("TFMessage") and topic.count for topic in topics)
 
     def in_own_frame(self, scan: Scan) -> NDArray[Any]:
         """Return the points (n, 3) of a scan in the frame of its cloud, to which crops refer [m].

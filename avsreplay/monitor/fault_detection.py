@@ -1,4 +1,8 @@
-"""The fault detector: gamma for each scan, and why it is 0 (section 6 of the equations).
+"""Gamma for each scan, and why it is 0 (section 6 of the equations): one table of rules.
+
+The rules on a scan alone come first. What they admit goes to the estimate, which finds whether the
+motion of the target, an error of the sensor or a wrong scan explains it, and to the tracker. The
+remaining rules decide from what both have found. No other part of the program sets gamma.
 
 The pose test is |alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks,
 the limit is ``alpha_max_m``. Where the prediction is uncertain (at the start, after a blackout) it
@@ -10,16 +14,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.records import (
+    Admission,
     Alignment,
     AlignStatus,
     Belief,
+    Finding,
     Innovation,
     Reason,
     ScanStatus,
@@ -126,6 +132,8 @@ class ScanEvidence:
         prior: the prediction at the scan.
         limits: of the run, with all lengths filled in.
         repeated: the scan has the points, or the pose, of the one before.
+        finding: of the estimate.
+        followed: the target does not move freely, and the tracker confirms the pose.
     """
 
     status: ScanStatus
@@ -134,6 +142,13 @@ class ScanEvidence:
     prior: Belief
     limits: FaultParams
     repeated: bool = False
+    finding: Finding = Finding.UNTESTED
+    followed: bool = False
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the pose is that of a registration, and not one that the log contains."""
+        return self.alignment is None or self.alignment.status is not AlignStatus.MEASURED
 
     @property
     def poor_fit(self) -> bool:
@@ -151,21 +166,34 @@ class ScanEvidence:
 
 @value_class
 class Rule:
-    """One row of the table: a scan that fails the test is not used, for this reason.
+    """One row of the table.
 
     Attributes:
-        reason: value of the column ``reason``.
+        reason: value of the column ``reason`` of a scan for which the test holds; gamma is 1 with
+            ``OK`` and 0 with any other.
         words: what the test finds, for people.
-        fails: the test.
+        holds: the test.
         policies: under which the row applies.
         fitted: the row applies to poses of a registration only, not to poses that the log contains.
     """
 
     reason: Reason
     words: str
-    fails: Callable[[ScanEvidence], bool]
+    holds: Callable[[ScanEvidence], bool]
     policies: tuple[Policy, ...] = (Policy.ANY, Policy.ALL)
     fitted: bool = False
+
+    def applies(self, scan: ScanEvidence, policy: Policy) -> bool:
+        """Return whether the row decides on a scan.
+
+        Args:
+            scan: what is known of it.
+            policy: of the run; of a pose that the log contains there is no fit to combine, so that
+                its innovation decides under each.
+        """
+        if self.fitted and not scan.fitted:
+            return False
+        return (policy if scan.fitted else Policy.ANY) in self.policies and self.holds(scan)
 
 
 def _no_scan(scan: ScanEvidence) -> bool:
@@ -211,7 +239,11 @@ def _jumps(scan: ScanEvidence) -> bool:
     return scan.jumps
 
 
-RULES = (
+def _found(*findings: Finding) -> Callable[[ScanEvidence], bool]:
+    return lambda scan: scan.finding in findings
+
+
+SCAN_RULES = (
     Rule(Reason.NO_SCAN, "the scan has no point, or its message is damaged", _no_scan),
     Rule(
         Reason.FROZEN,
@@ -255,15 +287,64 @@ RULES = (
         (Policy.ANY,),
         fitted=True,
     ),
-    Rule(Reason.POSE_JUMP, "the innovation reaches its limit", _jumps, (Policy.ANY,)),
     Rule(
         Reason.CLOCK,
         "the time stamp steps back or jumps",
         lambda scan: scan.status is ScanStatus.CLOCK,
     ),
 )
-"""The rules in their order; the first that holds gives the reason. A pose that the log contains has
-no fit, so that its innovation decides under both policies."""
+"""The rules on a scan alone, of which the first that holds refuses it."""
+
+JUMP = Rule(Reason.POSE_JUMP, "the innovation reaches its limit", _jumps, (Policy.ANY,))
+
+MOTION_RULES = (
+    Rule(
+        Reason.OK,
+        "the target does not move freely, and the pose agrees with the poses before it",
+        lambda scan: scan.followed,
+    ),
+    Rule(
+        Reason.OK,
+        "the motion of the target explains the pose",
+        _found(Finding.AGREES, Finding.EXPLAINED),
+    ),
+    Rule(
+        Reason.SENSOR_BIAS,
+        "the poses have an offset that no motion explains",
+        _found(Finding.OFFSET),
+    ),
+    Rule(
+        Reason.WRONG_SCAN,
+        "neither a motion nor an error of the sensor explains the last poses",
+        _found(Finding.UNEXPLAINED),
+    ),
+    JUMP,
+    Rule(
+        Reason.DOUBTFUL,
+        "the innovations are unlikely, and their cause is not decided",
+        lambda scan: True,  # noqa: ARG005
+    ),
+)
+"""The rules on a scan that none of the others has refused, with what the estimate and the tracker
+have found; the last one holds always."""
+
+RULES = (*SCAN_RULES, *MOTION_RULES)
+"""All rules in their order; the first that holds decides on gamma and gives the reason."""
+
+
+@value_class
+class Examined:
+    """A scan after the rules that need nothing but it.
+
+    Attributes:
+        scan: what is known of it.
+        refused: the rule that refused it, or None.
+        admission: what the estimate may do with its pose.
+    """
+
+    scan: ScanEvidence
+    refused: Rule | None
+    admission: Admission
 
 
 class FaultDetector:
@@ -277,15 +358,15 @@ class FaultDetector:
     def __init__(self, params: FaultParams, extent_m: float) -> None:
         self.params = params.resolved(extent_m)
 
-    def judge(
+    def examine(
         self,
         scan_status: ScanStatus,
         alignment: Alignment | None,
         innovation: Innovation | None,
         prior: Belief,
         repeated: bool = False,
-    ) -> Verdict:
-        """Return gamma and the reason of the first rule that holds.
+    ) -> Examined:
+        """Return what the rules on a scan alone find.
 
         Args:
             scan_status: of the reader.
@@ -295,9 +376,27 @@ class FaultDetector:
             repeated: the scan has the points, or the pose, of the one before.
         """
         scan = ScanEvidence(scan_status, alignment, innovation, prior, self.params, repeated)
-        fitted = alignment is None or alignment.status is not AlignStatus.MEASURED
-        policy = self.params.policy if fitted else Policy.ANY
-        for rule in RULES:
-            if policy in rule.policies and (fitted or not rule.fitted) and rule.fails(scan):
-                return Verdict(0, rule.reason)
-        return Verdict(1, Reason.OK)
+        refused = self._first(SCAN_RULES, scan)
+        admission = Admission.REFUSED
+        if refused is None:
+            large = JUMP.applies(scan, self.params.policy)
+            admission = Admission.LARGE if large else Admission.ADMITTED
+        return Examined(scan, refused, admission)
+
+    def judge(self, examined: Examined, finding: Finding, followed: bool = False) -> Verdict:
+        """Return gamma and the reason of the first rule that holds.
+
+        Args:
+            examined: the scan.
+            finding: of the estimate.
+            followed: the target does not move freely, and the tracker confirms the pose.
+        """
+        rule = examined.refused
+        if rule is None:
+            scan = replace(examined.scan, finding=finding, followed=followed)
+            rule = self._first(MOTION_RULES, scan)
+        reason = Reason.OK if rule is None else rule.reason
+        return Verdict(int(reason is Reason.OK), reason)
+
+    def _first(self, rules: tuple[Rule, ...], scan: ScanEvidence) -> Rule | None:
+        return next((rule for rule in rules if rule.applies(scan, self.params.policy)), None)

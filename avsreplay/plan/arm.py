@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -233,41 +233,75 @@ class Arm:
         if self.never_reaches(scene, limits, horizon_s):
             made = make(first_s, 1.0)
             return no_plan(made.t_ns, PlanStatus.INFEASIBLE, made.a_max, horizon_s), None
+
+        def flown(earliest_s: float, share: float) -> tuple[Plan, JointPath | None]:
+            return self._flown(make(earliest_s, share), path, scene, limits)
+
         if hint_s > first_s:
-            made = make(hint_s, 1.0)
-            joints = self.last_metres(path(made), scene, limits) if made.found else None
-            if joints is not None and joints.possible:
+            made, joints = flown(hint_s, 1.0)
+            if _possible(joints):
                 return _later(made, make(first_s, 1.0).lower_bound_s), joints
-        earliest_s, missed_s, share, lead_s, first = first_s, first_s, 1.0, 0.0, None
-        for _ in range(CAPTURES):
-            made = make(earliest_s, share)
-            joints = self.last_metres(path(made), scene, limits) if made.found else None
-            if joints is not None and joints.possible:
-                if first is None:
-                    return made, joints
-                made, joints = self._earlier(
-                    make, path, scene, limits, (missed_s, share), (made, joints)
-                )
-                return _later(made, first[0].lower_bound_s), joints
-            first = first or (made, joints)
-            least = 1.0 if joints is None else joints.slower
-            if joints is not None and least * share >= SLOWEST and least < 1.0:
-                share *= least
-                continue
-            if made.found:
-                lead_s = made.t_go_s - last_metres_s(path(made), scene, limits)
-                earliest_s = missed_s = max(made.t_go_s, earliest_s)
-            after_s = self._next_capture(scene, limits, earliest_s, horizon_s, lead_s)
-            if after_s is None or (not made.found and share == 1.0):
-                break
-            earliest_s, share = after_s, 1.0
-        assert first is not None
+        first = flown(first_s, 1.0)
+        if _possible(first[1]):
+            return first
+        later = self._later_capture(flown, path, scene, limits, first, (first_s, horizon_s))
+        if later is not None:
+            tried, last = later
+            made, joints = self._earlier(make, path, scene, limits, tried, last)
+            return _later(made, first[0].lower_bound_s), joints
         made, joints = first
-        none = replace(
-            no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s),
-            delayed_by="arm",
-        )
-        return (none if made.found else made), joints
+        if not made.found:
+            return made, joints
+        none = no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s)
+        return replace(none, delayed_by="arm"), joints
+
+    def _later_capture(
+        self,
+        flown: Callable[[float, float], tuple[Plan, JointPath | None]],
+        path: Callable[[Plan], RobotPath],
+        scene: Scene,
+        limits: Limits,
+        first: tuple[Plan, JointPath | None],
+        span_s: tuple[float, float],
+    ) -> tuple[tuple[float, float], tuple[Plan, JointPath]] | None:
+        """Return the first plan that the joints can fly after one that they cannot.
+
+        Args:
+            flown: Plan and joints for an earliest capture [s] with a share of the acceleration.
+            path: Returns the path of a plan.
+            scene: The target after the instant of planning.
+            limits: Resolved limits.
+            first: The plan that the joints cannot fly, with its joints.
+            span_s: Earliest and latest capture [s after the instant of planning].
+
+        Returns:
+            The last capture that was missed [s] with the share of the acceleration, and the plan
+            with its joints; None without one.
+        """
+        made, joints = first
+        earliest_s, missed_s, share, lead_s = span_s[0], span_s[0], 1.0, 0.0
+        for _ in range(1, CAPTURES):
+            slower = 1.0 if joints is None else joints.slower
+            if slower < 1.0 and slower * share >= SLOWEST:
+                share *= slower
+            else:
+                if made.found:
+                    lead_s = made.t_go_s - last_metres_s(path(made), scene, limits)
+                    earliest_s = missed_s = max(made.t_go_s, earliest_s)
+                after_s = self._next_capture(scene, limits, earliest_s, span_s[1], lead_s)
+                if after_s is None or (not made.found and share == 1.0):
+                    return None
+                earliest_s, share = after_s, 1.0
+            made, joints = flown(earliest_s, share)
+            if _possible(joints):
+                return (missed_s, share), (made, joints)
+        return None
+
+    def _flown(
+        self, made: Plan, path: Callable[[Plan], RobotPath], scene: Scene, limits: Limits
+    ) -> tuple[Plan, JointPath | None]:
+        """Return a plan with the joints of its last metres, None where there is no plan."""
+        return made, self.last_metres(path(made), scene, limits) if made.found else None
 
     def _earlier(
         self,
@@ -398,6 +432,11 @@ class Arm:
             rate_share=share_of(rate, model.velocityLimit),
             torque_share=share_of(torque, model.effortLimit),
         )
+
+
+def _possible(joints: JointPath | None) -> TypeGuard[JointPath]:
+    """Whether the joints can fly a path."""
+    return joints is not None and joints.possible
 
 
 def _later(made: Plan, lower_bound_s: float) -> Plan:

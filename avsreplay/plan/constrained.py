@@ -37,15 +37,14 @@ from avsreplay.plan.convexification import (
     proven,
     shortened,
     warm_reference,
-    withdrawals,
     withdrawn,
     worst_margin,
 )
 from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
+from avsreplay.plan.rendezvous import PlanParams, finer, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
-from avsreplay.plan.withdrawal import COAST_S, Tried
+from avsreplay.plan.withdrawal import COAST_S, Space, Tried, certified, safety
 
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
@@ -86,7 +85,6 @@ def constrained(
     extent_m: float = 8.0,
     warm: tuple[RobotPath, float] | None = None,
     earliest_s: float = 0.0,
-    stated: bool = True,
 ) -> Plan:
     """Plan a rendezvous under constraints.
 
@@ -100,7 +98,6 @@ def constrained(
         extent_m: Diagonal of the target's bounding box [m].
         warm: A path planned earlier and the time since its begin [s]; it is the first initial path.
         earliest_s: Earliest capture allowed [s after t_ns].
-        stated: State the margin of the withdrawals from every instant; it is required in any case.
 
     Returns:
         A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the
@@ -111,7 +108,7 @@ def constrained(
     Raises:
         ValueError: A value is not valid, or the scene lacks what a constraint needs.
     """
-    limits = limits.resolved(extent_m)
+    limits, params = limits.resolved(extent_m), finer(params, scene.goal)
     scene.check(limits)
     strongest = replace(params, a_max_mps2=largest_acceleration(limits, params))
     unbound = free = rendezvous(scene.goal, r0, v0, strongest, t_ns)
@@ -129,15 +126,70 @@ def constrained(
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     buffer_m = BUFFER_OF_EXTENT * extent_m
     case = Case(sampled, limits, params, r0, v0, buffer_m, earliest_s=earliest_s)
-    plan = _free_plan(case, free) or _graded(
+    return _free_plan(case, free) or _graded(
         case, free, _best_path(case, free, unbound, warm), t_ns
     )
-    if not (stated and plan.found):
+
+
+def linearised_s(
+    scene: Scene, path: StepPath, params: PlanParams, limits: Limits, extent_m: float
+) -> float:
+    """Return the time to go for a target that differs little from that of a plan: the solution of
+    one convex subproblem about its path [s]; NaN where that has none.
+
+    Args:
+        scene: The target.
+        path: The path of the plan, whose escapes are kept.
+        params: Thrust, horizon, latency and grid.
+        limits: The constraints.
+        extent_m: Diagonal of the target's bounding box [m].
+    """
+    limits, params = limits.resolved(extent_m), finer(params, scene.goal)
+    n, end_s = len(path.u), path.t_go_s
+    sampled = SampledScene(scene, params.horizon_s, params.grid_s, 1.5 * end_s + COAST_S)
+    limits = replace(limits, nodes=n)
+    case = Case(sampled, limits, params, path.r0, path.v0, BUFFER_OF_EXTENT * extent_m)
+    tried = Tried.near(path.escapes, case.wait_s, end_s)
+    away = withdrawn(case, path, tried, improve=False)
+    reference = warm_reference(case, path, 0.0)
+    change, off = largest_change(case, reference, TRUST), np.zeros((2 * n, len(CONSTRAINTS)))
+    found = solve(convex_subproblem(case, reference, off, change, away.rows))
+    return math.nan if found is None else case.wait_s + n * found.h
+
+
+def with_safety(
+    scene: Scene,
+    plan: Plan,
+    path: RobotPath,
+    params: PlanParams,
+    limits: Limits,
+    extent_m: float,
+    after_s: float = 0.0,
+) -> Plan:
+    """Return a plan with the margins of a robot that withdraws or coasts from any of its instants;
+    the same plan without one or without a clearance.
+
+    Args:
+        scene: The target after the begin of the path.
+        plan: The plan.
+        path: Its path.
+        params: Thrust, horizon and grid.
+        limits: Resolved limits.
+        extent_m: Diagonal of the target's bounding box [m].
+        after_s: Begin of the path [s after the instant of planning].
+    """
+    if not plan.found or limits.clearance_m is None or scene.surface is None:
         return plan
-    found = withdrawals(case, path_of(plan, r0, v0), plan.escapes)
-    if found is None:
-        return plan
-    return replace(plan, abort_margin_m=found.margin_m, escapes=found.escapes)
+    grid_s = finer(params, scene.goal).grid_s
+    sampled = SampledScene(scene, params.horizon_s, grid_s, path.t_go_s + 1.5 * COAST_S)
+    space = Space(sampled, limits, params.a_max_mps2, extent_m)
+    found = safety(space, path, plan.latency_s - after_s, plan.escapes)
+    return replace(
+        plan,
+        abort_margin_m=found.margin_m,
+        passive_margin_m=found.passive_margin_m,
+        passive_safe_s=after_s + min(found.passive_safe_s, path.t_go_s),
+    )
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
@@ -222,6 +274,9 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         return no_plan(t_ns, PlanStatus.NOT_FOUND, free.a_max, free.lower_bound_s)
     position, velocity = found.terminal_errors(case.scene.goal)
     worst, name = worst_margin(case, found)
+    escapes = found.escapes
+    if found.short_m > 0.0 and case.space is not None:  # the search ended at the first short ones
+        escapes = certified(case.space, found, case.wait_s, escapes).escapes
     return Plan(
         t_ns=t_ns,
         status=PlanStatus.OPTIMAL
@@ -239,7 +294,7 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         violation_m=max(-worst, 0.0),
         margin_m=worst,
         binding=name,
-        escapes=found.escapes,
+        escapes=escapes,
     )
 
 
@@ -255,12 +310,10 @@ def _best_path(
     """
     best: StepPath | None = None
     if warm is not None:
-        again = shortened(case, *warm)
-        best = _refined(again, *warm, rough=True)
-        if (
-            best is not None
-            and best.t_go_s <= LATER * max(expected_s(case, *warm), case.earliest_s) + LATER_S
-        ):
+        again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
+        enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
+        best = _refined(again, *warm, rough=True, enough_s=enough_s)
+        if best is not None and best.t_go_s <= LATER * expected + LATER_S:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -370,6 +423,7 @@ def _refined(
     latest_s: float = math.inf,
     trust: float = TRUST,
     rough: bool = False,
+    enough_s: float = -math.inf,
 ) -> StepPath | None:
     """Iterate from the rest of an earlier path, whose withdrawals the first iteration
     requires.
@@ -377,7 +431,7 @@ def _refined(
     known = path.escapes if isinstance(path, StepPath) else None
     away = withdrawn(case, path, Tried.near(known, since_s + case.wait_s, path.t_go_s), since_s)
     reference = warm_reference(case, path, since_s)
-    return _converged(case, reference, latest_s, trust, rough, away)
+    return _converged(case, reference, latest_s, trust, rough, away, enough_s)
 
 
 @dataclass
@@ -411,12 +465,14 @@ class _Search:
                 0 if better or best is None or path.short_m < best.short_m else self.idle,
             )
 
-    def done(self, settled: bool) -> bool:
-        """Return whether the best path is the latest one and moves no more, or is safe and has not
-        become better in ``IDLE`` iterations.
+    def done(self, settled: bool, enough_s: float) -> bool:
+        """Return whether the best path is the latest one and moves no more, or is safe and not
+        later than ``enough_s``, or has not become better in ``IDLE`` iterations.
         """
         if self.best is None:
             return False
+        if self.best.short_m <= 0.0 and self.best.t_go_s <= enough_s:
+            return True
         idle = self.idle >= IDLE and self.best.short_m <= 0.0
         return idle or (settled and self.idle == 0)
 
@@ -456,12 +512,14 @@ def _converged(
     trust: float = TRUST,
     rough: bool = False,
     away: Withdrawn | None = None,
+    enough_s: float = -math.inf,
 ) -> StepPath | None:
     """Iterate from a reference until the best feasible path seen no longer becomes better, and
     return it.
 
-    The iterations end without a result where the end time remains later than ``latest_s``. The
-    first iteration requires ``away``, the withdrawals of an earlier path.
+    The iterations end without a result where the end time remains later than ``latest_s``, and with
+    a safe path that is not later than ``enough_s``. The first iteration requires ``away``, the
+    withdrawals of an earlier path.
     """
     n = case.limits.nodes
     tolerance = ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
@@ -482,7 +540,7 @@ def _converged(
         if found.slack <= case.allowed_slack_m:
             _accepted(case, path, over, search)
         moved = abs(t - reference.t)
-        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t)):
+        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t), enough_s):
             break
         if _hopeless(case, search, path, iteration, latest_s, stuck):
             break

@@ -25,6 +25,7 @@ from avsreplay.plan.limits import (
     in_fixture_axes,
     largest_acceleration,
     margins,
+    narrowing,
 )
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
@@ -403,29 +404,14 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
         return away
     start = Tried(away.tried.share[:1], away.tried.d[:1])
     least = _accepted(case.space, sampled(case.space, path, start, case.wait_s)[0])
-    found = certified(case.space, path, case.wait_s, away.tried, least)
+    escapes = away.tried.escapes(case.wait_s, path.t_go_s)
+    found = certified(case.space, path, case.wait_s, escapes, least)
     short, length = max(least - found.margin_m, 0.0), path.t_go_s - case.wait_s
     poor = found.margins_m < least + case.space.resolution_m
     share = (found.worst.t[poor] - case.wait_s) / length
     tried = away.tried.also(share, found.worst.push[poor] / case.space.a_max, short)
     rows = _withdrawal_rows(case, case.space, path.t_go_s, found, least, tried.reserve_m)
     return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
-
-
-def withdrawals(case: Case, path: RobotPath, escapes: Array | None) -> Certificate | None:
-    """Return the withdrawals from every instant of a path, with a lower bound of their margin; None
-    without a clearance.
-
-    Args:
-        case: The problem.
-        path: The path.
-        escapes: Escapes that are known to be good, as a plan carries them.
-    """
-    if case.space is None:
-        return None
-    space = Space(case.sampled, case.limits, case.params.a_max_mps2, case.extent_m)
-    tried = Tried.of(escapes, case.wait_s, path.t_go_s)
-    return certified(space, path, case.wait_s, tried)
 
 
 def _accepted(space: Space, found: Certificate) -> float:
@@ -534,7 +520,9 @@ def _geometric(
     dy *= (reference.t * s)[:, None]  # change with the relative change of the end time
     bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], y]), 2, axis=0), axis=1) / 8.0
     off = off + np.concatenate([bend, bend[-1:]])[:, None] - allowed(case.start, s)
-    found = margins(scene, limits, y, reference.r, case.sampled.sigma(times))
+    sigma = case.sampled.sigma(times)
+    found = margins(scene, limits, y, reference.r, sigma)
+    off[:, :2] += narrowing(scene, limits, y, sigma)
     inside = found.inside
     if case.entry is not None:
         inside[:, 0] = s >= case.entry[0] - 1e-9

@@ -378,7 +378,7 @@ def closed_loop(
         ValueError: There is no scan.
     """
     aimed: Array | None = None
-    last_ns, flown, known, guidance = start_ns, list[Array](), None, guidance.unstated()
+    last_ns, flown, known = start_ns, list[Array](), None
     for known in inputs:
         if state is None:
             state, last_ns = guidance.initial(known.t_ns), known.t_ns
@@ -429,7 +429,7 @@ def flown_positions(
     instants = begin_ns + steps * (end_ns - begin_ns) // PATH_INSTANTS
     if segment.path is not None:
         instants = instants[instants <= segment.end_ns]
-    return instants, np.array([segment.at(int(t))[0] for t in instants]).reshape(-1, 3)
+    return instants, segment.positions(instants)
 
 
 def relative_path(

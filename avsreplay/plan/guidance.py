@@ -13,19 +13,20 @@ from dataclasses import field, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, next_turn, with_turn, without_turn
-from avsreplay.plan.constrained import constrained
+from avsreplay.plan.constrained import constrained, with_safety
 from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import BurnPath, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.rendezvous import PlanParams, finer
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
-from avsreplay.plan.withdrawal import COAST_S, Space, Withdrawal, withdrawal
+from avsreplay.plan.withdrawal import COAST_S, Space, Withdrawal, escapes_at, withdrawal
 from avsreplay.records import Forecast
 
 # ratio to the time to go of the latest full search from which on all initial paths are searched
@@ -98,6 +99,19 @@ class Segment:
         position, velocity = self.path.at(np.array([span]))
         return position[0], velocity[0]
 
+    def positions(self, instants: NDArray[np.int64]) -> Array:
+        """Return positions of the robot (n, 3) in {A} [m].
+
+        Args:
+            instants: (n,) on the clock of the scans [ns].
+        """
+        spans: Array = np.asarray((instants - self.t_ns) * 1e-9, np.float64)
+        r = self.r0 + spans[:, None] * self.v0 if self.path is None else self.path.at(spans)[0]
+        if self.previous is not None:
+            early = instants < self.t_ns
+            r[early] = self.previous.positions(instants[early])
+        return r
+
     @property
     def end_ns(self) -> int:
         """Instant at which the thrust ends."""
@@ -139,7 +153,6 @@ class Guidance:
         extent_m: float = 8.0,
         gripper: tuple[Array, float] | None = None,
         arm: Arm | None = None,
-        stated: bool = True,
     ) -> None:
         """Create the guidance of one run.
 
@@ -151,16 +164,10 @@ class Guidance:
             gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration
                 [rad/s2]; None: the attitude is not planned.
             arm: Manipulator that must be able to fly the last metres; None without.
-            stated: Plans state the margin of their withdrawals.
         """
-        self.gripper, self.arm, self.stated = gripper, arm, stated
+        self.gripper, self.arm = gripper, arm
         self.params, self.supervisor = params, supervisor
         self.limits, self.extent_m = (limits or Limits()).resolved(extent_m), extent_m
-
-    def unstated(self) -> Guidance:
-        """Return the same guidance, whose plans do not state the margin of their withdrawals."""
-        own = self.params, self.supervisor, self.limits, self.extent_m, self.gripper, self.arm
-        return Guidance(*own, stated=False)
 
     def initial(self, t_ns: int) -> GuidanceState:
         """Return the state at the first scan: the robot at its configured position and velocity.
@@ -215,6 +222,22 @@ class Guidance:
             made_ns=None,
             draft=segment or state.draft,
         )
+
+    def stated(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
+        """Return the state whose plan has the margins of a robot that withdraws or coasts from any
+        of its instants, where it was made after this scan.
+
+        Args:
+            state: State after a scan.
+            known: What is known after this scan.
+        """
+        plan, draft = state.plan, state.draft
+        if plan is None or plan.t_ns != known.t_ns or draft is None or draft.path is None:
+            return state
+        after_s = (draft.t_ns - known.t_ns) * 1e-9
+        scene = known.scene.after(after_s) if after_s else known.scene
+        own = self.params, self.limits, self.extent_m, after_s
+        return replace(state, plan=with_safety(scene, plan, draft.path, *own))
 
     def _replan(
         self, state: GuidanceState, known: PlannerInput
@@ -292,10 +315,10 @@ class Guidance:
             if draft is not None and draft.path is not None:
                 since_s = (known.t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
                 warm = draft.path, max(since_s, 0.0)
-                plan = constrained(*problem, warm=warm, earliest_s=earliest_s, stated=self.stated)
+                plan = constrained(*problem, warm=warm, earliest_s=earliest_s)
                 if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
                     return plan
-            plan = constrained(*problem, earliest_s=earliest_s, stated=self.stated)
+            plan = constrained(*problem, earliest_s=earliest_s)
             searched_s = plan.t_go_s
             return plan
 
@@ -400,14 +423,15 @@ class Guidance:
         begin_ns = known.t_ns + round(wait_s * 1e9)
         r, v = segment.at(begin_ns)
         scene = known.scene.after(wait_s) if wait_s else known.scene
-        sampled = SampledScene(scene, self.params.horizon_s, self.params.grid_s, 1.5 * COAST_S)
+        grid_s = finer(self.params, scene.goal).grid_s
+        sampled = SampledScene(scene, self.params.horizon_s, grid_s, 1.5 * COAST_S)
         space = Space(sampled, self.limits, self.params.a_max_mps2, self.extent_m)
         path, after_s = segment.path, (begin_ns - segment.t_ns) * 1e-9
         current = planned = None
         if isinstance(path, BurnPath):
             current = path.after(after_s)
         elif isinstance(path, StepPath) and path.escapes is not None:
-            planned = path.escapes[np.abs(path.escapes[:, 0] - after_s).argmin(), 1:]
+            (planned,) = escapes_at(path.escapes, np.array([after_s]))
         found = withdrawal(space, r, v, least_m, current, planned)
         previous = segment if known.t_ns < segment.t_ns else replace(segment, previous=None)
         return found, Segment(begin_ns, r, v, found.path, previous, turn=segment.turn)

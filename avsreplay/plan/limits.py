@@ -30,6 +30,8 @@ CONSTRAINTS = (
     "body",
     "workspace",
 )  # in the order of the columns of ``margins``
+AXIS_POINTS = 401  # on the fixture's axis at which limits are compared with the body
+NARROWEST = 0.5  # largest share of the width of cone and corridor that an uncertain target takes
 
 
 @value_class
@@ -229,13 +231,14 @@ def margins(
     if scene.axis_c is not None:
         along = y @ scene.axis_c
         across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
+        narrowed = narrowing(scene, limits, y, sigma)
         for i, degrees, length in (
             (0, limits.cone_deg, limits.cone_range_m or 0.0),
             (1, limits.final_deg, reach),
         ):
             if degrees is not None:
                 within = math.tan(math.radians(degrees)) * along + mouth - across
-                first[:, i], second[:, i] = within, distance - length
+                first[:, i], second[:, i] = within - narrowed[:, i], distance - length
                 corridor = np.minimum(within, reach - distance) if i else corridor
     if limits.keepout_m is not None and scene.centre_c is not None:
         first[:, 2] = (limits.keepout_release_m or 0.0) - distance
@@ -251,6 +254,27 @@ def margins(
     return Margins(first, second, foot, gap, clearance)
 
 
+def narrowing(scene: Scene, limits: Limits, y: Array, sigma: tuple[Array, Array] | None) -> Array:
+    """Return by how much cone and corridor (n, 2) are narrowed at n points [m]: by the predicted
+    standard deviations, at most to half of their width.
+
+    Args:
+        scene: The target.
+        limits: Resolved limits.
+        y: (n, 3) positions in {C} [m].
+        sigma: Predicted 1 sigma of position [m] and attitude [rad], each (n,); None: exact.
+    """
+    out = np.zeros((len(y), 2))
+    if sigma is None or scene.axis_c is None:
+        return out
+    away = limits.clearance_sigmas * (sigma[0] + sigma[1] * np.linalg.norm(y, axis=1))
+    for i, degrees in enumerate((limits.cone_deg, limits.final_deg)):
+        if degrees is not None:
+            width = math.tan(math.radians(degrees)) * (y @ scene.axis_c) + (limits.mouth_m or 0.0)
+            out[:, i] = np.minimum(away, NARROWEST * np.maximum(width, 0.0))
+    return out
+
+
 def required_clearance(limits: Limits, distance: Array, sigma: tuple[Array, Array] | None) -> Array:
     """Return the distance to the surface (n,) that is required at n points [m].
 
@@ -263,6 +287,33 @@ def required_clearance(limits: Limits, distance: Array, sigma: tuple[Array, Arra
     if sigma is not None:
         clearance += limits.clearance_sigmas * (sigma[0] + sigma[1] * distance)
     return clearance
+
+
+def axis_blocked(
+    scene: Scene, limits: Limits, length_m: float, sigma: tuple[float, float] | None = None
+) -> tuple[str, float, float] | None:
+    """Return why no straight approach along the fixture's axis exists: the constraint that is
+    violated there, the distance from the grasp point up to which it is [m], and the largest
+    violation [m]; None where all hold.
+
+    Args:
+        scene: The target.
+        limits: Resolved limits.
+        length_m: Length of the axis that is looked at [m].
+        sigma: Predicted 1 sigma of position [m] and attitude [rad] at the capture; None: exact.
+    """
+    if scene.axis_c is None or not limits.geometric:
+        return None
+    along = np.linspace(0.0, length_m, AXIS_POINTS)
+    away = None if sigma is None else (along * 0.0 + sigma[0], along * 0.0 + sigma[1])
+    y = along[:, None] * scene.axis_c
+    found = margins(scene, replace(limits, reach_max_m=None, reach_min_m=None), y, y, away).values
+    worst = int(found[1:].min(axis=0).argmin())
+    violated = np.flatnonzero(found[1:, worst] < 0.0)
+    if not len(violated):
+        return None
+    last = float(along[1 + violated[-1]])
+    return CONSTRAINTS[worst], last, float(-found[1:, worst].min())
 
 
 def corridor_margin(scene: Scene, limits: Limits, y: Array) -> tuple[Array, Array]:

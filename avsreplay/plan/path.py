@@ -21,6 +21,10 @@ from avsreplay.records import Trajectory
 
 # bounds on the goal's motion: this factor times the largest difference quotient on the grid
 MOTION_FACTOR = 1.5
+RESOLVED = 0.1  # largest turn of the goal from one sample to the next [rad]
+PROBED = 48  # intervals at the begin of a trajectory by which the spacing of samples is chosen
+MOST_HALVINGS = 12  # of the spacing
+INVISIBLE_M = 1e-9  # a difference below it is rounding
 _HERMITE = 1.0 / 384.0  # position error of a cubic Hermite interval in units of d^4 |d4 rho|
 _HERMITE_RATE = math.sqrt(3.0) / 216.0  # its velocity error in units of d^3 |d4 rho|
 
@@ -183,8 +187,9 @@ class StepPath:
         u: (n, 3) acceleration of each interval in {A} [m/s2].
         latency_s: Coasting time before the first interval [s].
         t_go_s: End of the last interval [s after the instant of planning].
-        escapes: (m, 4) instants of the path [s after the instant of planning], ascending, and the
-            directions in {A} in which the robot withdraws there; None: not planned.
+        escapes: (m, 4) begins of ranges of its instants [s after the instant of planning],
+            ascending, and the direction in {A} in which the robot withdraws in each; None: not
+            planned.
         short_m: By how much withdrawals miss what is required of them [m].
     """
 
@@ -402,6 +407,30 @@ class SampledGoal:
         """Return a bound on the interpolation error of P0.dr + P1.(t dv - dr)."""
         d3 = self.step**3 * self.snap
         return n0 * _HERMITE * self.step * d3 + n1 * t * _HERMITE_RATE * d3
+
+
+def resolved_step(goal: Trajectory, step_s: float, end_s: float) -> float:
+    """Return the spacing of samples at which a goal turns little from one to the next: the given
+    one, halved as often as needed [s].
+
+    The difference between its way and its mean velocity in an interval grows with the turn; it
+    also shows a goal that turns once or more between two samples.
+
+    Args:
+        goal: Trajectory of the grasp point.
+        step_s: Largest spacing [s].
+        end_s: Latest instant that is of interest [s].
+    """
+    for _ in range(MOST_HALVINGS):
+        times = np.linspace(0.0, min(step_s * PROBED, end_s), PROBED + 1)
+        step = float(times[1])
+        rho, rate = goal(times)
+        turned = _largest_norm(np.diff(rho, axis=0) - 0.5 * step * (rate[1:] + rate[:-1]))
+        bend = _largest_norm(np.diff(rate, axis=0))
+        if not turned > max(step * bend * RESOLVED / 12.0, INVISIBLE_M):
+            break
+        step_s *= 0.5
+    return step_s
 
 
 def sample_goal(

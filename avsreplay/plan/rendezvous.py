@@ -19,12 +19,12 @@ import numpy as np
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan.path import CostatePath, SampledGoal, sample_goal
+from avsreplay.plan.path import CostatePath, SampledGoal, resolved_step, sample_goal
 from avsreplay.plan.reachable_set import Gauge, gauge
 from avsreplay.records import Trajectory
 from avsreplay.settings import Settings, setting
 
-MAX_STEPS = 400
+MAX_STEPS = 4000  # of the search, about 0.3 ms each: its work is bounded, not its horizon
 # the goal is sampled over this time span at once, then over ever longer ones; most captures need
 # no more
 STRETCH_S = 30.0
@@ -84,6 +84,17 @@ class PlanParams(Settings):
             )
 
 
+def finer(params: PlanParams, goal: Trajectory) -> PlanParams:
+    """Return the parameters with a spacing of the samples that resolves the motion of a goal.
+
+    Args:
+        params: As configured; ``grid_s`` is the largest spacing.
+        goal: Trajectory of the grasp point.
+    """
+    grid_s = resolved_step(goal, params.grid_s, params.horizon_s)
+    return params if grid_s == params.grid_s else replace(params, grid_s=grid_s)
+
+
 @value_class
 class _Search:
     """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t``
@@ -124,7 +135,7 @@ def rendezvous(
     Raises:
         ValueError: The start or the goal is not finite.
     """
-    params = params or PlanParams()
+    params = finer(params or PlanParams(), goal)
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
     plan = _earliest(goal, r0, v0, params, t_ns)
     return (

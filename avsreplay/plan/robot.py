@@ -82,7 +82,7 @@ class Limits(Settings):
     clearance_sigmas: float = setting(
         3.0,
         "Multiple of the predicted standard deviation of the surface's position that is added to"
-        " the clearance.",
+        " the clearance, and by which cone and corridor are narrowed, at most to half.",
         low=0.0,
     )
     abort: bool = setting(

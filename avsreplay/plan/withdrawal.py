@@ -5,9 +5,9 @@ A withdrawal is either a brake, the largest acceleration against the velocity re
 of mass, or an escape: the largest acceleration in a constant direction until the robot recedes
 outside the sphere that contains the target in every attitude, and then a brake. The direction is
 the one with the largest margin: the best of many (``Space.directions``), improved. A plan carries
-the escapes from its instants, found by ``certified``, which bounds their margins over time and
-start instant. Guidance flies ``withdrawal``, which chooses among these and its own. Planning,
-margins and guidance evaluate the same manoeuvres with the same bound.
+escapes for ranges of its instants, found by ``certified``, which bounds their margins over time and
+start instant; ``escapes_at`` gives the one for an instant. The stated margin is that of the escapes
+that the plan carries. Guidance flies ``withdrawal``, which chooses among these and its own.
 
 Between two instants the distance changes by at most the path length in the axes of the fixture,
 which follows from the speeds at both instants and a bound on the acceleration. Escapes that begin
@@ -118,10 +118,51 @@ class Certificate:
 
     @property
     def escapes(self) -> Array:
-        """Start instants [s], ascending, and directions in {A} of the manoeuvres (m, 4)."""
-        push = self.worst.push
+        """Begins of the ranges [s], ascending, and directions in {A} of the manoeuvres (m, 4)."""
+        push, begins = self.worst.push, self.worst.t - self.worst.half
         d = push / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), 1e-12)
-        return np.column_stack([self.worst.t, d])[np.argsort(self.worst.t, kind="stable")]
+        return np.column_stack([begins, d])[np.argsort(begins, kind="stable")]
+
+
+def escapes_at(escapes: Array, times: Array) -> Array:
+    """Return the directions in {A} (n, 3) of the escapes from instants of a path.
+
+    Args:
+        escapes: (m, 4) begins of ranges of start instants [s], ascending, and the direction in
+            each; the last range ends with the path.
+        times: (n,) instants [s].
+    """
+    k = np.searchsorted(escapes[:, 0], times, side="right") - 1
+    return np.asarray(escapes[np.maximum(k, 0), 1:])
+
+
+@value_class
+class Safety:
+    """What is certified of the robot that leaves a path at any of its instants.
+
+    Attributes:
+        margin_m: Lower bound of the smallest margin of the withdrawals [m].
+        passive_margin_m: The same of coasting after a cut of the thrust [m].
+        passive_safe_s: Instant of the path up to which a cut is safe [s]; infinite: all of it.
+    """
+
+    margin_m: float
+    passive_margin_m: float
+    passive_safe_s: float
+
+
+def safety(space: Space, path: RobotPath, begin_s: float, escapes: Array | None) -> Safety:
+    """Return the margins of the escapes that a path carries, and of coasting.
+
+    Args:
+        space: The target.
+        path: The path.
+        begin_s: Begin of its thrust [s after its begin].
+        escapes: What it carries, see ``escapes_at``; None: they are searched.
+    """
+    active = certified(space, path, begin_s, escapes, search=escapes is None)
+    passive = coasting(space, path, begin_s)
+    return Safety(active.margin_m, passive.margin_m, passive.safe_s)
 
 
 class Space:
@@ -207,12 +248,6 @@ class Space:
             self._kernel.set_motion(c, x)
             self._end_s = float(x[-1])
         return self._kernel
-
-    def most(self, r: Array, times: Array) -> Array:
-        """Return the largest distance to the surface (n,) [m] that is required of manoeuvres from
-        points (n, 3) in {A}.
-        """
-        return self.kernel(float(times.max())).most(times, r)
 
     def gradient(self, y: Array, times: Array, most: Array) -> Array:
         """Return the gradients (n, 3) in {C} of the margin at points (n, 3) in {C}."""
@@ -312,8 +347,9 @@ def certified(
     space: Space,
     path: RobotPath,
     begin_s: float,
-    tried: Tried | None = None,
+    escapes: Array | None = None,
     least_m: float | None = None,
+    search: bool = True,
 ) -> Certificate:
     """Bound the smallest margin of the withdrawals from every instant of a path.
 
@@ -321,20 +357,21 @@ def certified(
         space: The target.
         path: The path.
         begin_s: First start instant [s after the instant of planning].
-        tried: Escapes that are known to be good.
+        escapes: Escapes that are known to be good, see ``escapes_at``; NaN or None: none.
         least_m: Prove that the margin is at least this, and end where it is not [m]; None: bound
             the smallest margin to within ``Space.resolution_m``.
+        search: Other directions are compared where the margin is short; else those of ``escapes``
+            are bounded.
     """
-    low, high, u = _ranges(path, begin_s)
+    low, high, u = _ranges(path, begin_s, None if escapes is None else escapes[:, 0])
     d = np.full((len(low), 3), math.nan)
-    if tried is not None:
-        share = (0.5 * (low + high) - begin_s) / (path.t_go_s - begin_s)
-        d = tried.d[np.abs(share[:, None] - tried.share).argmin(axis=1)]
+    if escapes is not None:
+        d = escapes_at(escapes, 0.5 * (low + high))
     done = list[_Done]()
     goal = space.enough_m - space.resolution_m if least_m is None else least_m
     for halving in range(HALVINGS):
         t, half = 0.5 * (low + high), 0.5 * (high - low)
-        m, lower, upper, at = _chosen(space, path, t, half, u, d, goal)
+        m, lower, upper, at = _chosen(space, path, t, half, u, d, goal, search)
         worst = float(upper.min())
         if least_m is None and worst - space.resolution_m < goal:
             # whether the margin is negative is decided first
@@ -350,10 +387,17 @@ def certified(
 
 
 def _chosen(
-    space: Space, path: RobotPath, t: Array, half: Array, u: Array, d: Array, goal: float
+    space: Space,
+    path: RobotPath,
+    t: Array,
+    half: Array,
+    u: Array,
+    d: Array,
+    goal: float,
+    search: bool,
 ) -> tuple[Manoeuvres, Array, Array, Array]:
     """Escapes for ranges of start instants with the bounds of ``Space.least``, in the directions d
-    (m, 3); where one does not reach the goal all directions are compared.
+    (m, 3); where one does not reach the goal all directions are compared, with ``search``.
     """
     r, v = path.at(t)
 
@@ -367,7 +411,7 @@ def _chosen(
         d[unknown] = space.directions(t[unknown], r[unknown], v[unknown], d[unknown])
     found = bounded(d)
     poor = found[2] < goal
-    if not poor.any():
+    if not search or not poor.any():
         return found
     other = d.copy()
     other[poor] = space.directions(t[poor], r[poor], v[poor], d[poor])
@@ -384,7 +428,7 @@ def coasting(space: Space, path: RobotPath, begin_s: float) -> Certificate:
         path: The path.
         begin_s: First start instant [s after the instant of planning].
     """
-    low, high, u = _ranges(path, begin_s)
+    low, high, u = _ranges(path, begin_s, None)
     done = list[_Done]()
     for halving in range(COAST_HALVINGS):
         t, half, none = 0.5 * (low + high), 0.5 * (high - low), np.zeros(len(low))
@@ -416,17 +460,20 @@ def _certificate(space: Space, done: list[_Done], rejected: bool = False) -> Cer
     )
 
 
-def _ranges(path: RobotPath, begin_s: float) -> tuple[Array, Array, Array]:
+def _ranges(path: RobotPath, begin_s: float, begins: Array | None) -> tuple[Array, Array, Array]:
     """Ranges of start instants of a path: begins, ends, and the thrust (m, 3), constant over a
-    range; NaN where it is not.
+    range; NaN where it is not. Ranges begin also at the instants ``begins``.
     """
+    n = len(path.u) if isinstance(path, StepPath) else RANGES
+    first = path.latency_s if isinstance(path, StepPath) else begin_s
+    edges = first + (path.t_go_s - first) * np.arange(n + 1) / n
+    if begins is not None:
+        edges = np.union1d(edges, begins)
+    edges = np.r_[begin_s, edges[(edges > begin_s) & (edges < path.t_go_s)], path.t_go_s]
+    low, high = edges[:-1], edges[1:]
     if isinstance(path, StepPath):
-        n = len(path.u)
-        edges = path.latency_s + (path.t_go_s - path.latency_s) * np.arange(n + 1) / n
-        on = edges[1:] > begin_s
-        return np.maximum(edges[:-1][on], begin_s), edges[1:][on], path.u[on]
-    edges = np.linspace(begin_s, path.t_go_s, RANGES + 1)
-    return edges[:-1], edges[1:], np.full((RANGES, 3), math.nan)
+        return low, high, path.thrust(0.5 * (low + high))
+    return low, high, np.full((len(low), 3), math.nan)
 
 
 def _bounded(m: Manoeuvres, path: RobotPath) -> Manoeuvres:
@@ -471,20 +518,19 @@ class Tried:
         return cls(share, np.full((STARTS, 3), math.nan))
 
     @classmethod
-    def of(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
-        """Return the instants of a table; the first ones where there is none."""
-        if table is None:
-            return cls.first()
-        return cls((table[:, 0] - begin_s) / max(end_s - begin_s, 1e-9), table[:, 1:])
-
-    @classmethod
-    def near(cls, table: Array | None, begin_s: float, end_s: float) -> Tried:
-        """Return the first instants with the directions of the nearest instants of a table."""
+    def near(cls, escapes: Array | None, begin_s: float, end_s: float) -> Tried:
+        """Return the first instants of a part of a path with the escapes that it carries."""
         first = cls.first()
-        if table is None:
+        if escapes is None:
             return first
-        t = begin_s + (end_s - begin_s) * first.share
-        return cls(first.share, table[np.abs(t[:, None] - table[:, 0]).argmin(axis=1), 1:])
+        return cls(first.share, escapes_at(escapes, begin_s + (end_s - begin_s) * first.share))
+
+    def escapes(self, begin_s: float, end_s: float) -> Array:
+        """Return the escapes for the ranges between the instants, see ``escapes_at``."""
+        order = np.argsort(self.share, kind="stable")
+        share = self.share[order]
+        begins = begin_s + (end_s - begin_s) * 0.5 * (share + np.r_[share[:1], share[:-1]])
+        return np.column_stack([begins, self.d[order]])
 
     def also(self, share: Array, d: Array, short_m: float) -> Tried:
         """Return these instants and others (n,) with their directions (n, 3), where the margin was
@@ -622,5 +668,5 @@ def _pieces(space: Space, path: BurnPath) -> Manoeuvres:
     u = path.u if len(path.u) else np.zeros((1, 3))
     r, v = path.at(begins)
     none, zero = np.zeros(len(begins)), np.zeros(1)
-    most = none + space.most(r[:1], zero)
+    most = none + space.kernel(0.0).most(zero, r[:1])
     return Manoeuvres(begins, none, r, v, u, np.maximum(ends - begins, 0.0), none, most)

@@ -402,7 +402,10 @@ def kernel_module() -> Any:
     try:
         from avsreplay.register import _kernel
     except ImportError:
-        hint = "run 'pip install .' in the source folder (needs a C++17 compiler)"
+        hint = (
+            "run 'pip install .' in the source folder (needs a C++17 compiler), then Python"
+            " outside of it"
+        )
         raise MissingBackend(
             "the C++ extension is not built", where="avsreplay.register._kernel", hint=hint
         ) from None

@@ -1,5 +1,5 @@
-"""The picture of the approach in the frame of the fixture {C}: flown path, cones, target,
-begin and grasp point.
+"""The picture of the approach in the frame of the fixture {C}: the path that was flown, the
+approach cones, the target, where the approach began, and the grasp point.
 """
 
 from __future__ import annotations

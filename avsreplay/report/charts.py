@@ -1,6 +1,4 @@
-"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``; arrays
-as base64 text.
-"""
+"""The charts of a page as plain data for ``charts.js``; arrays are base64 text."""
 
 from __future__ import annotations
 
@@ -26,13 +24,20 @@ _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1":
 
 
 def pack(array: ArrayLike, kind: str) -> dict[str, str]:
-    """Return ``{"type", "data"}`` of a flattened array; ``kind`` is f8, f4, i4, i2, u4 or u1."""
+    """Return an array as ``{"type", "data"}``, its elements in row order as base64 text.
+
+    Args:
+        array: of any shape.
+        kind: type of the stored elements: f8, f4, i4, i2, u4 or u1.
+    """
     flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
     return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
 
 
 def embed(value: Any) -> str:
-    """Return JSON that is safe inside a script element: no ``<``, no line separators, no NaN."""
+    """Return a value as JSON that can stand inside a script element: without ``<``, line separators
+    or NaN.
+    """
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -61,7 +66,7 @@ KINDS = {  # colour and pattern of each place
             "not_converged",
         ),
         "halves_differ",
-        *("doubtful", "sensor_bias", "clock"),
+        *("doubtful", "sensor_bias", "clock", "wrong_scan"),
     ),
     "injected": FAULTS.names(),
     "action": (
@@ -80,7 +85,7 @@ _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
 def derived(rows: Sequence[Row]) -> Columns:
-    """Every column that a chart draws, (n,) each; empty ones are left out."""
+    """Return every column (n,) that a chart draws, by name, without those that have no value."""
     out = {name: numbers(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (
@@ -172,10 +177,10 @@ def charts(
     limits: Mapping[str, float] | None = None,
     used: NDArray[np.bool_] | None = None,
 ) -> list[Chart]:
-    """The charts that have data, in reading order.
+    """Return the charts that have data, in reading order.
 
     Args:
-        columns: from ``derived``.
+        columns: the columns that ``derived`` returns.
         truth: true parameters, drawn as horizontal lines.
         limits: limits of the fault detector: ``rms_max_m``, ``alpha_max_m`` and ``length_m`` [m].
         used: (n,) whether each scan was used; None if all were.
@@ -445,10 +450,13 @@ def _plan_charts() -> list[Chart]:
 
 
 def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[str, Any]]:
-    """Intervals of flagged scans (lane "flagged", by reason), of injected faults ("injected"), of
-    actions ("action").
+    """Return the intervals of the chart of states: of flagged scans by their reason (lane
+    "flagged"), of injected faults ("injected") and of actions ("action").
 
-    Of ``episodes`` only those without any scan are drawn, over their window.
+    Args:
+        rows: one per scan.
+        episodes: the injected faults; of these only the ones without any scan are drawn from here,
+            over their window.
     """
     gammas, reasons = column_of(rows, "gamma"), column_of(rows, "reason")
     flagged = [None if gamma == 1 else why for gamma, why in zip(gammas, reasons, strict=True)]
@@ -491,10 +499,14 @@ def _runs(rows: Sequence[Row], words: Sequence[str | None], lane: str) -> list[d
 
 
 def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> list[int]:
-    """Indices of at most about ``most`` rows: of every interval the first row and those with the
-    largest errors.
+    """Return the indices of at most about ``most`` rows: the first row of every interval, and the
+    rows with the largest errors.
 
-    Rows at which gamma, reason, fault or action change are kept, and those in ``always``.
+    Args:
+        rows: one per scan.
+        most: number of rows.
+        always: indices that are kept, as are the rows at which gamma, reason, fault or action
+            change.
     """
     if len(rows) <= most:
         return list(range(len(rows)))

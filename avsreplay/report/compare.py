@@ -17,8 +17,13 @@ from avsreplay.settings import dump, entries, value_of
 
 @value_class(eq=True)
 class Metric:
-    """One metric of a run: name with its unit as suffix, unit, meaning, function (None
-    without a value).
+    """One metric of a run.
+
+    Attributes:
+        name: its name, which ends with its unit.
+        unit: its unit, "" without one.
+        meaning: what it measures, in words.
+        get: returns it from a summary; None where the run has no value.
     """
 
     name: str
@@ -128,8 +133,13 @@ METRICS: tuple[Metric, ...] = (
         "median iterations of the registration",
         _spread(lambda s: s.iterations, "median"),
     ),
-    Metric("faults_missed", "", "harmful faults not detected", _known(lambda s: s.faults.missed)),
-    Metric("scans_missed", "", "harmful scans used", _known(lambda s: s.faults.missed_scans)),
+    Metric(
+        "faults_missed",
+        "",
+        "faults with unusable scans that were not detected",
+        _known(lambda s: s.faults.missed),
+    ),
+    Metric("scans_missed", "", "unusable scans used", _known(lambda s: s.faults.missed_scans)),
     Metric(
         "false_alarms", "", "flagged scans without a fault", _known(lambda s: s.faults.false_alarms)
     ),
@@ -234,7 +244,7 @@ METRICS: tuple[Metric, ...] = (
 
 
 def metrics(summary: Summary) -> dict[str, float | None]:
-    """Return every metric by name, None where the run has no value."""
+    """Return the value of every metric by name, None where the run has no value."""
     return {m.name: _finite(m.of(summary)) for m in METRICS}
 
 
@@ -243,7 +253,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested table of settings as dotted keys."""
+    """Return a nested table of settings as one table with dotted keys."""
     out: dict[str, Any] = {}
     for key, value in table.items():
         out |= (
@@ -336,7 +346,7 @@ def _value(value: Any, unset: str = "not set") -> str:
 
 
 def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:
-    """The metrics of a single run."""
+    """Return the table of the metrics of a single run."""
     meaning = {m.name: m.doc for m in METRICS}
     rows = tuple(
         (metric, meaning[metric], number(value)) for metric, value in figures if value is not None

@@ -128,16 +128,17 @@ class ComparedRun(Protocol):
 
 @value_class(eq=True)
 class Change:
-    """One metric of two runs or groups of runs.
+    """One metric in the comparison of two runs or groups of runs.
 
     Attributes:
-        metric: its name.
-        base, other: values; means over the runs of a group that have one; None where none has.
+        metric: name of the metric.
+        base, other: its value in the baseline and in the other run. For a group this is the mean
+            over the runs that have a value; None where none has.
         low, high: 95 % interval of the difference other - base; None without enough pairs.
         word: "better", "worse", "no evidence" (the interval contains 0, or there are too few
             pairs), "equal", or "changed" for a metric without a direction or without an interval,
             and for runs of different logs.
-        note: "lost" or "new" where one side has no value.
+        note: "lost" where only the baseline has a value, "new" where only the other run has one.
     """
 
     metric: str
@@ -154,14 +155,15 @@ class Conclusion:
     """The comparison of a run (or a group of runs) with the baseline.
 
     Attributes:
-        name: of the other run or group.
+        name: name of the run or group that is compared with the baseline.
         word: "better", "worse", "mixed", "no evidence" or "same" (all rows agree).
         sentence: the conclusion in one line.
-        changes: of every metric that one of them has.
+        changes: every metric that one of the two has.
         settings: log, model, reading options and settings that differ, as ``key = value (baseline
             ...)``.
         pairs: number of paired runs.
-        divergence: of the rows of a single pair; None for several pairs or different logs.
+        divergence: where the rows of a single pair first differ; None for several pairs or
+            different logs.
     """
 
     name: str
@@ -177,7 +179,7 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     """Compare runs with their baselines.
 
     Args:
-        name: of the other run or group.
+        name: name of the run or group that is compared with the baseline.
         pairs: (baseline, other) runs, paired by seed or by log; at least one.
 
     Returns:
@@ -350,7 +352,7 @@ def _said(change: Change) -> str:
 
 
 def settings_table(conclusion: Conclusion) -> Table:
-    """The settings in which a run differs from the baseline."""
+    """Return the table of the settings in which a run differs from the baseline."""
     texts = conclusion.settings or ("none",)
     return facts_table(
         f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts]
@@ -358,9 +360,13 @@ def settings_table(conclusion: Conclusion) -> Table:
 
 
 def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = False) -> Table:
-    """The metrics of a run against those of the baseline, with a word on each.
+    """Return the table of the metrics of a run against those of the baseline, with the conclusion
+    on each.
 
-    Without ``show_all`` the table has the main metrics and those that changed.
+    Args:
+        baseline: name of the baseline.
+        conclusion: the comparison.
+        show_all: also show the metrics that are equal and not among the main ones.
     """
     shown = [
         c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"

@@ -1,10 +1,11 @@
-"""Injected faults against the detector's verdicts, and the time to recover.
+"""Compares the injected faults of a log with the decisions of the fault detector.
 
-A label is *harmful* (the scan must be flagged) or not (either verdict is right). A harmful label is
-*detected* where at least one of its scans has gamma 0 or, where no scan came at all, where a gap
-covers it. Where all scans in its window carry the label of another fault, these scans decide. A
-flagged scan without a label is a *false alarm*. A *gap* is an interval between scans longer than
-1.5 times the median interval.
+A label marks the scans that an injected fault affects. Its ``harmful`` states that these scans are
+unusable and that the detector must flag them (gamma 0); otherwise either decision is right. A fault
+with unusable scans is *detected* where at least one of its scans has gamma 0 or, where no scan came
+at all, where a gap covers it. Where all scans in its window carry the label of another fault, these
+scans decide. A flagged scan without a label is a *false alarm*. A *gap* is an interval between
+scans longer than 1.5 times the median interval.
 
 Recovery is assessed by gamma alone: an estimate that followed wrong poses agrees with the next ones
 and counts as healthy. The effect of a fault is seen in the errors of the estimate over its flagged
@@ -27,7 +28,7 @@ GAP = 1.5
 
 
 class Mark(NamedTuple):
-    """The part of a row that the fault account needs."""
+    """The values of a row that the comparison of faults and decisions needs."""
 
     t_ns: int
     gamma: int
@@ -38,8 +39,8 @@ class Mark(NamedTuple):
 
 @value_class(eq=True)
 class Peak:
-    """Largest position and attitude error over some scans; None without truth or without such
-    a scan.
+    """The largest position [m] and attitude error [deg] over some scans; None where the log has no
+    truth, or without a scan.
     """
 
     pos_err_m: float | None = None
@@ -47,7 +48,7 @@ class Peak:
 
     @classmethod
     def of(cls, marks: Iterable[Mark]) -> Peak:
-        """Peak over ``marks``; errors that are None are ignored."""
+        """Return the largest errors over ``marks``; errors that are None are ignored."""
         listed = list(marks)
         return cls(
             max((m.pos_err_m for m in listed if m.pos_err_m is not None), default=None),
@@ -57,22 +58,25 @@ class Peak:
 
 @value_class(eq=True)
 class Episode:
-    """One injected fault.
+    """One injected fault, from its first to its last scan, and what the detector decided.
 
     Attributes:
-        start_s, end_s: its window, since the first scan.
-        scans: rows that carry it.
-        flagged: those with gamma 0.
-        detected: see the module.
-        recover_scans: scans without a label after it that were still flagged.
-        recover_s: from the first scan without a label after it to the first healthy scan (0: at
-            once); None where there was nothing to recover from (neither it nor the scan after it
-            was flagged) or no recovery.
-        strength: as its label states.
-        delay_scans, delay_s: from its first scan to the first flagged one; None where none was.
-        lost: scans without a label came after it, and not one of them was healthy.
-        peak_flagged, peak_used: of its scans with gamma 0 and with gamma 1.
-        peak_after: of the healthy scans without a label after it, up to the next label.
+        start_s, end_s: begin and end of its window, in seconds since the first scan.
+        scans: number of rows that carry it.
+        flagged: number of these rows with gamma 0.
+        detected: whether it was detected, as the module defines it.
+        recover_scans: number of scans without a label after it that were still flagged.
+        recover_s: time from the first scan without a label after it to the first healthy scan, 0 if
+            that is the same scan. None where neither the fault nor the scan after it was flagged,
+            so that there is nothing to recover from, and where no recovery followed.
+        strength: the strength that its label states.
+        delay_scans, delay_s: scans and seconds from its first scan to the first flagged one; None
+            where no scan was flagged.
+        lost: whether scans without a label came after it and none of them was healthy.
+        peak_flagged, peak_used: largest errors over its scans with gamma 0, and over those with
+            gamma 1.
+        peak_after: largest errors over the healthy scans without a label after it, up to the next
+            label.
     """
 
     kind: str
@@ -95,15 +99,17 @@ class Episode:
 
 @value_class(eq=True)
 class FaultAccount:
-    """All labels of a log.
+    """The injected faults of a log and the decisions on all its scans.
 
     Attributes:
         known: whether the log states the injected faults; without that a flagged scan is no proven
             false alarm.
-        injected, detected, missed: harmful labels.
-        missed_scans: harmful scans with gamma 1.
-        false_alarms: flagged scans without a label, of ``unlabelled`` scans.
-        peak_flagged, peak_used: of the scans without a label with gamma 0 and with gamma 1.
+        injected, detected, missed: number of faults with unusable scans, and of those detected and
+            missed.
+        harmful_scans, missed_scans: number of unusable scans, and of those with gamma 1.
+        false_alarms: number of flagged scans without a label, of ``unlabelled`` scans.
+        peak_flagged, peak_used: largest errors over the scans without a label with gamma 0, and
+            over those with gamma 1.
     """
 
     known: bool
@@ -120,7 +126,7 @@ class FaultAccount:
 
     @property
     def false_alarm_rate(self) -> float:
-        """False alarms over scans without a label."""
+        """Number of false alarms over the number of scans without a label."""
         return self.false_alarms / self.unlabelled if self.unlabelled else 0.0
 
     @property
@@ -131,7 +137,7 @@ class FaultAccount:
 
 @value_class(eq=True)
 class Coast:
-    """A run of scans with gamma 0, and the pose error at its last scan."""
+    """Consecutive scans with gamma 0, and the pose error at the last of them."""
 
     start_s: float
     scans: int
@@ -141,7 +147,9 @@ class Coast:
 
 
 def gaps(t_ns: Sequence[int]) -> list[tuple[int, int]]:
-    """(before, after) instants of every interval longer than ``GAP`` times the median interval."""
+    """Return the instants [ns] before and after every interval longer than ``GAP`` times the median
+    interval.
+    """
     steps = [b - a for a, b in pairwise(t_ns) if b > a]
     if not steps:
         return []
@@ -150,7 +158,16 @@ def gaps(t_ns: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccount:
-    """Set rows against labels; without labels they are read off the rows' own ``fault`` column."""
+    """Compare rows with labels.
+
+    Args:
+        marks: the values of the rows, one per scan in their order.
+        labels: the injected faults; where there are none, they are taken from the column ``fault``
+            of the rows.
+
+    Returns:
+        The faults, what was detected of them, and the false alarms.
+    """
     known = labels is not None or any(m.fault is not None for m in marks)
     labels = _labels_of(marks) if labels is None else labels
     labels, members = _replayed(marks, labels, _members(marks, labels))
@@ -314,8 +331,8 @@ def _nexts(labels: Sequence[Label]) -> list[int | None]:
 
 
 def coasts(marks: Sequence[Mark]) -> list[Coast]:
-    """Every run of scans with gamma 0; its duration is from the last healthy scan before it
-    to its last scan.
+    """Return all runs of consecutive scans with gamma 0. The duration of one is the time from the
+    last healthy scan before it to its last scan.
     """
     out: list[Coast] = []
     begin: int | None = None

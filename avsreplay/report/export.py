@@ -39,7 +39,7 @@ _COLUMNS = {
 
 
 def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | None:
-    """The estimated or the registered pose of a row, None where there is none."""
+    """Return the estimated or the registered pose of a row, None where there is none."""
     attitude, position = _COLUMNS[which]
     q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
     return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
@@ -48,12 +48,12 @@ def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | Non
 def row_poses(
     rows: Iterable[Row], which: Literal["estimate", "registration"]
 ) -> Iterator[StampedPose]:
-    """The estimated or the registered pose of every row that has one."""
+    """Return the estimated or the registered poses of the rows that have one."""
     return ((row.t_ns, pose) for row in rows if (pose := row_pose(row, which)) is not None)
 
 
 def stamp_text(t_ns: int) -> str:
-    """Seconds with nine decimals, exact."""
+    """Return a time stamp [ns] as seconds with nine decimals, exactly."""
     sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
     return f"{sign}{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
 
@@ -88,8 +88,8 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 
 
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
-    """Write all columns; their names (with units as suffixes) stand in the first line, null
-    is an empty cell.
+    """Write all columns as CSV. The first line has their names, which end with the unit; null is an
+    empty cell.
     """
     names = [c.name for c in columns()]
     with output_text(path) as stream:
@@ -107,7 +107,7 @@ def _cell(value: Any) -> str:
 
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
-    """Write all columns, typed; the metadata of each field state unit and meaning.
+    """Write all columns with their types; the metadata of each field have its unit and meaning.
 
     Raises:
         MissingBackend: pyarrow is not installed.
@@ -140,8 +140,8 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
 def run_document(
     rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return ``{"format", "verdict", "header", "summary", "rows"}`` as plain JSON values (NaN is
-    null).
+    """Return a run as plain JSON values, with the keys ``format``, ``verdict``, ``header``,
+    ``summary`` and ``rows``; NaN becomes null.
     """
     names = [f.name for f in dataclasses.fields(Row)]
     return {
@@ -154,7 +154,7 @@ def run_document(
 
 
 def summary_record(summary: Summary) -> dict[str, Any]:
-    """The summary as plain JSON values, with the derived figures."""
+    """Return a summary as plain JSON values, with the figures that follow from it."""
     record: dict[str, Any] = _strict(dump(summary))
     record["faults"]["false_alarm_rate"] = summary.faults.false_alarm_rate
     record["faults"]["longest_recovery_s"] = summary.faults.longest_recovery_s
@@ -217,7 +217,7 @@ FREQUENT = {
 
 
 def columns_page() -> str:
-    """Return the Markdown page."""
+    """Return the text of docs/columns.md."""
     lines = ["| question | columns |", "|---|---|"]
     lines += [
         f"| {what} | {', '.join(f'`{n}`' for n in names)} |" for what, names in FREQUENT.items()
@@ -251,7 +251,7 @@ def _line(column: Column, kind: type, nullable: bool) -> str:
 
 
 def row_schema() -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of one line of ``rows.jsonl``."""
+    """Return the JSON schema (draft 2020-12) of one line of ``rows.jsonl``."""
     names = {str: "string", int: "integer", float: "number", bool: "boolean"}
     properties = {}
     for column in columns():

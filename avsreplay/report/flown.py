@@ -32,13 +32,14 @@ def flight_facts(
     header: Mapping[str, Any],
     assessment: Assessment | None,
 ) -> list[tuple[str, str]]:
-    """Return names and texts: contact, margins, acceleration, distance from the base, withdrawals.
+    """Return facts about the flight as names and texts: contact, margins, largest acceleration,
+    distance from the base, withdrawals.
 
     Args:
         rows: one per scan.
         view: the planned paths; None where they are not known.
-        header: ``run.json``.
-        assessment: of the capture; None where there is none.
+        header: the content of ``run.json``.
+        assessment: the assessment of the capture; None where there is none.
     """
     found = [*_contact(assessment), *_margins(rows)]
     flown = _flown_paths(rows, view)

@@ -29,20 +29,18 @@ class GateRule(Settings):
     """
 
     metric: str = setting(doc="The metric that is limited.")
-    min: float | None = setting(None, "Smallest value that passes.")
-    max: float | None = setting(None, "Largest value that passes.")
-    min_ratio: float | None = setting(
-        None, "Smallest multiple of the baseline's value that passes."
-    )
-    max_ratio: float | None = setting(None, "Largest multiple of the baseline's value that passes.")
+    min: float | None = setting(None, "Smallest allowed value.")
+    max: float | None = setting(None, "Largest allowed value.")
+    min_ratio: float | None = setting(None, "Smallest allowed multiple of the baseline's value.")
+    max_ratio: float | None = setting(None, "Largest allowed multiple of the baseline's value.")
     max_increase: float | None = setting(
-        None, "Largest increase over the baseline's value that passes."
+        None, "Largest allowed increase over the baseline's value."
     )
     max_decrease: float | None = setting(
-        None, "Largest decrease below the baseline's value that passes."
+        None, "Largest allowed decrease below the baseline's value."
     )
     optional: bool = setting(
-        False, "Whether a run without a value passes, if the baseline has none either."
+        False, "Whether the rule holds for a run without a value if the baseline has none either."
     )
     note: str = setting("", "The reason, printed with the outcome.")
 
@@ -60,7 +58,7 @@ class GateRule(Settings):
 
     @property
     def limits(self) -> dict[str, float]:
-        """The given limits by name."""
+        """Return the limits that the rule has, by name."""
         return {name: getattr(self, name) for name in _LIMITS if getattr(self, name) is not None}
 
     @property
@@ -78,7 +76,7 @@ class GateRule(Settings):
 
 @dataclass(frozen=True, slots=True)
 class GateRules(Settings):
-    """The file: ``[[rule]]`` tables."""
+    """The content of a file of rules, its tables ``[[rule]]``."""
 
     rule: tuple[GateRule, ...] = setting((), "The rules.")
 
@@ -90,7 +88,9 @@ class GateRules(Settings):
 
 @value_class(eq=True)
 class RuleOutcome:
-    """One rule applied to one run; ``why`` states the broken limit with both numbers."""
+    """The outcome of one rule on one run; ``why`` states the limit that is broken, with both
+    numbers.
+    """
 
     run: str
     rule: GateRule
@@ -115,13 +115,13 @@ def judge(
     *,
     baseline: bool = True,
 ) -> list[RuleOutcome]:
-    """Apply every rule to every run but the baseline, which is the first; a run that used no scan
-    always fails.
+    """Apply every rule to every run except the baseline, which is the first; a run that used no
+    scan always fails.
 
     Args:
-        rules: to apply.
-        runs: (name, metrics) of each run.
-        baseline: False applies absolute rules to all runs; so does a single run.
+        rules: the rules.
+        runs: name and metrics of each run.
+        baseline: False applies rules without a baseline to all runs; so does a single run.
 
     Raises:
         UsageError: a relative rule has no baseline.
@@ -201,7 +201,7 @@ def _bounds(name: str, limit: float, reference: float) -> tuple[float, float]:
 
 
 def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
-    """Raise CheckFailed naming the first broken rule."""
+    """Raise CheckFailed with the first broken rule, if there is one."""
     broken = [o for o in outcomes if not o.ok]
     if broken:
         o = broken[0]
@@ -213,7 +213,9 @@ def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
 
 
 def junit(outcomes: Sequence[RuleOutcome]) -> str:
-    """JUnit XML with a suite per run and a case per rule; the same outcomes give the same bytes."""
+    """Return the outcomes as JUnit XML with a suite for each run and a case for each rule; the same
+    outcomes give the same bytes.
+    """
     root = ET.Element("testsuites", name="avsreplay gate")
     for run in dict.fromkeys(o.run for o in outcomes):
         mine = [o for o in outcomes if o.run == run]
@@ -230,7 +232,9 @@ def junit(outcomes: Sequence[RuleOutcome]) -> str:
 
 
 def github_lines(outcomes: Sequence[RuleOutcome]) -> list[str]:
-    """GitHub workflow commands: an error per broken rule, one notice where all hold."""
+    """Return the outcomes as GitHub workflow commands: an error for each broken rule, or one notice
+    where all hold.
+    """
     broken = [o for o in outcomes if not o.ok]
     if not broken:
         return [f"::notice title=avsreplay gate::{len(outcomes)} rules hold"]
@@ -250,7 +254,7 @@ def _property(text: str) -> str:
 
 
 def gate_table(outcomes: Sequence[RuleOutcome]) -> Table:
-    """Every rule and its outcome."""
+    """Return the table of the rules and their outcomes."""
     rows = tuple(
         (
             TableCell("holds", "good") if o.ok else TableCell("broken", "bad"),

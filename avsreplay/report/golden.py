@@ -1,7 +1,7 @@
-"""Comparison with golden rows in both directions: numbers within their column's tolerance, flags
-and states exactly.
+"""Comparison with golden rows: numbers agree within the tolerance of their column, flags and states
+exactly.
 
-A value passes where ``|got - expected| <= atol + rtol |expected|``. A row or a column that is
+A value agrees where ``|got - expected| <= atol + rtol |expected|``. A row or a column that is
 missing on one side is a difference; so is null against a value.
 """
 
@@ -48,10 +48,10 @@ class GoldenResult:
     """Result of a comparison.
 
     Attributes:
-        rows: rows on both sides.
-        differences: the first ones, in order of scan and column.
-        count: of all differences.
-        by_column: the same, column by column.
+        rows: number of rows on both sides.
+        differences: the first differences, in the order of scan and column.
+        count: number of all differences.
+        by_column: number of differences in each column.
     """
 
     rows: int
@@ -65,7 +65,7 @@ class GoldenResult:
         return self.count == 0
 
     def check(self, where: str) -> None:
-        """Raise CheckFailed if they differ; ``where`` names the golden file."""
+        """Raise CheckFailed if the two differ; ``where`` is the golden file, for the message."""
         if not self.ok:
             first = self.differences[0]
             at = "every scan" if first.seq is None else f"scan {first.seq}"
@@ -81,7 +81,12 @@ class GoldenResult:
 def compare_golden(
     expected_path: str | Path, rows: Sequence[Row], *, first: int = 20
 ) -> GoldenResult:
-    """Compare rows with a golden file; ``first`` differences are kept, all are counted.
+    """Compare rows with a golden file.
+
+    Args:
+        expected_path: the golden file.
+        rows: the rows of the run.
+        first: number of differences that are kept; all are counted.
 
     Raises:
         UnreadableInput: the file does not exist, or does not hold rows.
@@ -110,8 +115,12 @@ def read_golden(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20) -> GoldenResult:
-    """Compare the rows of two runs by the tolerances of golden files; ``first`` differences
-    are kept.
+    """Compare the rows of two runs by the tolerances of golden files.
+
+    Args:
+        expected: the rows of the first run.
+        got: the rows of the second run.
+        first: number of differences that are kept; all are counted.
     """
     return _compare(Columns(expected), Columns(got), first)
 
@@ -222,7 +231,7 @@ def update_golden(path: str | Path, rows: Sequence[Row], *, first: int = 20) -> 
 
 
 def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
-    """Where the rows of two runs that differ first do so, in one line."""
+    """Return in one line where the rows of two runs first differ."""
     first = found.differences[0]
     scan = "every scan" if first.seq is None else f"scan {first.seq}"
     line = (
@@ -233,8 +242,8 @@ def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
 
 
 def golden_table(result: GoldenResult) -> Table:
-    """The first differences from a golden file, and in the note how many there are in each
-    column.
+    """Return the table of the first differences from a golden file; its note has the number of
+    differences in each column.
     """
     counts = sorted(result.by_column.items(), key=lambda item: (-item[1], item[0]))
     more = f", and {len(counts) - 12} further columns" if len(counts) > 12 else ""

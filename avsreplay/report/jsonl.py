@@ -37,14 +37,16 @@ _LARGEST = 1e100  # sums of squares of larger values are not finite
 
 
 def plain(value: Any) -> Any:
-    """A JSON value: numpy scalars as Python's, floats that are not finite as None."""
+    """Return a value that JSON has: numpy scalars as those of Python, floats that are not finite as
+    None.
+    """
     if type(value) not in _PLAIN and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def dump_row(row: Row) -> str:
-    """One line of JSON, without the line end."""
+    """Return a row as one line of JSON, without the line end."""
     values = _VALUES(row)
     try:
         return _ENCODE(dict(zip(_NAMES, values, strict=True)))
@@ -53,7 +55,9 @@ def dump_row(row: Row) -> str:
 
 
 class RowWriter:
-    """Writes rows one by one; the file appears when the ``with`` block ends without an error."""
+    """Writes rows one after the other; the file appears when the ``with`` block ends without an
+    error.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
@@ -195,11 +199,20 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
 
 
 def read_rows(path: str | Path) -> RowTable:
-    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending
-    order.
+    """Read all rows of a file.
 
     Whole blocks of lines are decoded and checked at once. A block in which anything differs from
     what a run writes is read cell by cell, which accepts it or names line and column.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The rows.
+
+    Raises:
+        UnreadableInput: the file cannot be read, a line is no row, or the scans are not in
+            ascending order.
     """
     rows = RowTable()
     for first, ends, block in _blocks(Path(path)):
@@ -213,9 +226,8 @@ def read_rows(path: str | Path) -> RowTable:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Pause the collector, which would visit all rows again and again while they are read.
-
-    They have no cycles.
+    """Pause the garbage collector, which would visit all rows again and again while they are read;
+    rows have no cycles.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -293,7 +305,13 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
     """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid
     Unicode only.
 
-    Raises UnreadableInput otherwise.
+    Args:
+        text: the text.
+        where: the file, for the message.
+        hint: what to do, for the message.
+
+    Raises:
+        UnreadableInput: the text is no such JSON.
     """
     try:
         value = json.loads(text, parse_constant=_reject_constant)
@@ -305,7 +323,11 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
 
 
 def read_json(path: Path, *, hint: str) -> Any:
-    """Return the value of a JSON file; see ``parse_json``. Raises UnreadableInput."""
+    """Return the value of a JSON file, see ``parse_json``.
+
+    Raises:
+        UnreadableInput: the file cannot be read, or is no such JSON.
+    """
     return parse_json(read_limited(path, _MAX_JSON, hint), where=str(path), hint=hint)
 
 

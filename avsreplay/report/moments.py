@@ -1,5 +1,5 @@
-"""The worst moments of a run, with their cause: intervals without a used scan, scans whose
-error or NIS stands out.
+"""The worst moments of a run with their cause: intervals without a used scan, and scans whose error
+or NIS is far above the median.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Moment:
 
     Attributes:
         row: index of its worst row.
-        start_s, end_s: since the first scan.
-        what: what happened, with its size and what is usual.
-        cause: its cause by the rows.
+        start_s, end_s: its begin and end, in seconds since the first scan.
+        what: what happened, its size, and the usual size.
+        cause: its cause as far as the rows show it.
     """
 
     row: int
@@ -39,8 +39,8 @@ class Moment:
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
-    """The five worst intervals: without a used scan, or with an error or NIS that stands out;
-    no two overlap.
+    """Return the five worst intervals, which do not overlap: those without a used scan, and those
+    whose error or NIS is far above the median.
     """
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
@@ -141,12 +141,12 @@ def _cause_in_estimate(
 
 
 def plain(name: str) -> str:
-    """A status or reason in words."""
+    """Return a status or reason in words."""
     return "no usable points" if name == "no_scan" else name.replace("_", " ")
 
 
 def median_of(figures: Array) -> float | None:
-    """Median of the finite figures, None if there is none."""
+    """Return the median of the finite figures, None if there is none."""
     return (
         float(known[len(known) // 2])
         if len(known := np.sort(figures[np.isfinite(figures)]))

@@ -55,7 +55,7 @@ class Section:
 
 @value_class(eq=True)
 class Folded:
-    """Parts, or preformatted text, that are shown on request."""
+    """Parts, or preformatted text, that are folded until the reader opens them."""
 
     title: str
     text: str = ""
@@ -85,7 +85,7 @@ def _environment() -> Environment:
 
 
 def render(template: str, **context: Any) -> Markup:
-    """A template of ``assets/`` with every value escaped."""
+    """Render a template of ``assets/``; every value is escaped."""
     return Markup(_environment().get_template(template).render(**context))
 
 
@@ -100,13 +100,13 @@ def build_html(
     """Build a page.
 
     Args:
-        title: of the page and its first heading.
-        lines: under the title, the verdict first.
+        title: title of the page, also its first heading.
+        lines: lines under the title, the verdict first.
         parts: tables, headings, figures and folded parts, in order; a table without rows is left
             out.
         data: charts and 3D view for the scripts; without it the page has no script.
         lead: parts beside the 3D view.
-        grade: pass, check or fail, the colour of the first line.
+        grade: pass, check or fail, which determines the colour of the first line.
 
     Returns:
         The page as text; the same arguments give the same bytes.
@@ -160,13 +160,13 @@ def build_page(
     poses: Iterable[StampedPose] = (),
     view: View | None = None,
 ) -> str:
-    """The page of one run.
+    """Build the page of one run.
 
     Args:
         rows: one per scan.
-        summary: of the same rows.
-        header: ``run.json``, folded away at the end.
-        title: what the run is called.
+        summary: the summary of these rows.
+        header: the content of ``run.json``, folded away at the end.
+        title: title of the page.
         truth: true parameters, drawn as horizontal lines.
         poses: true poses of {C} in {A}.
         view: model, clouds and paths for the 3D view.
@@ -252,12 +252,13 @@ def build_comparison(
     conclusions: Sequence[Conclusion],
     outcomes: Sequence[RuleOutcome] = (),
 ) -> str:
-    """The page of several runs: conclusions, metrics in tables, charts over each other.
+    """Build the page of several runs: conclusions, metrics in tables, and charts with a line for
+    each run.
 
     Args:
-        runs: the first is the baseline, whose flagged scans are shaded.
+        runs: the runs; the first is the baseline, whose flagged scans are shaded.
         conclusions: one for each of the other runs.
-        outcomes: of a gate.
+        outcomes: the outcomes of the rules of a gate.
 
     Returns:
         The page as text.
@@ -367,10 +368,10 @@ def build_flight_page(
     """Return the page of a flight as text; the same arguments give the same bytes.
 
     Args:
-        title: Of the page.
-        lines: Under the title, the verdict first.
-        flight: The flight.
-        facts: Figures of the plan, as names and texts.
+        title: title of the page.
+        lines: lines under the title, the verdict first.
+        flight: the flight.
+        facts: figures of the plan, as names and texts.
     """
     columns = {
         name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()

@@ -46,8 +46,11 @@ class Parameter:
 
 
 def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is
-    given.
+    """Return the parameters of the body at a row: those of the paper, and those in {C}.
+
+    Args:
+        row: a row, usually the last.
+        truth: the true state; None where it is not known.
     """
     sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
     found = [

@@ -1,4 +1,6 @@
-"""Two findings about a run whose truth are poses only, or whose points have no times."""
+"""Two checks of a run: errors beyond their covariance where the truth has poses only, and points
+without times.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,15 @@ _SIGNIFICANT = 3.0  # displacement during a scan over the 1 sigma of the positio
 
 
 def error_over_sigma(rows: Sequence[Row]) -> str:
-    """Return what is said if the errors of the pose exceed what the estimate states of them.
+    """Return a finding where the pose errors exceed the standard deviations of the estimate.
 
-    It is the consistency check of runs whose truth has no rates, from which NEES is not known.
+    It is the consistency check of runs whose truth has no rates, for which NEES is not known.
 
     Args:
         rows: one per scan.
 
     Returns:
-        The finding, "" if there is none.
+        The finding as a text, "" if there is none.
     """
     used = used_rows(rows)
     said = []
@@ -48,16 +50,18 @@ def error_over_sigma(rows: Sequence[Row]) -> str:
 
 
 def times_may_matter(rows: Sequence[Row], extent_m: float, period_s: float) -> str:
-    """Return what is said of points without times, if the target moves so fast that these would
-    matter if a scan took all the time to the next one.
+    """Return a finding where points have no times and the target moves so fast that times would
+    matter.
+
+    A scan is assumed to take the whole time to the next one.
 
     Args:
         rows: one per scan.
-        extent_m: of the model.
-        period_s: time between two scans.
+        extent_m: extent of the model [m].
+        period_s: time between two scans [s].
 
     Returns:
-        The finding, "" if times cannot matter.
+        The finding as a text, "" if times cannot matter.
     """
     used = used_rows(rows)
     rate = np.linalg.norm([numbers(used, f"w{axis}_radps") for axis in "xyz"], axis=0)

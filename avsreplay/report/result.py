@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from decimal import ROUND_DOWN, Decimal
@@ -32,6 +33,7 @@ from avsreplay.tables import PoseTable, RowTable
 
 _STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
+LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 _RUN_AGAIN = "the result is not as a run wrote it: run again"
 _MAX_TUM, _LEAST, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e-12, 1e15, 1e-3, 9_000_000_000
 
@@ -41,10 +43,13 @@ class Result:
     """The result of a run as read from its directory.
 
     Attributes:
-        name: of its folder.
-        header: content of ``run.json``, empty if the file does not exist.
-        truth: the true state at the last scan, its axes named as the estimate's.
+        name: name of its folder.
+        rows: one per scan.
+        summary: the summary of these rows.
+        header: the content of ``run.json``, empty if the file does not exist.
+        truth: the true state at the last scan; its axes have the order of those of the estimate.
         poses: true poses of {C} in {A}.
+        view: model, clouds and paths for the 3D view.
         unverified: why the files could not be compared with run.json; empty if they are as the run
             wrote them.
         whole: whether it is a result directory, not a single file of rows.
@@ -114,8 +119,8 @@ def facts_record(
     truth: State | None = None,
     counts: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """What ``Summary.fold`` received beside the rows, as JSON values for the key ``facts`` of
-    ``run.json``.
+    """Return what ``Summary.fold`` received beside the rows as JSON values, for the key ``facts``
+    of ``run.json``.
     """
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
@@ -144,7 +149,11 @@ def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
+    """Return the SHA-256 of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(1 << 20):
@@ -153,8 +162,8 @@ def sha256(path: Path) -> str:
 
 
 def result_path(path: Path) -> Path:
-    """Return the directory of a result for any of its files but the rows; other paths as they
-    are.
+    """Return the directory of a result where one of its files other than the rows is named; any
+    other path is returned as it is.
     """
     folder = path.parent
     inside = path.is_file() and path.name in ("run.json", "beliefs.npz", "view.npz", "result.mcap")
@@ -177,6 +186,9 @@ def load_result(path: str | Path) -> Result:
             rows in run.json.
     """
     path = result_path(Path(path))
+    if path.is_file() and path.suffix.lower() in LOG_SUFFIXES:
+        hint = f"replay it first: avsreplay run {shlex.quote(str(path))} -o results/"
+        raise UnreadableInput("is a log, not a result", where=str(path), hint=hint)
     folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
     if folder and not rows_path.is_file():
         raise UnreadableInput(
@@ -301,9 +313,16 @@ def _state(values: Mapping[str, Any]) -> State:
 
 
 def read_tum(path: str | Path) -> PoseTable:
-    """Read a TUM file: (t_ns, pose) with times exact to the nanosecond.
+    """Read a TUM file.
 
-    Raises UnreadableInput with the line.
+    Args:
+        path: the file.
+
+    Returns:
+        The time of each pose, exact to the nanosecond, and the pose.
+
+    Raises:
+        UnreadableInput: the file cannot be read, or a line is no pose; the message names the line.
     """
     hint = "name a TUM trajectory"
     text = read_limited(Path(path), _MAX_TUM, hint).decode("utf-8", "backslashreplace")

@@ -1,8 +1,8 @@
-"""The summary of a run, one fold over its rows.
+"""The summary of a run, computed in one pass over its rows.
 
-Terms: a scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are against the
-log's truth. Sums are correctly rounded, so the summary does not depend on their order. The speed in
-scans per second is not part of it.
+A scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are relative to the truth
+of the log. Sums are correctly rounded, so that the summary does not depend on their order. The
+speed in scans per second is not part of it.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class Share:
 
 @value_class(eq=True)
 class ObservabilitySummary:
-    """The Gramian at the last scan, and the time of the first scan at which its rank was 20
-    (None: never).
+    """The Gramian at the last scan, and the time of the first scan at which its rank was 20, None
+    if that did not happen.
     """
 
     log10_cond: float | None
@@ -88,8 +88,8 @@ class ObservabilitySummary:
 
 @value_class(eq=True)
 class ConvergenceSummary:
-    """t_1: time of the first scan whose estimate the planner may use; whether it holds at the
-    end; times withdrawn.
+    """When the estimate converged: the time of the first scan whose estimate the planner may use
+    (t_1), whether this holds at the end, and how often it was withdrawn.
     """
 
     t1_s: float | None

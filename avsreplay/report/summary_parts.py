@@ -1,6 +1,6 @@
-"""Parts of a run's summary: statistics of a list of numbers, planning.
+"""Parts of the summary of a run: statistics of numbers, manoeuvres, planning.
 
-Sums are correctly rounded, so a statistic does not depend on the order of its values.
+Sums are correctly rounded, so that a statistic does not depend on the order of its values.
 """
 
 from __future__ import annotations
@@ -136,12 +136,12 @@ class Drifting:
 
 
 def length_text(metres: float) -> str:
-    """A length in millimetres, from 1 m on in metres."""
+    """Return a length [m] as text in millimetres, from 1 m on in metres."""
     return f"{metres:.3g} m" if abs(metres) >= 1.0 else f"{1000 * metres:.3g} mm"
 
 
 def times(count: int) -> str:
-    """A number of events in words: never, once, 2 times."""
+    """Return a number of events in words: never, once, 2 times."""
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 
@@ -163,11 +163,32 @@ def events(
         yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
+    yield from _not_free(rows)
     stated = list(zip(column_of(rows, "t_s"), column_of(rows, "reason"), strict=True))
     if biased := [t_s for t_s, reason in stated if reason == "sensor_bias"]:
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
     if frozen := [t_s for t_s, reason in stated if reason == "frozen"]:
         yield f"the sensor repeated a scan {times(len(frozen))}, first at {frozen[0]:.1f} s"
+
+
+def _not_free(rows: Sequence[Row]) -> Iterator[str]:
+    """That no free motion explains the poses, or only one with random torques or forces."""
+    moved = list(zip(column_of(rows, "t_s"), column_of(rows, "motion"), strict=True))
+    if driven := [t_s for t_s, motion in moved if motion == "driven"]:
+        scans = f"{len(driven)} of {len(rows)} scans, first at {driven[0]:.1f} s"
+        yield f"the target does not move freely: no free motion explains the poses of {scans}"
+    elif moved and moved[-1][1] == "disturbed":
+        last = rows[-1]
+        sizes = [
+            f"{value:.2g} {unit}"
+            for value, unit in (
+                (last.torque_noise_radps15, "rad/s^1.5"),
+                (last.force_noise_mps15, "m/s^1.5"),
+            )
+            if value
+        ]
+        what = f"random torques or forces act, {' and '.join(sizes)}"
+        yield f"the target does not move freely: {what}"
 
 
 @value_class(eq=True)
@@ -186,7 +207,7 @@ class Statistics:
 
     @classmethod
     def of(cls, values: ArrayLike) -> Statistics | None:
-        """Statistics of ``values`` (n,); None without any value."""
+        """Return the statistics of ``values`` (n,); None without any value."""
         array = np.asarray(values, dtype=np.float64)
         n = len(array)
         if not n:
@@ -204,7 +225,9 @@ class Statistics:
 
 
 def median(values: ArrayLike) -> float:
-    """The middle value, or the mean of the two middle values; ``values`` (n,) must not be empty."""
+    """Return the middle value of ``values`` (n,), or the mean of the two middle values; there must
+    be at least one.
+    """
     ordered: list[float] = np.sort(np.asarray(values)).tolist()
     half = len(ordered) // 2
     return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
@@ -223,17 +246,17 @@ class CaptureMiss:
 
 @value_class(eq=True)
 class Capture:
-    """Planned instants of capture since the first scan; a replan is a row whose plan differs from
-    the one before.
+    """Planned instants of capture in seconds since the first scan. A replan is a row whose plan
+    differs from the one before.
 
     Attributes:
-        last_s, first_s: of the last and the first plan.
-        std_s, range_s: over all replans.
-        status: of the last plan.
+        last_s, first_s: planned instants of the last and the first plan.
+        std_s, range_s: standard deviation and range over all replans.
+        status: status of the last plan.
         plan_miss_m: distance to the true grasp point at the end of each plan, flown without
             replanning.
-        miss: when the gripper closed; None where it never closed or without truth.
-        actions: scans under each of the supervisor's actions.
+        miss: errors when the gripper closed; None where it never closed, or without truth.
+        actions: number of scans under each action of the supervisor.
     """
 
     replans: int

@@ -1,5 +1,5 @@
-"""The tables of one run, the same for terminal and page, and the single lines that are printed
-about it.
+"""The tables of one run, the same for terminal and page, and what is printed about it in single
+lines.
 """
 
 from __future__ import annotations
@@ -45,13 +45,15 @@ _STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 
 def print_screen(console: Console, rows: Sequence[Row], verdict: RunVerdict) -> None:
-    """Print the answer in 24 lines: verdict, worst moments, and the four quantities of the run over
-    time, of fewer scans where the verdict is long.
+    """Print the answer in 24 lines: the verdict, the worst moments, and the four main quantities
+    over time.
+
+    A long verdict leaves room for fewer scans.
 
     Args:
         console: where to print.
         rows: one per scan.
-        verdict: on the run.
+        verdict: the verdict on the run.
     """
     moments = verdict.moments[:SCREEN_MOMENTS]
     left = SCREEN_LINES - _lines(console, verdict.line) - 1 - len(moments) - TABLE_LINES
@@ -72,8 +74,8 @@ def _lines(console: Console, text: str) -> int:
 
 
 def over_time_table(rows: Sequence[Row], most: int = SCREEN_ROWS) -> Table:
-    """Pose error, gamma with its reason, condition number of the Gramian and planned time of
-    capture over time.
+    """Return the table of pose error, gamma with its reason, condition number of the Gramian and
+    planned time of capture over time.
 
     Args:
         rows: one per scan.
@@ -125,9 +127,9 @@ def print_tables(
     Args:
         console: where to print.
         rows: one per scan.
-        summary: of the same rows.
-        verdict: on the run; None leaves out what depends on it.
-        names: of ``TABLES``; None prints all of them.
+        summary: the summary of these rows.
+        verdict: the verdict on the run; None leaves out what depends on it.
+        names: names of tables of ``TABLES``; None prints all of them.
         every: print every N-th scan.
         show_all: print all scans.
         scans_per_s: measured speed; it is printed and never written to a file.
@@ -156,7 +158,9 @@ def print_tables(
 
 
 def verdict_table(verdict: RunVerdict) -> Table:
-    """Reasons, first pose, robot and the settings that differ from their defaults."""
+    """Return the table of reasons, first pose, robot and the settings that differ from their
+    defaults.
+    """
     marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
     rows: list[tuple[str | TableCell, ...]] = [
         ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
@@ -173,7 +177,9 @@ def verdict_table(verdict: RunVerdict) -> Table:
 
 
 def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
-    """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
+    """Return the table of the worst moments; ``place`` maps a row to its row on a page, to which a
+    click leads.
+    """
     rows = []
     for m in verdict.moments:
         span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
@@ -183,15 +189,15 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
-    """Errors, injected faults, manoeuvres, parameters and consistency; a table without
-    content has no rows.
+    """Return the tables of errors, injected faults, manoeuvres, parameters and consistency; a table
+    without content has no rows.
     """
     events = fault_table(summary, rows), manoeuvre_table(summary, rows)
     return error_table(summary), *events, parameter_table(summary), consistency_table(summary)
 
 
 def error_table(summary: Summary) -> Table:
-    """Statistics of the pose and registration errors, in mm (m from 1 m on) and degrees."""
+    """Return the statistics of pose and registration errors in mm (m from 1 m on) and deg."""
     groups = (
         ("pose, all scans", summary.pose_all if summary.coasting else Errors(None, None)),
         ("pose, healthy", summary.pose_healthy),
@@ -223,8 +229,8 @@ def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
 
 
 def consistency_table(summary: Summary) -> Table:
-    """Normalised errors squared against their degrees of freedom and two-sided 95 % chi-square
-    bands.
+    """Return the normalised errors squared with their degrees of freedom and two-sided 95 %
+    chi-square bands.
     """
     sizes = {f"NEES {name}": block.stop - block.start for name, block in BLOCKS.items()}
     blocks = [(f"NEES {name}", share) for name, share in summary.nees_blocks.items()]
@@ -247,7 +253,9 @@ def consistency_table(summary: Summary) -> Table:
 
 
 def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
-    """Injected faults; with ``rows`` the first cell leads to the fault's first scan."""
+    """Return the table of the injected faults; with ``rows`` the first cell leads to the first scan
+    of the fault.
+    """
     heads = (
         "kind",
         "from\n[s]",
@@ -299,7 +307,9 @@ def _figure(value: Any, places: int) -> str:
 
 
 def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
-    """Changes of the target's velocity; with ``rows`` the first cell leads to the nearest scan."""
+    """Return the table of the changes of the target's velocity; with ``rows`` the first cell leads
+    to the nearest scan.
+    """
     heads = (
         "t\n[s]",
         "1 sigma\n[s]",
@@ -336,14 +346,14 @@ def _nearest_row(t_s: float, rows: Sequence[Row]) -> int | None:
 
 def _verdict(episode: Episode) -> TableCell:
     if episode.detected and not episode.harmful:
-        return TableCell("harmless, flagged")
+        return TableCell("usable, flagged")
     if episode.detected:
         return TableCell("detected" if episode.scans else "detected as a gap", "good")
-    return TableCell("missed", "bad") if episode.harmful else TableCell("harmless, used")
+    return TableCell("missed", "bad") if episode.harmful else TableCell("usable, used")
 
 
 def parameter_table(summary: Summary) -> Table:
-    """Estimated constants against the true ones, one row for each component."""
+    """Return the table of the estimated and the true constants, one row for each component."""
     heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
     rows = tuple(row for p in summary.parameters for row in _parameter_rows(p))
     note = (
@@ -375,7 +385,7 @@ def _small(value: float | None) -> str:
 
 
 def in_one_line(summary: Summary) -> str:
-    """Scans used, faults, errors, t_1 and planned capture."""
+    """Return scans used, faults, errors, t_1 and planned capture in one line."""
     parts = [
         f"{summary.healthy} of {summary.scans} scans used",
         *_fault_words(summary),
@@ -397,10 +407,10 @@ def _fault_words(summary: Summary) -> list[str]:
     faults = summary.faults
     if not faults.known:
         return [f"{faults.false_alarms} flagged"] if faults.false_alarms else []
-    found = f"{faults.detected} of {faults.injected} harmful faults detected"
+    found = f"{faults.detected} of {faults.injected} faults with unusable scans detected"
     alarms = f"{faults.false_alarms} false alarms ({100 * faults.false_alarm_rate:.2f} %)"
     return [
-        found if faults.injected else "no harmful fault injected",
+        found if faults.injected else "no fault with unusable scans injected",
         alarms if faults.unlabelled else "no scan without a fault",
     ]
 
@@ -421,9 +431,7 @@ def _error_words(summary: Summary) -> list[str]:
 
 
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
-    """(name, value) of everything that takes one line: scans, faults, filter, plan, counts,
-    speed.
-    """
+    """Yield names and values of what takes one line: scans, faults, filter, plan, counts, speed."""
     facts = [
         *_scan_facts(summary),
         *_fault_facts(summary),
@@ -477,11 +485,11 @@ def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         return
     events = f"{faults.injected} injected, {faults.detected} detected, {faults.missed} missed"
     scans = (
-        f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans"
+        f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} unusable scans"
         " flagged"
     )
     alarms = f"{faults.false_alarms} of {faults.unlabelled} scans without a fault"
-    yield "harmful faults", f"{events}; {scans}"
+    yield "faults to detect", f"{events}; {scans}"
     rate = f"{alarms} ({100.0 * faults.false_alarm_rate:.2f} %)"
     yield "false alarms", rate if faults.unlabelled else "unknown: every scan carries a fault"
     if faults.longest_recovery_s is not None:

@@ -46,7 +46,7 @@ class TableCell:
     scan: int | None = None
 
     def signed(self, *, ascii_only: bool = False) -> str:
-        """The text after the sign of its mark."""
+        """Return the text after the sign of its mark."""
         sign = _SIGNS[self.mark][ascii_only] if self.mark else ""
         return " ".join(part for part in (sign, self.text) if part)
 
@@ -82,7 +82,7 @@ class Table:
 
 
 def as_cell(cell: str | TableCell) -> TableCell:
-    """A plain string as a cell without a mark."""
+    """Return a plain string as a cell without a mark."""
     return cell if isinstance(cell, TableCell) else TableCell(cell)
 
 
@@ -111,11 +111,14 @@ def ascii_only(console: Console) -> bool:
 
 
 def print_table(console: Console, table: Table, *, tight: bool = False) -> None:
-    """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank
-    between columns, as where two do not fit.
+    """Print a table and an empty line; nothing for a table without rows.
 
-    Lines are longer than the console is wide where numbers and names, which are never cut, require
-    it.
+    Numbers and names are never cut; lines are longer than the console is wide where they need it.
+
+    Args:
+        console: where to print.
+        table: the table.
+        tight: leave one blank between columns in any case, not only where two do not fit.
     """
     if table.rows:
         tight = tight or _least_width(table, 2) > console.width
@@ -182,7 +185,7 @@ def _text(cell: TableCell, console: Console) -> Text:
 
 
 def markdown(table: Table) -> str:
-    """The table in GitHub's Markdown; "" for a table without rows."""
+    """Return a table in the Markdown of GitHub; "" for a table without rows."""
     if not table.rows:
         return ""
     heads = [escaped(head.replace("\n", " ")) for head in table.heads]
@@ -194,25 +197,25 @@ def markdown(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text that Markdown shows as it is, on one line."""
+    """Return a text on one line that Markdown shows as it is."""
     for sign in "\\`*_[]<>|#":
         text = text.replace(sign, "\\" + sign)
     return " ".join(text.split())
 
 
 def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
-    """A table of names and values."""
+    """Return a table of names and values."""
     return Table(title, ("what", "value"), tuple(facts), align="l")
 
 
 def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
-    """A number as text, ``none`` where there is no value."""
+    """Return a number as text, or ``none`` where there is no value."""
     return none if value is None else format(value, spec)
 
 
 def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
-    """Number of decimals, ``least`` to 8, that show ``figures`` significant figures of the middle
-    value.
+    """Return the number of decimals, from ``least`` to 8, that show ``figures`` significant figures
+    of the middle value.
     """
     sizes: Sequence[float] = sorted(abs(v) for v in values if v)
     wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2])) if sizes else least
@@ -291,7 +294,7 @@ def _ordinal(n: int) -> str:
 def scan_table(
     console: Console, rows: Sequence[Row], *, every: int | None = None, show_all: bool = False
 ) -> Table:
-    """The table of the chosen rows; columns that do not fit the console are left out and
+    """Return the table of the chosen rows; columns that do not fit the console are left out and
     named in the note.
     """
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
@@ -321,7 +324,7 @@ def scan_table(
 
 
 def head(column: Column, shown: str = "") -> str:
-    """A heading of whole words with the unit on the last line; ``shown`` is the unit of the
+    """Return a heading of whole words with the unit on the last line; ``shown`` is the unit of the
     printed numbers.
     """
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
@@ -371,7 +374,9 @@ def _cell(value: Any, fmt: str) -> TableCell:
 
 
 def state_cell(gamma: int, reason: str) -> TableCell:
-    """Healthy, coasting because there was no scan, or flagged with the reason."""
+    """Return the cell of a state: healthy, coasting because there was no scan, or flagged with the
+    reason.
+    """
     if gamma == 1:
         return TableCell("ok", "good")
     return TableCell(reason, "warn" if reason == "no_scan" else "bad")
@@ -392,8 +397,8 @@ _LABEL = 32
 
 
 def spark(values: Sequence[float | None], width: int) -> str:
-    """At most ``width`` blocks from 0 to the largest value, each the largest of its part; a
-    blank for none.
+    """Return at most ``width`` blocks, whose heights from 0 to the largest value show the largest
+    value of each part; a blank where a part has none.
     """
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)

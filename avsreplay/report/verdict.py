@@ -1,8 +1,8 @@
 """The verdict on a run: PASS, CHECK or FAIL with its reasons, the origin of the first pose, and the
 worst moments.
 
-FAIL: the result must not be used, for example because most scans were not used. CHECK: a person
-should look at the named part. The limits below are stated in docs/report.md.
+FAIL means that the result must not be used, for example because most scans were not used. CHECK
+means that a person should look at the named part. docs/report.md lists the limits.
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ GROWN_LEAST, TURNED_LEAST = (
 )  # smallest median of the last third, over the extent, and [deg]
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SAME_ERROR = 0.2
+ALIASED = 0.1  # share of the scans whose poses two angular rates explain
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
 
 class Grade(Enum):
-    """Grades from best to worst."""
+    """The grades of a verdict, from best to worst."""
 
     PASS = "PASS"
     CHECK = "CHECK"
@@ -55,7 +56,7 @@ class Grade(Enum):
 
 @value_class(eq=True)
 class Concern:
-    """One reason against PASS: what, when and how bad, in a sentence."""
+    """A reason for a grade below PASS, in a sentence: what, when, and of which size."""
 
     grade: Grade
     text: str
@@ -68,11 +69,11 @@ class RunVerdict:
     Attributes:
         grade: the worse one of tracking and capture; a capture that is not likely is a CHECK.
         tracking: the worst grade of all reasons.
-        reasons: on the tracking, worst first.
+        reasons: the reasons about the tracking, worst first.
         capture: the assessment of the capture; None where there is none.
         first_pose: where the first pose came from.
-        task: what is grasped, with the values that were assumed, "" without an assessment.
-        robot: the robot that the planner assumed, "" without configuration.
+        task: what is grasped, with the values that were assumed; "" without an assessment.
+        robot: the robot that the planner assumed; "" without configuration.
         changed: settings that differ from their defaults, as ``key = value (default ...)``.
         moments: at most five, worst first.
     """
@@ -89,7 +90,7 @@ class RunVerdict:
 
     @property
     def line(self) -> str:
-        """The capture, then the tracking with at most three reasons, in one line."""
+        """Return the capture, then the tracking with at most three reasons, in one line."""
         if self.capture is None:
             return self._tracking
         return f"{self.capture.sentence}. TRACKING {self._tracking}"
@@ -106,7 +107,7 @@ class RunVerdict:
         return f"{self.tracking.value}: {'; '.join(texts)}."
 
     def record(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return the verdict as plain values for JSON."""
         return {
             "grade": self.grade.value,
             "line": self.line,
@@ -289,15 +290,16 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
     if extent_m and used > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if used > ERROR_FAIL * extent_m else Grade.CHECK
         text = (
-            f"{faults.missed_scans} of {faults.harmful_scans} scans with a harmful fault were used"
+            f"{faults.missed_scans} of {faults.harmful_scans} scans that faults make unusable"
+            " were used"
         )
         yield Concern(grade, f"{text}, with a position error up to {length_text(used)}")
     missed = [e for e in faults.episodes if e.harmful and not e.detected]
     if missed:
         first = f"{plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
         text = (
-            f"{len(missed)} of {faults.injected} harmful faults were not detected, the first:"
-            f" {first}"
+            f"{len(missed)} of {faults.injected} faults with unusable scans were not detected,"
+            f" the first: {first}"
         )
         yield Concern(Grade.FAIL, text)
     lost = next((e for e in faults.episodes if e.lost), None)
@@ -316,6 +318,7 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Consistency, changes of the motion and new starts of the estimate, what it determines."""
+    yield from _aliases(rows)
     yield from _consistency(rows, summary)
     yield from _new_starts(rows, summary)
     if (used := column_of(used_rows(rows), "free_directions")) and all(used):
@@ -325,6 +328,18 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         )
     if summary.assessment is None:  # else it states whether the estimate suffices
         yield from _convergence(rows, summary)
+
+
+def _aliases(rows: Sequence[Row]) -> Iterator[Concern]:
+    """Two angular rates that explain the poses alike."""
+    named = [row for row in rows if row.alias_fast_radps is not None]
+    if len(named) > ALIASED * len(rows):
+        slow, fast = named[-1].alias_slow_radps, named[-1].alias_fast_radps
+        yield Concern(
+            Grade.CHECK,
+            "the target turns too far from scan to scan: rates of"
+            f" {slow:.3g} and {fast:.3g} rad/s both explain the poses; more scans a second tell",
+        )
 
 
 def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
@@ -441,7 +456,7 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
 
 
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
-    """Where the first pose came from, in words."""
+    """Return in words where the first pose came from."""
     if not rows:
         return "no scan"
     config = header.get("config") or {}

@@ -1,8 +1,8 @@
-"""Data of a page's 3D view: a decimated model, decimated clouds and planned paths, kept in
-``view.npz``.
+"""Data for the 3D view of a page, kept in ``view.npz``: a thinned model, thinned clouds and planned
+paths.
 
-Decimation is deterministic: clouds by an even stride, the model by clustering its vertices on a
-grid.
+Thinning is deterministic: clouds keep points at an even stride, the vertices of the model are
+merged on a grid.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Faces = NDArray[np.int32]
 
 @value_class
 class CloudView:
-    """Some points of scan ``seq``: (n, 3) in {A} [m], distances to the model (n,) [m] and
-    intensities (n,) or None.
+    """Some points of scan ``seq``: positions (n, 3) in {A} [m], distances to the model (n,) [m],
+    and intensities (n,) or None.
     """
 
     seq: int
@@ -56,7 +56,7 @@ class CloudView:
 
 
 class CloudTable(Sequence[CloudView]):
-    """Clouds, of which only the last ones are in memory."""
+    """A sequence of clouds, of which only the last ones are in memory."""
 
     def __init__(self, clouds: Iterable[CloudView] = (), arrays: Mapping[str, Spool] | None = None):
         """Take clouds.
@@ -133,7 +133,9 @@ class PathView:
 
 @value_class
 class View:
-    """Model (vertices (n, 3) in {C} [m], faces (m, 3), possibly none), clouds and paths."""
+    """What the 3D view shows: the model with vertices (n, 3) in {C} [m] and faces (m, 3), possibly
+    none, the clouds, and the planned paths.
+    """
 
     vertices: Floats
     faces: Faces
@@ -149,8 +151,14 @@ def thin_cloud(
     *,
     most: int = CLOUD_POINTS,
 ) -> CloudView:
-    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m],
-    intensity (n,).
+    """Thin a cloud to an even stride of its points.
+
+    Args:
+        seq: number of the scan.
+        points: (n, 3) in {A} [m].
+        residual_m: (n,) distances to the model [m].
+        intensity: (n,) or None.
+        most: largest number of points that are kept.
     """
     points = np.asarray(points)
     count = min(most, len(points))
@@ -163,8 +171,8 @@ def thin_cloud(
 
 
 def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
-    """At most ``most`` faces (vertices, for a bare cloud): vertices are merged on an ever
-    coarser grid.
+    """Thin a model to at most ``most`` faces (vertices, for a model without faces): vertices are
+    merged on a grid that is made coarser until this holds.
     """
     vertices, faces = surface.vertices, surface.faces
     size = surface.extent / 256.0 or 1.0
@@ -304,8 +312,8 @@ RING = 48  # lines of a cone
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
-    """Plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit steps
-    about a centre [m].
+    """Return the plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit
+    steps about a centre [m].
     """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack(

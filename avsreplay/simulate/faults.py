@@ -5,8 +5,8 @@ registered in the entry-point group ``avsreplay.faults``. Its ``apply`` serves s
 recorded scans. The keys of a scenario, the help of ``record``, the table in docs/scenario.md, which
 ``python -m avsreplay.simulate.faults`` prints, and the colours of a page follow from the classes.
 
-``harmful`` is part of the label: the scan cannot give a correct pose at its stamp. The estimate
-should survive a fault that is not harmful.
+``harmful`` is part of the label: the scan is unusable, because it cannot give a correct pose at its
+stamp. Scans with another fault are usable.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ RADIUS_QUANTILE = 0.9  # of the distances from the median point: the radius of a
 
 
 class Stage(IntEnum):
-    """What a fault acts on. Faults act in this order, those of one stage by name."""
+    """The part of a scan on which a fault acts. Faults act in this order, those of one stage by
+    name.
+    """
 
     LIGHT = 0  # what the rays meet, before the noise of the scanner
     NOISE = 1  # the noise of the ranges
@@ -54,14 +56,14 @@ class Stage(IntEnum):
 
 @value_class
 class Shot:
-    """A scan on its way into a log.
+    """A scan before it is written to a log.
 
     Attributes:
-        returns: its returns.
-        noise: factor on the noise of the ranges.
-        stamp_ns: added to its stamp [ns].
-        written: whether there is a message.
-        repeated: whether the message has the points of the last one without this fault.
+        returns: the returns of the scanner.
+        noise: factor by which the noise of the ranges is multiplied.
+        stamp_ns: time that is added to its stamp [ns].
+        written: whether the log gets a message of it.
+        repeated: whether the message has the points of the last scan without this fault.
     """
 
     returns: Returns
@@ -73,16 +75,16 @@ class Shot:
 
 @value_class
 class Circumstances:
-    """What is known where a fault acts on a scan.
+    """What a fault can use about the scan on which it acts.
 
     Attributes:
         t_s: time of the scan after the first one [s].
         place: number of scans before it in the window of the fault.
         window: makes a random generator that is the same for all scans of the window.
-        along_z: the scanner looks along +z of the frame of the directions; otherwise along the mean
-            direction of the returns.
-        centre_a: (3,) centre of the target in that frame [m]; None: the median point.
-        radius_m: radius of its bounding sphere [m]; None: from the points.
+        along_z: whether the scanner looks along +z of the frame of the directions; otherwise it
+            looks along the mean direction of the returns.
+        centre_a: (3,) centre of the target in that frame [m]; None takes the median point.
+        radius_m: radius of its bounding sphere [m]; None takes it from the points.
     """
 
     t_s: float
@@ -94,14 +96,14 @@ class Circumstances:
 
 
 class Fault(ABC):
-    """A fault that acts on scans.
+    """A fault that acts on scans; the base class of every kind.
 
     Attributes:
-        name: the kind, as in ``kind = "..."``.
-        about: what happens, one line.
-        harmful: whether a scan with it cannot give a correct pose at its stamp.
-        stage: what it acts on.
-        parameters: parameter class with the field ``strength``, or without it.
+        name: name of the kind, as in ``kind = "..."``.
+        about: what happens, in one line.
+        harmful: whether a scan with it is unusable: it cannot give a correct pose at its stamp.
+        stage: the part of the scan on which it acts.
+        parameters: parameter class, which has the field ``strength`` or not.
     """
 
     name: ClassVar[str]
@@ -124,8 +126,8 @@ class Fault(ABC):
 
         Args:
             shot: the scan, with the faults that act before this one.
-            at: what is known.
-            rng: for the random numbers of this scan.
+            at: what the fault can use about the scan.
+            rng: generator of the random numbers of this scan.
         """
 
 
@@ -135,7 +137,7 @@ class _Covered(Settings):
 
 
 class Occlusion(Fault):
-    """A plate hides returns; it enters from the same side in all scans of the window."""
+    """A plate that hides returns; it enters from the same side in all scans of the window."""
 
     name = "occlusion"
     about = "a plate in front of the target; 5 % of the rays it blocks give a return from it"
@@ -164,7 +166,7 @@ class _Hidden(Settings):
 
 
 class PartialOcclusion(Occlusion):
-    """The same plate, which covers a part of the view."""
+    """A plate that hides a part of the view."""
 
     name = "partial_occlusion"
     about = "the same plate from one side"
@@ -173,7 +175,7 @@ class PartialOcclusion(Occlusion):
 
 
 class Dropped(Fault):
-    """No message."""
+    """The scan is not written."""
 
     name = "dropped"
     about = "no message is written"
@@ -186,7 +188,7 @@ class Dropped(Fault):
 
 
 class Empty(Fault):
-    """A message without points."""
+    """The message has no points."""
 
     name = "empty"
     about = "a message without points"
@@ -205,7 +207,7 @@ class _Added(Settings):
 
 
 class Clutter(Fault):
-    """Points about the target."""
+    """Additional points about the target."""
 
     name = "clutter"
     about = "points uniform in a ball about the target"
@@ -238,7 +240,7 @@ class _Bias(Settings):
 
 
 class RangeBias(Fault):
-    """Longer or shorter ranges."""
+    """Ranges that are too long or too short."""
 
     name = "range_bias"
     about = "the target appears farther away"
@@ -258,7 +260,7 @@ class _Factor(Settings):
 
 
 class NoiseBurst(Fault):
-    """More range noise."""
+    """Larger range noise."""
 
     name = "noise_burst"
     about = "more range noise"
@@ -272,7 +274,7 @@ class NoiseBurst(Fault):
 
 
 class Frozen(Fault):
-    """The last scan again."""
+    """The last scan is repeated."""
 
     name = "frozen"
     about = "the last scan before the window is repeated"
@@ -292,7 +294,7 @@ class _Jump(Settings):
 
 
 class StampJump(Fault):
-    """A wrong stamp."""
+    """A wrong time stamp."""
 
     name = "stamp_jump"
     about = "the log clock stays correct"
@@ -335,7 +337,7 @@ class _Removed(Settings):
 
 
 class Subsampled(Fault):
-    """Fewer points."""
+    """Fewer points in each scan."""
 
     name = "subsampled"
     about = "fewer points, chosen at random"
@@ -360,7 +362,7 @@ class _Every(Settings):
 
 
 class FrameRate(Fault):
-    """Fewer scans."""
+    """Fewer scans in each second."""
 
     name = "frame_rate"
     about = "only every n-th scan is written"
@@ -375,7 +377,7 @@ class FrameRate(Fault):
 
 @dataclass(frozen=True, slots=True)
 class InjectedFault(Settings):
-    """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
+    """The table [[fault]]: a kind of fault in the interval [start_s, start_s + duration_s)."""
 
     kind: str = setting(doc="Kind of the fault.", one_of=FAULTS)
     start_s: float = setting(
@@ -390,7 +392,7 @@ class InjectedFault(Settings):
     )
     harmful: bool | None = setting(
         None,
-        "Whether the label states that such a scan gives no good pose.",
+        "Whether such a scan is unusable: it gives no correct pose.",
         unset="as usual for the kind",
     )
 

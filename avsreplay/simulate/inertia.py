@@ -38,23 +38,26 @@ class Body:
 
     @property
     def c_b(self) -> Array:
-        """(3,) varrho, the fixture in {B} [m]: p_b = A(mu) p_c + varrho is zero at the mass
-        centre.
+        """Origin of {C} in {B} (3,) [m], the paper's varrho: p_b = A(mu) p_c + varrho is zero at
+        the mass centre.
         """
         return -geometry.rotate(geometry.matrix(self.q_bc), self.centre_c)
 
     @property
     def sigma(self) -> Array:
-        """(2,) inertia ratios ((Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy)."""
+        """Inertia ratios (2,), ((Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy)."""
         xx, yy, zz = self.moments
         return np.array([(yy - zz) / xx, (zz - xx) / yy])
 
 
 def body_of(surface: Surface) -> Body:
-    """The body of uniform density with this surface.
+    """Return the body of uniform density with this surface.
+
+    Args:
+        surface: a mesh in {C} [m].
 
     Raises:
-        UsageError: The model has no faces, or encloses no volume.
+        UsageError: the model has no faces, or encloses no volume.
     """
     if not len(surface.faces):
         hint = "name a mesh, or give moments_m2, axes_xyzw and mass_centre_m under [target]"
@@ -93,7 +96,9 @@ def principal(inertia_c: ArrayLike, centre_c: ArrayLike) -> Body:
 
 
 def with_axes(moments: ArrayLike, q_bc: ArrayLike, centre_c: ArrayLike) -> Body:
-    """The body of given principal moments (3,), axes mu (4,) and mass centre (3,) in {C}."""
+    """Return the body of given principal moments (3,) [m2], axes mu (4,) and mass centre (3,) in
+    {C} [m].
+    """
     R_bc = geometry.matrix(geometry.normalise(q_bc))
     inertia = R_bc.T @ np.diag(np.asarray(moments, dtype=np.float64)) @ R_bc
     return Body(

@@ -86,7 +86,7 @@ class FaceOptics:
     normals: Array
 
     def part(self, faces: NDArray[np.intp]) -> FaceOptics:
-        """The properties of some of the faces."""
+        """Return the properties of some of the faces."""
         return FaceOptics(*(getattr(self, field.name)[faces] for field in fields(self)))
 
     def intensity(
@@ -221,11 +221,13 @@ class TracedRays:
 
     @classmethod
     def empty(cls, n: int) -> TracedRays:
-        """Rays that meet nothing."""
+        """Return ``n`` rays that meet nothing."""
         return cls(np.full(n, np.inf), np.full(n, np.inf), np.zeros(n), np.zeros(n), np.zeros(n))
 
     def nearer(self, other: TracedRays) -> TracedRays:
-        """Ray by ray the nearer surface; it blocks the other one also where it gives no return."""
+        """Return for each ray the nearer surface; it blocks the other one also where it gives no
+        return.
+        """
         other_first = other.ranges < self.ranges
         names = [field.name for field in fields(self)]
         return TracedRays(
@@ -233,7 +235,7 @@ class TracedRays:
         )
 
     def chosen(self, index: NDArray[np.intp]) -> TracedRays:
-        """Some of the rays."""
+        """Return some of the rays."""
         return TracedRays(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
@@ -342,7 +344,7 @@ def bloomed(
 
 
 def part_of(surface: Surface, faces: NDArray[np.intp]) -> Surface:
-    """Some of the faces of a mesh."""
+    """Return the mesh with some of its faces only."""
     return (
         surface
         if len(faces) == len(surface.faces)

@@ -99,7 +99,7 @@ Search = Callable[[Array, Array], Hits]
 
 
 class Engine(Enum):
-    """The search for the triangle."""
+    """The program that finds the triangle that a ray hits."""
 
     AUTO = "auto"  # embree where embreex is installed, else exact
     EMBREE = "embree"  # float32, fast; hits on an edge may differ between processors

@@ -63,24 +63,24 @@ class Returns:
     dropouts: Array
 
     def keep(self, chosen: NDArray[Any]) -> Returns:
-        """The returns selected by a mask (n,) or by indices."""
+        """Return the returns that a mask (n,) or indices select."""
         index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         return Returns(*(getattr(self, field.name).take(index, axis=0) for field in fields(self)))
 
     def joined(self, other: Returns) -> Returns:
-        """These returns, then the others."""
+        """Return these returns, followed by the others."""
         names = [field.name for field in fields(self)]
         return Returns(
             *(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
         )
 
     def in_order(self) -> Returns:
-        """The returns by time; the order of equal times is kept."""
+        """Return the returns ordered by time; the order of equal times is kept."""
         return self.keep(np.argsort(self.times_s, kind="stable"))
 
     @property
     def points(self) -> NDArray[np.float32]:
-        """(n, 3) float32 in {A} [m]."""
+        """Return the points (n, 3) in {A} as float32 [m]."""
         return (self.directions * self.ranges[:, None]).astype(np.float32)
 
 
@@ -140,13 +140,13 @@ class Scanner:
         plumes: Sequence[tuple[Plume, np.random.Generator]] = (),
         limbs: Sequence[tuple[Limb, np.random.Generator]] = (),
     ) -> Returns:
-        """The returns of a scan without noise; beams without a return are left out.
+        """Return the returns of a scan without noise; beams without a return are left out.
 
         Args:
-            t_s: Time of the scan [s].
-            bodies: Objects beside the target that are present.
-            plumes: Plumes that are present, each with the generator of its particles.
-            limbs: Sunlit Earth, where it is present, with the generator of its false returns.
+            t_s: time of the scan [s].
+            bodies: objects beside the target that are present.
+            plumes: plumes that are present, each with the generator of its particles.
+            limbs: the sunlit Earth where it is present, with the generator of its false returns.
         """
         times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times
         target = self._motion.poses(times)

@@ -1,4 +1,4 @@
-"""A scenario: one TOML file, one table per part of the simulation."""
+"""A scenario: one TOML file with one table for each part of the simulation."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class StartParams(Settings):
 
 @dataclass(frozen=True, slots=True)
 class ScenarioParams(Settings):
-    """A scenario file."""
+    """The content of a scenario file."""
 
     name: str = setting("scenario", "Name of the scenario.")
     seed: int = setting(0, "Seed of every random draw.", low=0, below=2**63)
@@ -122,12 +122,12 @@ class ScenarioParams(Settings):
 
 @value_class(eq=True)
 class Scenario:
-    """A scenario as read.
+    """A scenario as it was read.
 
     Attributes:
-        params: Its parameters, with the seed that is used.
-        text: Its TOML text, which is stored in the log.
-        folder: Folder to which its file names are relative.
+        params: its parameters, with the seed that is used.
+        text: its TOML text, which is stored in the log.
+        folder: folder to which its file names are relative.
     """
 
     params: ScenarioParams

@@ -34,7 +34,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Presence(Settings):
-    """Something that is in the scene for the whole log or for a part of it."""
+    """An item that is in the scene for the whole log or for a part of it."""
 
     name: str = setting(doc="Name, which is also the kind in its label.")
     start_s: float = setting(
@@ -52,7 +52,7 @@ class Presence(Settings):
         high=1e8,
         unset="to the end of the log, without a label",
     )
-    harmful: bool = setting(False, "Whether its label states that such a scan gives no good pose.")
+    harmful: bool = setting(False, "Whether such a scan is unusable: it gives no correct pose.")
 
     def check(self) -> None:
         """Raise ValueError where the name is empty."""
@@ -66,7 +66,7 @@ class Presence(Settings):
         )
 
     def label(self, epoch_ns: int) -> Label | None:
-        """Its label on a log clock that begins at ``epoch_ns``; None where it stays to the
+        """Return its label on a log clock that begins at ``epoch_ns``; None where it stays to the
         end of the log.
         """
         if self.duration_s is None:
@@ -87,7 +87,7 @@ class ObjectShape(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SceneObject(Presence):
-    """One table [[object]]: something else than the target in the field of view."""
+    """The table [[object]]: an object other than the target in the field of view."""
 
     shape: ObjectShape = setting(
         ObjectShape.BOX,

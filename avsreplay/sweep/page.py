@@ -42,7 +42,7 @@ KIND_PARTS = (
 )  # columns: what was found and when; errors
 _KINDS_TEXT = """\
 No.: the combination. None: the scans outside every window; what is flagged there is a false
-alarm. ~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap.
+alarm. ~: usable by its label. Found: windows with a flagged scan or, without any scan, a gap.
 Delay: from a window's first scan to its first flagged one [s], median and worst. Recovery: from
 the first scan after it to the first healthy one [s], where there was something to recover from.
 Lost: windows after which no scan was healthy. Worst: errors of the estimate [mm, deg] over the
@@ -197,10 +197,10 @@ def detector_table(detector: Detector) -> Table:
                 )
             )
     return Table(
-        f"Fault tests over {detector.harmful} harmful and {detector.other} other scans of all runs",
+        f"Fault tests over {detector.harmful} unusable and {detector.other} other scans",
         (
             "test",
-            "harmful scans flagged",
+            "unusable scans flagged",
             "other scans flagged",
             "threshold",
             "area under\nthe ROC curve",
@@ -310,7 +310,7 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     "none" come first: flagged scans in these rows are false alarms.
     """
     title = (
-        "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none:"
+        "By kind of fault: times in s, errors in mm and deg; ~: usable by its label; none:"
         " outside every window"
     )
     injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)

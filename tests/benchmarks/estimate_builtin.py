@@ -48,9 +48,9 @@ def run(registrar: Registrar, text: str, params: EstimatorParams) -> tuple[np.nd
         track = track or estimator.initial(scan.t_ns, alignment.T_ac)
         prediction = estimator.predict(track, scan.t_ns)
         innovation = estimator.innovate(prediction, alignment) if alignment.measured else None
-        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
-        track, verdict = estimator.step(track, prediction, innovation, verdict, True)
-        flagged += not verdict.gamma
+        examined = detector.examine(ScanStatus.OK, alignment, innovation, prediction.belief)
+        track, finding = estimator.step(track, prediction, innovation, examined.admission, True)
+        flagged += not finding.used
         if k in marks:
             found.append(nees_of(estimator.published(track), scan.body))
     return np.array(found), len(scans), flagged

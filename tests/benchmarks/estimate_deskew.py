@@ -20,7 +20,7 @@ from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import nees
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
-from avsreplay.records import AlignStatus, Scan
+from avsreplay.records import Admission, AlignStatus, Scan
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
@@ -93,7 +93,8 @@ def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int
             AlignStatus.FAILED,
         )
         seen = None if lost else estimator.innovate(prediction, alignment)
-        gamma = detector.judge(scan.status, alignment, seen, prediction.belief).gamma
+        examined = detector.examine(scan.status, alignment, seen, prediction.belief)
+        gamma = int(examined.admission is Admission.ADMITTED)
         track = estimator.update(track, prediction, seen, gamma)
         if k >= 5:
             total += 1

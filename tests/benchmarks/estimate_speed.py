@@ -174,9 +174,9 @@ def run_ms(world: tumbling.World) -> np.ndarray:
         begun = time.process_time()
         prediction = estimator.predict(track, round(t * 1e9))
         innovation = estimator.innovate(prediction, alignment)
-        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
-        track, verdict = estimator.step(
-            track, prediction, innovation, verdict, state.convergence.converged
+        examined = detector.examine(ScanStatus.OK, alignment, innovation, prediction.belief)
+        track, finding = estimator.step(
+            track, prediction, innovation, examined.admission, state.convergence.converged
         )
         middle = time.process_time()
         state, _ = monitors.observe(
@@ -184,7 +184,7 @@ def run_ms(world: tumbling.World) -> np.ndarray:
             estimator,
             prediction,
             innovation,
-            verdict.gamma,
+            int(finding.used),
             track,
             estimator.published(track),
         )

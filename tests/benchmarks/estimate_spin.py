@@ -55,8 +55,8 @@ def claims_of(seed: int, axis: int, seconds: float) -> tuple[Array, Array, list[
     for k, (t, alignment) in enumerate(zip(times, alignments, strict=True)):
         prediction = estimator.predict(track, round(t * 1e9))
         innovation, before = estimator.innovate(prediction, alignment), track
-        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
-        track, _ = estimator.step(track, prediction, innovation, verdict, False)
+        examined = detector.examine(ScanStatus.OK, alignment, innovation, prediction.belief)
+        track, _ = estimator.step(track, prediction, innovation, examined.admission, False)
         fitted = track.since == 0 and track.batch is not before.batch
         events.append(
             "fit" if fitted else "noise levels" if track.levels is not before.levels else "pose"

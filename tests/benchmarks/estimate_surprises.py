@@ -264,8 +264,10 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         begun = time.process_time()
         prediction = estimator.predict(track, round(t * 1e9))
         innovation = estimator.innovate(prediction, alignment)
-        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
-        track, verdict = estimator.step(track, prediction, innovation, verdict, word.converged)
+        examined = detector.examine(ScanStatus.OK, alignment, innovation, prediction.belief)
+        admission, held = examined.admission, word.converged
+        track, finding = estimator.step(track, prediction, innovation, admission, held)
+        verdict = detector.judge(examined, finding)
         spent = time.process_time() - begun
         result.axes |= {
             e.detected_ns: track.belief.x.q_bc

@@ -25,12 +25,12 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.build import target_geometry
 from avsreplay.log import read_surface
-from avsreplay.plan.constrained import constrained
+from avsreplay.plan.constrained import constrained, with_safety
 from avsreplay.plan.limits import SampledScene, Scene
 from avsreplay.plan.path import StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
-from avsreplay.plan.withdrawal import KEPT_SHARE, Space, withdrawal
+from avsreplay.plan.withdrawal import KEPT_SHARE, Space, escapes_at, withdrawal
 from avsreplay.records import Surface
 from avsreplay.simulate.target import Shape, builtin_surface
 
@@ -165,12 +165,13 @@ def one(surface, rng):
     if not made.found:
         return None
     path, found = path_of(made, zero, zero), math.inf
+    made = with_safety(scene, made, path, params, limits, extent)
     for t in made.t_go_s * (1.0 - rng.uniform(size=STARTS) ** 1.7):
         (r,), (v,) = path.at(np.array([t]))
         later = SampledScene(scene.after(t), 60.0, 0.2, 45.0)
         planned = None
         if isinstance(path, StepPath) and path.escapes is not None:
-            planned = path.escapes[np.abs(path.escapes[:, 0] - t).argmin(), 1:]
+            (planned,) = escapes_at(path.escapes, np.array([t]))
         space = Space(later, limits, params.a_max_mps2, extent)
         flown = withdrawal(space, r, v, 0.5 * extent, planned=planned).path
         found = min(found, least(truth, limits, flown, t, flown.t_go_s + 1.0))

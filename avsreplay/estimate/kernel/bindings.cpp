@@ -481,8 +481,8 @@ void set_pin(Problem& self, const Flat& centre, const Vector<DIM>& row, double t
   self.pin.one_sigma = one_sigma;
 }
 
-void set_noise(Problem& self, const Two& factors, bool redescend, double slack) {
-  self.slack = slack;
+void set_noise(Problem& self, const Two& factors, bool redescend, double gate) {
+  self.gate = gate;
   std::memcpy(self.factors, factors.data(), sizeof self.factors);
   self.redescend = redescend;
   if (!self.weights.empty()) self.reweigh();
@@ -865,7 +865,7 @@ NB_MODULE(_motion, m) {
       .def("paths", &set_paths, nb::arg("paths"))
       .def("pin", &set_pin, nb::arg("centre"), nb::arg("row"), nb::arg("target"), nb::arg("one_sigma"))
       .def("unpin", [](Problem& self) { self.pinned = false; })
-      .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"), nb::arg("slack"))
+      .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"), nb::arg("gate"))
       .def("linearise", [](Problem& self, const Flat& at) { self.linearise(chart(at)); }, nb::arg("chart"))
       .def("residuals", &residuals, nb::arg("chart"))
       .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"), nb::arg("go_on") = false)

@@ -7,7 +7,6 @@
 namespace avs {
 namespace {
 
-constexpr double GATE = 27.86;  // 99.99 % point of chi-square with 6 degrees of freedom, as in noise.py
 constexpr double DERIVATIVE_TAIL = 1e-7;  // relative error of the Jacobian by one piece of the flow
 constexpr double DIFFERENCE = 0.1;  // part of a step for the second derivative along it
 constexpr double MOST_BENT = 0.14;  // square of the second-order part of a step over that of the first: (0.75 / 2)^2
@@ -148,7 +147,7 @@ double Problem::residual(const Measured& pose, const State& x, const Turn& turn,
 }
 
 double Problem::robust(double chi2, double* weight) const {
-  const double gate = slack * GATE, over = chi2 / gate;
+  const double over = chi2 / gate;
   *weight = 1;
   if (!(over > 1)) return chi2;
   *weight = redescend ? 1 / over : 1 / std::sqrt(over);

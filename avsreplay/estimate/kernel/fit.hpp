@@ -46,7 +46,7 @@ class Problem {
   bool pinned = false;
   double factors[2] = {1, 1};  // on the noise of attitude and position
   bool redescend = true;  // Cauchy's weights, else Huber's
-  double slack = 1;  // on chi-square from which a pose is an outlier
+  double gate = std::numeric_limits<double>::infinity();  // chi-square from which a pose is an outlier
   Push push;
 
   // The linearisation at the present chart.

@@ -181,7 +181,6 @@ void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6
   one.mean = chart;
   std::memset(one.prior_info, 0, sizeof one.prior_info);
   one.factors[0] = factors[0], one.factors[1] = factors[1];
-  one.slack = std::numeric_limits<double>::infinity();
   one.linearise(base);
   one.cost_at(chart, one.d.data());
   one.weights[0] = weight;

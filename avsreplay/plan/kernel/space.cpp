@@ -11,7 +11,7 @@ constexpr double INFINITE = std::numeric_limits<double>::infinity();
 constexpr double RADIAN = 3.14159265358979323846 / 180;
 constexpr int COMPARED = 32;    // instants at which the directions of an escape are compared
 constexpr double DENSER = 1.3;  // power of the share of its duration: they are denser at the begin
-constexpr int INTERVALS = 6;    // intervals of a manoeuvre at the begin
+constexpr int INTERVALS = 7;    // intervals of a manoeuvre at the begin; the first one is before it
 constexpr int HALVINGS = 15;    // largest number of halvings of one of them
 constexpr int SIDES = 6;        // directions around another one
 constexpr std::array<double, 3> TILTS{20 * RADIAN, 40 * RADIAN, 60 * RADIAN};   // of directions around the fixture's axis
@@ -124,6 +124,11 @@ Margin Space::margin(const Vector3& y, double time, double most, Near& last, dou
   return {std::max(gap - required, inside), required};
 }
 
+// Bound of the acceleration in the axes of {C} at a position and velocity relative to the grasp point.
+double Space::bend(const Vector3& q, const Vector3& w, double thrust) const {
+  return thrust + of_.pull + 2 * of_.turn * norm(w) + (of_.turn * of_.turn + of_.bend) * norm(q);
+}
+
 double Space::most(double time, const Vector3& r, Near& last) const {
   const Vector3 y = local(time, r);
   if (!(corridor(y) > 0)) return INFINITE;
@@ -178,12 +183,30 @@ Space::Node Space::node(const Manoeuvre& m, double tau, Near& last) const {
   motion(m.t + tau, frame, true);
   const Vector3 q = position(m, tau) - frame.rho, w = m.v + tau * m.push - frame.drho;
   const Margin found = margin(transposed(frame.R, q), m.t + tau, m.most, last);
-  const double bend =
-      norm(m.push) + of_.pull + 2 * of_.turn * norm(w) + (of_.turn * of_.turn + of_.bend) * norm(q);
-  return {tau, found.value, found.required, norm(transposed(frame.R, w) + transposed(frame.dR, q)), bend};
+  return {tau, found.value, found.required, norm(transposed(frame.R, w) + transposed(frame.dR, q)),
+          bend(q, w, norm(m.push))};
 }
 
+// What is required differs over the range of start instants: the distance in the corridor by the way of the path, and
+// outside it all is required.
 Least Space::least(const Manoeuvre& m, double target) const {
+  if (m.half == 0 || m.most == INFINITE) return bounded(m, target, 0);
+  Frame frame;
+  motion(m.t, frame, true);
+  const Vector3 q = m.r - frame.rho, w = m.v - frame.drho;
+  const double speed = norm(transposed(frame.R, w) + transposed(frame.dR, q));
+  const double way = m.half * (speed + 0.5 * MOTION_FACTOR * m.half * bend(q, w, of_.a_max));
+  Least found = bounded(m, target, of_.kept_share * way);
+  if (corridor(transposed(frame.R, q)) <= of_.slope * way) {
+    Manoeuvre outside = m;
+    outside.most = INFINITE;
+    found.lower = std::min(found.lower, bounded(outside, target, 0).lower);
+  }
+  return found;
+}
+
+// Bounds for one requirement that is larger by at most ``more``.
+Least Space::bounded(const Manoeuvre& m, double target, double more) const {
   struct Interval {
     Node a, b;
     int halvings;
@@ -192,14 +215,15 @@ Least Space::least(const Manoeuvre& m, double target) const {
   std::array<Interval, INTERVALS + HALVINGS + 1> stack;
   Near last;
   Least found{INFINITE, INFINITE, 0};
+  // before the begin of the manoeuvre are those that begin earlier, of which only a bound is known
   const auto seen = [&](const Node& node) {
-    if (node.margin < found.upper) {
+    if (node.tau >= 0 && node.margin < found.upper) {
       found.upper = node.margin;
       found.at = node.tau;
     }
   };
   for (size_t i = 0; i <= INTERVALS; ++i) {
-    nodes[i] = node(m, -m.half + (m.half + m.span) * static_cast<double>(i) / INTERVALS, last);
+    nodes[i] = node(m, i ? m.span * static_cast<double>(i - 1) / (INTERVALS - 1) : -m.half, last);
     seen(nodes[i]);
   }
   size_t depth = 0;
@@ -209,7 +233,7 @@ Least Space::least(const Manoeuvre& m, double target) const {
     const Node &a = of.a, &b = of.b;
     const double h = b.tau - a.tau;
     const double length = 0.5 * h * (a.speed + b.speed) + 0.25 * MOTION_FACTOR * h * h * std::max(a.bend, b.bend);
-    const double strayed = of_.slope * m.half * m.other * (std::max(std::abs(a.tau), std::abs(b.tau)) + m.half);
+    const double strayed = of_.slope * m.half * m.other * (std::max(std::abs(a.tau), std::abs(b.tau)) + m.half) + more;
     const double bound =
         0.5 * (a.margin + b.margin - of_.slope * length - std::abs(a.required - b.required)) - strayed;
     // a smaller range of start instants is needed where the range takes too much

@@ -74,11 +74,13 @@ class Space {
   };
   void motion(double time, Frame& out, bool rates) const;
   Vector3 local(double time, const Vector3& r) const;
+  double bend(const Vector3& q, const Vector3& w, double thrust) const;
   double required(double distance, double time) const;
   double corridor(const Vector3& y) const;
   void relative(double time, const Vector3& r, const Vector3& v, Vector3& q, Vector3& w) const;
   Node node(const Manoeuvre& m, double tau, Near& last) const;
   bool recedes(const Manoeuvre& m, double tau) const;
+  Least bounded(const Manoeuvre& m, double target, double more) const;
   Least compared(const Manoeuvre& m, double floor) const;
   Vector3 gradient(const Manoeuvre& m, double tau) const;
   void improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const;

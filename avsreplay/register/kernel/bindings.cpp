@@ -511,6 +511,7 @@ nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k, doubl
     nb::gil_scoped_release release;
     std::vector<std::pair<double, int64_t>> best(k);
     for (size_t i = 0; i < n; ++i) {
+      poll((int64_t)i);
       tree.query(points.data() + 3 * i, k, best.data(), most);
       for (int64_t j = 0; j < k; ++j) {
         number[i * k + j] = best[j].second;
@@ -570,6 +571,7 @@ nb::tuple planes(const PointTree& tree, const Doubles& all, const Doubles& sides
     nb::gil_scoped_release release;
     std::vector<std::pair<double, int64_t>> best(k);
     for (size_t i = 0; i < n; ++i) {
+      poll((int64_t)i);
       tree.query(points.data() + 3 * i, k, best.data(), most);
       const Plane plane = plane_of(best, all.data(), sides.data(), normals.data() + 3 * i, least_cosine, tree.size());
       std::copy(plane.normal, plane.normal + 3, direction + 3 * i);
@@ -641,6 +643,7 @@ NB_MODULE(_kernel, m) {
   });
   m.def("request_stop", [](bool wanted) { stop_requested = wanted; }, nb::arg("wanted"));
   m.def("shield", [](bool wanted) { return std::exchange(shielded, wanted); }, nb::arg("wanted"));
+  m.def("is_shielded", [] { return shielded; });
   m.attr("LAYOUT") = LAYOUT;
   m.def("checksum", [](const Bytes& b) { return checksum(reinterpret_cast<const char*>(b.data()), b.size()); }, nb::arg("payload"));
   nb::class_<Matches>(m, "Matches");

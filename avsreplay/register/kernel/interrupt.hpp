@@ -1,6 +1,7 @@
 // The end of long work on request. The work asks between its parts, so that it ends at one of them.
 #pragma once
 #include <atomic>
+#include <cstdint>
 
 namespace avs {
 
@@ -27,5 +28,10 @@ class Poll {
  private:
   static constexpr int PARTS = 64;  // between two looks at the signals, about 20 ms
 };
+
+// Before item k of numbered work of one thread, of which `each` make one part: throws Interrupted where the work is to end.
+inline void poll(int64_t k, int64_t each = 512) {
+  if (k % each == 0 && Poll::ends()) throw Interrupted{};
+}
 
 }  // namespace avs

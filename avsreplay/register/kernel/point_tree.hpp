@@ -9,6 +9,8 @@
 #include <utility>
 #include <vector>
 
+#include "interrupt.hpp"
+
 namespace avs {
 
 class PointTree {
@@ -34,7 +36,9 @@ class PointTree {
       while (first[k] != k) k = first[k] = first[first[k]];
       return k;
     };
+    int64_t visited = 0;
     for (const Point& point : points_) {
+      poll(visited++, 16);  // the neighbours of one point may be all others
       int64_t own = root(point.number);
       within(0, point.x.data(), most * most, [&](int64_t other) {
         const int64_t theirs = root(other);

@@ -4,6 +4,7 @@
 #include <limits>
 #include <utility>
 
+#include "interrupt.hpp"
 #include "loop.hpp"
 
 namespace avs {
@@ -89,7 +90,10 @@ double first_face(const Store& s, const Ray& ray, int64_t& compared) {
 
 int64_t cast(const Store& s, const Vec3& eye, const double* directions, int64_t n, double* ranges) {
   int64_t compared = 0;
-  for (int64_t k = 0; k < n; ++k) ranges[k] = first_face(s, Ray(s, eye, directions + 3 * k), compared);
+  for (int64_t k = 0; k < n; ++k) {
+    poll(k);
+    ranges[k] = first_face(s, Ray(s, eye, directions + 3 * k), compared);
+  }
   return work_of(n, compared);
 }
 
