@@ -63,7 +63,7 @@ class Passed:
     @property
     def mean(self) -> Array:
         """(k, n) of the states, given all measurements."""
-        return self.before + np.einsum("kij,kj->ki", self.before_P, self.score)
+        return np.asarray(self.before + np.einsum("kij,kj->ki", self.before_P, self.score))
 
     def covariance(self, k: int) -> Array:
         """(n, n) of the state at a knot, given all measurements."""
@@ -89,7 +89,8 @@ def shock_size(score: Array, information: Array, one_sigma: Array) -> tuple[Arra
     """
     prior = np.eye(score.shape[-1]) / np.square(one_sigma)[..., None, None]
     covariance = np.linalg.inv(information + prior)
-    return (covariance @ score[..., None])[..., 0], covariance
+    size = np.asarray((covariance @ score[..., None])[..., 0], dtype=np.float64)
+    return size, np.asarray(covariance, dtype=np.float64)
 
 
 def shock_gain(
