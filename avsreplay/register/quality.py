@@ -194,7 +194,7 @@ def grade(
     unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the
     pose is one of least squared distances. The bias that noise causes in it is taken from the pose,
     and the mean that noise adds to the residuals from the covariance, see ``kernel/noise.hpp``. The
-    size is not fitted; if it should be (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it
+    size is not fitted; if it should be (``Alignment.size_1s``), ``Decision.with_size`` fits it
     for the pose that is returned in the end.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
@@ -218,63 +218,111 @@ def grade(
         return replace(
             failed, message="returned its guess unchanged, although the residuals require a step"
         )
-    info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
-    weakest, free = tuple[str, ...](), None
+    pose = Determined(fit.T_ca, found.total / found.noise_m**2)
     if found.observable:
-        b, uncertain = (
-            found.bias,
-            UNCERTAIN_BIAS**2 * np.outer(found.bias, found.bias) + found.chance,
-        )
-        P = found.covariance + uncertain + np.outer(found.left, found.left)
-        if not found.bounded:
-            weakest, free = unbounded_directions(P, index.extent_m)
-        if weakest:
-            info, P = pseudo_inverse(P), None
-        elif b.any():
-            T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
+        pose = _determined(found, fit.T_ca, index.extent_m)
     elif found.overlap:
-        used = Evidence(
-            found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
-        )
-        view = _directions(used)
-        info = _observable_information(view, used, index.extent_m, systematic)
-        weakest, free = view.words, view.motions
-        if guess is not None and fit.converged:
-            kept = view.nearest(
-                T_ca, guess
-            )  # passes over a curved surface drift along the unobservable directions
-            facing = visibility.camera_c(index, points, kept) is not None
-            at = index.normal_equations(points, kept, limits.gate_m, facing=facing)
-            fits = (
-                at.inliers >= AS_MANY * found.inliers
-                and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
-            )
-            T_ca = (
-                view.refined(kept, at.info, at.gradient) if fits else T_ca
-            )  # corrects the observable directions
+        view = _seen(index, visibility, points, limits.gate_m, found)
+        pose = view.pose(fit, guess if fit.converged else None, systematic)
+    return _alignment(found, fit, pose, systematic)
+
+
+@value_class
+class Determined:
+    """A pose T_ca, its information and covariance, and the motions that are not determined, in
+    words and as columns d (6, k).
+    """
+
+    T_ca: Pose
+    info: Array
+    covariance: Array | None = None
+    words: tuple[str, ...] = ()
+    free: Array | None = None
+
+
+def _determined(found: PoseQuality, T_ca: Pose, extent_m: float) -> Determined:
+    """A pose whose directions are all observed, without the bias that noise causes."""
+    b = found.bias
+    uncertain = UNCERTAIN_BIAS**2 * np.outer(b, b) + found.chance
+    P = found.covariance + uncertain + np.outer(found.left, found.left)
+    if not found.bounded:
+        words, free = unbounded_directions(P, extent_m)
+        if words:
+            return Determined(T_ca, pseudo_inverse(P), None, words, free)
+    if b.any():
+        T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
+    return Determined(T_ca, found.total / found.noise_m**2, P)
+
+
+@value_class
+class _Seen:
+    """A view that does not determine a pose."""
+
+    index: SurfaceIndex
+    visibility: Visibility
+    points: NDArray[Any]
+    gate_m: float
+    found: PoseQuality
+    used: Evidence
+    view: Directions
+
+    def pose(self, fit: Fit, guess: Pose | None, systematic: bool) -> Determined:
+        """Return the pose with its unobservable directions as in the guess T_ca, if the surface
+        then fits as well; passes over a curved surface drift along them.
+        """
+        info = _observable_information(self.view, self.used, self.index.extent_m, systematic)
+        T_ca = fit.T_ca if guess is None else self._kept(fit.T_ca, guess)
+        return Determined(T_ca, info, None, self.view.words, self.view.motions)
+
+    def _kept(self, T_ca: Pose, guess: Pose) -> Pose:
+        kept = self.view.nearest(T_ca, guess)
+        facing = self.visibility.camera_c(self.index, self.points, kept) is not None
+        at = self.index.normal_equations(self.points, kept, self.gate_m, facing=facing)
+        many = at.inliers >= AS_MANY * self.found.inliers
+        near = at.sum_d2 <= (AS_NEAR * self.found.rms_m) ** 2 * at.inliers
+        # corrects the observable directions
+        return self.view.refined(kept, at.info, at.gradient) if many and near else T_ca
+
+
+def _seen(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    gate_m: float,
+    found: PoseQuality,
+) -> _Seen:
+    used = Evidence(
+        found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
+    )
+    return _Seen(index, visibility, points, gate_m, found, used, _directions(used))
+
+
+def _alignment(found: PoseQuality, fit: Fit, pose: Determined, systematic: bool) -> Alignment:
+    """The alignment of a pose with its quality."""
+    P = pose.covariance
     settled = P is None or not found.beyond
-    fitted = P is not None and settled and systematic and _other_size(found)
+    sized = P is not None and systematic
+    fitted = sized and settled and _other_size(found)
+    converged = fit.converged and settled
     return Alignment(
-        T_ac=T_ca.inverse(),
+        T_ac=pose.T_ca.inverse(),
         iterations=fit.iterations,
-        converged=fit.converged and settled,
+        converged=converged,
         points=found.points,
         inliers=found.inliers,
         rms_m=found.rms_m,
-        info=frozen(info),
-        status=_status(found.overlap, fit.converged and settled, bool(weakest)),
+        info=frozen(pose.info),
+        status=_status(found.overlap, converged, bool(pose.words)),
         covariance=None if P is None else frozen(P),
-        free_directions=", ".join(weakest),
+        free_directions=", ".join(pose.words),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
-        message=_message(
-            settled, found.size_1s if P is not None and systematic and not fitted else 0.0
-        ),
+        message=_message(settled, found.size_1s if sized and not fitted else 0.0),
         dof=np.inf if P is None else found.dof,
-        free=free if weakest else None,
+        free=pose.free if pose.words else None,
         well_off=found.well_off,
         size_1s=found.size_1s if fitted else None,
-        systematic=frozen(found.systematic) if P is not None and systematic else None,
-        size=(found.size, found.size_1s) if P is not None and systematic else None,
+        systematic=frozen(found.systematic) if sized else None,
+        size=(found.size, found.size_1s) if sized else None,
     )
 
 
