@@ -556,6 +556,8 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
     contact = setup.contact
     if contact is None:
         return None
+    if not log.legs:  # the robot has not left its start
+        return np.zeros(DRAWS, dtype=bool)
     z = setup.rng(4).standard_normal((DRAWS, 6))
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
     parts: list[Array] = []

@@ -20,6 +20,7 @@ from avsreplay.records import (
     Forecast,
     Innovation,
     Manoeuvre,
+    Moves,
     Scan,
     Verdict,
 )
@@ -122,6 +123,8 @@ class MonitorReport:
             limit.
         unconverged: blocks whose covariance is above its limit, and two rates where both explain
             the poses.
+        alias: the slower and the faster of two angular rates [rad/s] that both explain the poses;
+            None where only one does.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
 
@@ -136,6 +139,7 @@ class MonitorReport:
     covariance_converged: bool
     predictive_converged: bool
     unconverged: tuple[str, ...]
+    alias: tuple[float, float] | None
     forecast: Forecast
 
 
@@ -181,6 +185,9 @@ class Outcome:
             {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
+        moves: what the poses show of the target's motion.
+        disturbances: root densities of the random torque [rad/s^1.5] and force [m/s^1.5] that the
+            estimate allows for; None where it states none.
         sigma_hits: how often a bound of the inertia ratios limited the gain.
         r_floors: how often an eigenvalue of R was raised to its floor.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
@@ -202,6 +209,8 @@ class Outcome:
     pose_covariance: Array
     body: BodyParameters
     estimator: str
+    moves: Moves
+    disturbances: tuple[float, float] | None
     sigma_hits: int
     r_floors: int
     reinitialised: int

@@ -27,8 +27,9 @@ from avsreplay.estimate.kinematic import Motion, kinematic_track
 from avsreplay.estimate.plugged import AnyEstimator
 from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
+from avsreplay.estimate.track import moves
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.aliasing import Instants, in_words, other_rate
+from avsreplay.monitor.aliasing import Turns, in_words, two_rates
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,
@@ -50,6 +51,7 @@ from avsreplay.records import (
     Finding,
     Forecast,
     Innovation,
+    Moves,
     Scan,
 )
 from avsreplay.region import Followed, Region
@@ -93,7 +95,7 @@ class MonitorState:
     convergence: ConvergenceTrack
     violations: int = 0
     motion: FittedMotion | None = None
-    instants: Instants = Instants()
+    turns: Turns = Turns()
 
 
 @value_class
@@ -132,6 +134,7 @@ class Monitors:
         state: MonitorState,
         estimator: AnyEstimator,
         prior: Prediction,
+        alignment: Alignment,
         innovation: Innovation | None,
         gamma: int,
         track: Track,
@@ -145,6 +148,7 @@ class Monitors:
             state: state of the monitors before the scan.
             estimator: estimator of the run.
             prior: prediction at the scan.
+            alignment: of the scan.
             innovation: of the measurement; None where nothing was measured.
             gamma: 1 if the fault detector accepts the measurement, else 0.
             track: estimate after the scan.
@@ -167,8 +171,10 @@ class Monitors:
         if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
             forecast = estimator.track_forecast(track, np.array([planned.after_s()]), grasp_c)
         possible = with_change(forecast, belief, track.change_P)
-        instants = state.instants.after(belief.t_ns) if healthy else state.instants
-        w, alias = belief.x.w_b, other_rate(instants, belief.x.w_b)
+        turns = state.turns
+        if alignment.measured:
+            turns = turns.after(belief.t_ns, alignment.T_ac.q)
+        alias = two_rates(turns)
         judged = self.convergence.judge(
             state.convergence,
             belief,
@@ -188,11 +194,12 @@ class Monitors:
             converged=judged.converged,
             covariance_converged=judged.covariance_converged,
             predictive_converged=judged.predictive_converged,
-            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(w, alias)),
+            unconverged=judged.unknown if alias is None else (*judged.unknown, in_words(alias)),
+            alias=alias,
             forecast=forecast,
         )
         violated = state.violations + len(failed)
-        return MonitorState(gramian, seen, judged, violated, motion, instants), report
+        return MonitorState(gramian, seen, judged, violated, motion, turns), report
 
     def _gramian(
         self,
@@ -318,13 +325,15 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
+    prior, innovation, examined = _examined(stages, state, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
     if acquired is None and examined.admission is not Admission.ADMITTED and lost:
         points = _deskewed(stages, state, scan, predicted)
         near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
         measurement = _acquire(stages, state, scan, points, "acquired", near)
-        prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
+        prior, innovation, examined = _examined(
+            stages, state, scan, predicted, measurement, repeated
+        )
     track, finding = stages.estimator.step(
         track, prior, innovation, examined.admission, state.monitors.convergence.converged
     )
@@ -341,7 +350,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     belief = stages.estimator.published(track)
     planned = _planned_time(stages, state.guidance, belief)
     seen = innovation, gamma, track, belief, planned, stages.grasp_c
-    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
+    monitors, report = stages.monitors.observe(
+        state.monitors, stages.estimator, prior, measurement.alignment, *seen
+    )
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
@@ -362,6 +373,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         pose_covariance=stages.estimator.pose_covariance(belief),
         body=body_parameters(belief),
         estimator=track.mode,
+        moves=Moves.DRIVEN if following.shown is not None else moves(track),
+        disturbances=stages.estimator.disturbances_of(track),
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
         reinitialised=track.reinitialised,
@@ -444,7 +457,15 @@ def _seen(
     if before is None or not measurement.alignment.measured:
         return None
     prior = stages.estimator.predict(before, scan.t_ns)
-    return prior, stages.estimator.innovate(prior, measurement.alignment)
+    alignment = _weighed(stages, state, measurement.alignment)
+    return prior, stages.estimator.innovate(prior, alignment)
+
+
+def _weighed(stages: Stages, state: PipelineState, alignment: Alignment) -> Alignment:
+    """The pose with the covariance that the tracker finds instead of the claimed one."""
+    if stages.tracker is None:
+        return alignment
+    return stages.tracker.weighed(state.following.kinematics, alignment)
 
 
 def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
@@ -633,6 +654,7 @@ def _measurement(
 
 def _examined(
     stages: Stages,
+    state: PipelineState,
     scan: Scan,
     predicted: Prediction,
     measurement: Measurement,
@@ -644,7 +666,7 @@ def _examined(
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
-    alignment = measurement.alignment
+    alignment = _weighed(stages, state, measurement.alignment)
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return (
         predicted,

@@ -106,6 +106,15 @@ class Reason(Enum):
     )
 
 
+class Moves(Enum):
+    """What the poses show of the target's motion."""
+
+    FREE = "free"  # nothing contradicts free motion
+    ACCELERATED = "accelerated"  # a constant torque or force acts
+    DISTURBED = "disturbed"  # random torques or forces act
+    DRIVEN = "driven"  # no free motion explains the poses, which agree with one another
+
+
 class Admission(Enum):
     """How the rules that use a scan alone permit the estimator to use its pose."""
 

@@ -5,7 +5,7 @@ belief, its errors against the truth, and the simulated approach.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -22,7 +22,7 @@ from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
-from avsreplay.plan.constrained import constrained, with_safety
+from avsreplay.plan.constrained import constrained, linearised_s, with_safety
 from avsreplay.plan.flights import Ended, Execution, Miss, miss
 from avsreplay.plan.flights import execute as plan_execute
 from avsreplay.plan.guidance import Guidance, PlannerInput
@@ -35,7 +35,7 @@ from avsreplay.plan.limits import (
     margin,
     margins,
 )
-from avsreplay.plan.path import RobotPath, path_of
+from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
@@ -254,15 +254,23 @@ class Replanning:
         _, drawn = drawn_beliefs(belief, count, np.random.Generator(np.random.PCG64(seed)))
         path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
 
-        def planner(scene: Scene) -> Plan:
-            return self._planned(scene, belief.t_ns, path)
-
+        time_to_go = self._time_to_go(belief, made, path)
         futures = [self._scene(b) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
         return spread(
-            path, futures, planner, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
+            path, futures, time_to_go, self.tolerance, aimed, disturbance, self._setup(0, 0).contact
         )
+
+    def _time_to_go(self, belief: Belief, made: Plan, path: RobotPath) -> Callable[[Scene], float]:
+        """Return the time to go to a target that was drawn from a belief: by the linearised
+        problem about a plan under constraints, else by a plan of its own.
+        """
+        if not isinstance(path, StepPath) or self.arm is not None or made.delayed_by:
+            return lambda scene: self._planned(scene, belief.t_ns, path).t_go_s
+        own = path, self.params, self.limits, self.saved.extent_m
+        mean_s = linearised_s(self._scene(belief), *own)
+        return lambda scene: made.t_go_s + linearised_s(scene, *own) - mean_s
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
         """Return the error of a plan made at scan ``index`` against the truth; None without

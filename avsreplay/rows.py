@@ -334,6 +334,12 @@ _DRIFT = _change(
     atol=1e-9,
 )
 
+_MOTION_WORDS = {
+    "free": "Nothing contradicts free motion.",
+    "accelerated": "A constant torque or force acts on the target.",
+    "disturbed": "Random torques or forces act on the target.",
+    "driven": "No free motion explains the poses, which agree with one another.",
+}
 _STATUS_WORDS = {
     "aligned": "The scan was registered.",
     "measured": "The pose comes from the log itself; nothing was registered.",
@@ -603,6 +609,23 @@ class Row:
             ),
         ),
         words=_ESTIMATOR_WORDS,
+    )
+    motion: str | None = _exact(
+        lambda o, s: o.moves.value,
+        "What the poses show of the motion of the target.",
+        words=_MOTION_WORDS,
+    )
+    torque_noise_radps15: float | None = _number(
+        lambda o, s: None if o.disturbances is None else o.disturbances[0],
+        "Root density of the random torque that the estimate allows for.",
+        "rad/s^1.5",
+        atol=1e-9,
+    )
+    force_noise_mps15: float | None = _number(
+        lambda o, s: None if o.disturbances is None else o.disturbances[1],
+        "Root density of the random force that the estimate allows for.",
+        "m/s^1.5",
+        atol=1e-9,
     )
     x_m: float | None = _ESTIMATED[0]
     y_m: float | None = _ESTIMATED[1]
@@ -883,6 +906,16 @@ class Row:
     unconverged_blocks: str | None = _exact(
         lambda o, s: ", ".join(o.monitors.unconverged) or None,
         "Names of the blocks of states whose covariance is above its limit.",
+    )
+    alias_slow_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[0],
+        "Slower of two angular rates that both explain the poses; empty where only one does.",
+        "rad/s",
+    )
+    alias_fast_radps: float | None = _number(
+        lambda o, s: None if o.monitors.alias is None else o.monitors.alias[1],
+        "Faster of these two rates.",
+        "rad/s",
     )
     grasp_pos_1s_m: float | None = _number(
         lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),

@@ -39,6 +39,9 @@ _LEAST_ERROR = 1e-4  # of a pose [rad, extents], below which no smaller one is u
 _FIRST_RATE = 3.0  # 1 sigma of the rate before a second pose [rad/s, extents/s]
 # A pose whose error has a smaller probability contradicts the poses before it.
 _LEAST_PROBABILITY = 1e-4
+# Probability with which the errors of the poses exceed the claimed ones by at least the factor that
+# their covariance is multiplied by. A smaller one multiplies that of poses as good as claimed.
+_SURE = 0.95
 _LEAST_POSES = 3  # of a track, from which on it judges poses: fewer determine no acceleration
 # A pose nearer to the last one than this share of its claimed 1 sigma, in attitude and position, is
 # no new measurement: independent errors make it so in one of 10^8 poses.
@@ -105,6 +108,13 @@ class Bank:
     def best(self) -> int:
         """Return the number of the filter with the largest probability."""
         return int(np.argmax(self.weight))
+
+    @property
+    def least_error(self) -> float:
+        """Return the factor that the errors of the poses exceed the claimed ones by at least."""
+        each = self.weight.reshape(len(_ACCELERATIONS), len(_ERRORS)).sum(axis=0)
+        at_least = np.cumsum(each[::-1])[::-1]
+        return float(_ERRORS[np.flatnonzero(at_least >= _SURE).max(initial=0)])
 
     @property
     def variance(self) -> float:
@@ -246,6 +256,31 @@ class Tracker:
         turn, move = (bank.updated(e, v) for bank, e, v in pairs)
         poses, known = before.poses + 1, before.connected
         return Kinematics(t_ns, found.T_ac, turn, move, poses, 0, known, dt), sure
+
+    def weighed(self, before: Kinematics | None, found: Alignment) -> Alignment:
+        """Return a pose with the covariance that the poses before it show.
+
+        Args:
+            before: the track.
+            found: what was registered, with the claimed covariance.
+        """
+        if before is None or before.poses < _LEAST_POSES or found.covariance is None:
+            return found
+        turn, move = before.turn.least_error, before.move.least_error
+        if turn == move == 1.0:
+            return found
+        about = np.eye(6)  # the factor on the position is that of the middle
+        about[3:, :3] = -geometry.skew(self.middle)
+        scale = np.repeat([turn, move], 3)
+        D = np.linalg.solve(about, scale[:, None] * about)
+        back = np.linalg.solve(about, about / scale[:, None])
+        of = found.systematic
+        return replace(
+            found,
+            covariance=D @ found.covariance @ D.T,
+            info=back.T @ found.info @ back,
+            systematic=None if of is None else D @ of @ D.T,
+        )
 
     def used(self, track: Kinematics | None, t_ns: int) -> Kinematics | None:
         """Return a track of whose pose at an instant the estimate of the free body made use."""

@@ -206,6 +206,7 @@ def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, objec
         "fault": "full_occlusion" if blind else None,
         "points": 0 if blind else 4000,
         "estimator": "filter",
+        "motion": "free",
         "converged": k >= 10,
         "action": "approach",
         "supervisor_rule": "track",

@@ -5,14 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avsreplay.monitor.aliasing import Instants, in_words, other_rate
+from avsreplay import geometry
+from avsreplay.monitor.aliasing import FEWEST, Turns, in_words, two_rates
 
 
-def poses(spans):
-    instants = Instants()
+def poses(spans, rate, axis=(0.0, 0.6, 0.8)):
+    """Of a rotation about one axis."""
+    turns = Turns()
     for t in np.cumsum([0.0, *spans]):
-        instants = instants.after(round(t * 1e9))
-    return instants
+        turns = turns.after(round(t * 1e9), geometry.exp(rate * t * np.array(axis)))
+    return turns
 
 
 @given(
@@ -22,22 +24,33 @@ def poses(spans):
 )
 def test_both_rates_turn_the_target_alike_at_every_pose(rate, period, lost):
     """The oracle is the rotation itself: cos and sin of both angles at each instant."""
-    spans = [period, *(k * period for k in lost)]
-    other = other_rate(poses(spans), np.array([0.0, 0.0, rate]))
-    if rate * period <= 2.0:
-        assert other is None
+    spans = [*([period] * FEWEST), *(k * period for k in lost)]
+    found = two_rates(poses(spans, rate))
+    turn = abs((rate * period + np.pi) % (2.0 * np.pi) - np.pi)  # as the poses show it
+    if abs(turn - 2.0) < 1e-6:
+        return
+    assert (found is not None) == (turn > 2.0)
+    if found is None:
         return
     at = np.cumsum([0.0, *spans])
-    alike = [np.abs(np.exp(1j * rate * at) - np.exp(1j * s * other * at)).max() for s in (-1, 1)]
-    assert min(alike) < 1e-3
+    for each in found:
+        alike = [np.abs(np.exp(1j * rate * at) - np.exp(1j * s * each * at)).max() for s in (-1, 1)]
+        assert min(alike) < 1e-3
+    assert found[0] <= found[1]
 
 
 def test_intervals_that_are_no_multiples_of_one_exclude_the_other_rate():
-    w = np.array([2.0, 5.0, 1.0])
-    assert other_rate(poses([0.5] * 9), w) == pytest.approx(2 * np.pi / 0.5 - np.linalg.norm(w))
-    assert other_rate(poses([0.5, 0.63, 0.5, 0.57]), w) is None
-    assert "and 7.09 rad/s both" in in_words(w, 2 * np.pi / 0.5 - np.linalg.norm(w))
+    assert two_rates(poses([0.5] * 9, 7.0)) == pytest.approx((4.0 * np.pi - 7.0, 7.0))
+    assert two_rates(poses([0.5, 0.63, 0.5, 0.57, *([0.5] * 6)], 5.48)) is None
+    assert "of 5.57 and 7 rad/s both" in in_words((4.0 * np.pi - 7.0, 7.0))
 
 
-def test_a_single_pose_shows_no_rate():
-    assert other_rate(poses([]), np.array([0.0, 0.0, 9.0])) is None
+def test_a_few_poses_and_poses_at_random_show_no_rate():
+    assert two_rates(poses([], 9.0)) is None
+    assert two_rates(poses([0.5] * (FEWEST - 1), 7.0)) is None
+    rng = np.random.default_rng(3)
+    turns = Turns()
+    for k in range(32):
+        q = rng.normal(size=4)
+        turns = turns.after(k * 500_000_000, q / np.linalg.norm(q))
+    assert two_rates(turns) is None

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan._cone import Body
 from avsreplay.plan.cone_programme import solve
-from avsreplay.plan.constrained import constrained, with_safety
+from avsreplay.plan.constrained import constrained, linearised_s, with_safety
 from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
@@ -114,6 +114,23 @@ def test_cone_holds_between_nodes_and_costs_time():
     near = distance <= 2.0
     assert near.sum() > 100
     assert np.max((off - math.tan(math.radians(25.0)) * along - 0.01)[near]) <= 1e-6
+
+
+@pytest.mark.parametrize("towards", [-1.0, 1.0])
+def test_the_linearised_time_to_go_follows_that_of_new_plans(towards):
+    """A target that is displaced along the way by 4 cm."""
+    scene, limits = body(), Limits(cone_deg=25.0, cone_range_m=2.0, mouth_m=0.01)
+    shift = np.array([0.0, 0.0, 0.04 * towards])
+
+    def goal(t):
+        position, velocity = scene.goal(t)
+        return position + shift, velocity
+
+    moved = replace(scene, goal=goal)
+    plan, other = (constrained(s, ORIGIN, ORIGIN, PARAMS, limits) for s in (scene, moved))
+    own = path_of(plan, ORIGIN, ORIGIN), PARAMS, limits, 8.0
+    found = linearised_s(moved, *own) - linearised_s(scene, *own)
+    assert found == pytest.approx(other.t_go_s - plan.t_go_s, rel=0.15)
 
 
 def test_last_metres_go_along_the_axis():

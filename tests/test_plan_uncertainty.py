@@ -24,7 +24,7 @@ def scene(point, q=None):
 
 
 def planner(params):
-    return lambda scene: rendezvous(scene.goal, ORIGIN, ORIGIN, params)
+    return lambda scene: rendezvous(scene.goal, ORIGIN, ORIGIN, params).t_go_s
 
 
 def plan():

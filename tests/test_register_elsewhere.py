@@ -15,11 +15,11 @@ from trimesh.creation import annulus, box, cylinder
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
-from avsreplay.register.elsewhere import cube_rotations
+from avsreplay.register.generators.displaced import cube_rotations
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
 from avsreplay.register.symmetry import near_symmetries
+from avsreplay.register.work import HEALTHY_SCANS, Work, healthy_work
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import scenes
@@ -130,7 +130,8 @@ def test_the_axis_of_a_body_with_large_marks_is_found(name: str) -> None:
     """
     surface = scenes.meshes([name])[name]
     registrar = Registrar(surface)
-    found = near_symmetries(registrar._symmetry.search, registrar.index, *sample(surface, 4000))
+    search = registrar._loop.symmetry.search
+    found = near_symmetries(search, registrar.index, *sample(surface, 4000))
     assert len(found.kinds[0]) == 71
     assert min(abs(T[2, 2]) for T in found.kinds[0]) > 0.999
 
@@ -184,13 +185,13 @@ def test_comparing_poses_stays_within_the_budget(
     """Also where displaced starts take several times their usual work, and where the turns of a
     body are many.
     """
-    spent, spend = [0], Budget.spend
+    spent, spend = [0], Work.spend
 
-    def counted(self: Budget, searches: int) -> None:
+    def counted(self: Work, searches: int) -> None:
         spent[0] += searches
         spend(self, searches)
 
-    monkeypatch.setattr(Budget, "spend", counted)
+    monkeypatch.setattr(Work, "spend", counted)
     surface = scenes.meshes([name])[name]
     registrar, case = Registrar(surface), scenes.SCENES[scene](surface, 2000, seed)
     found = (

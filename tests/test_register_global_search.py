@@ -19,10 +19,9 @@ from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import global_search
-from avsreplay.register.budget import HEALTHY_SCANS, healthy_work
+from avsreplay.register.comparison import Measured
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import (
-    Candidate,
     GlobalSearch,
     SearchResult,
     VisibleCentroids,
@@ -38,6 +37,7 @@ from avsreplay.register.sampling import (
     without_sparse_points,
 )
 from avsreplay.register.surface_index import kernel_module
+from avsreplay.register.work import HEALTHY_SCANS, healthy_work
 from avsreplay.simulate.target import builtin_surface
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -187,7 +187,7 @@ def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registra
 
 
 def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
-    search = Registrar(_box((2.0, 1.0, 0.6)))._symmetry.search
+    search = Registrar(_box((2.0, 1.0, 0.6)))._loop.symmetry.search
     turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search.symmetries]
     assert turns
     assert all(angle > 175.0 for angle in turns)
@@ -208,7 +208,7 @@ def test_the_symmetries_of_a_body_are_exact_so_that_a_turned_part_of_it_still_fi
     registrar = Registrar(_mesh(body))
     points, _ = sample(_mesh(body), 500)
     motions = [
-        T for T in registrar._symmetry.search.symmetries if T[2, 2] > 0.5
+        T for T in registrar._loop.symmetry.search.symmetries if T[2, 2] > 0.5
     ]  # about z: the body has a top
     assert motions
     for T in motions:
@@ -224,16 +224,18 @@ def test_attitudes_near_the_identity_that_return_to_it_are_no_symmetries(
     """A box turned by 12 deg still covers most of itself, and is registered back to where it
     was.
     """
-    search = Registrar(_box((2.0, 1.6, 1.8)))._symmetry.search
+    search = Registrar(_box((2.0, 1.6, 1.8)))._loop.symmetry.search
     half_turn = Pose.from_matrix(search.symmetries[0])
     near = [Pose(exp(np.radians(12.0) * np.eye(3)[k]), np.zeros(3)) for k in range(3)]
     monkeypatch.setattr(search, "_selected", lambda *_: [*near, half_turn, half_turn @ near[0]])
     monkeypatch.setattr(global_search, "SYMMETRIC", 1.0)
     points, _ = sample(_box((2.0, 1.6, 1.8)), 300)
     found = [Pose.from_matrix(T) for T in search._near_symmetries(points)]
-    assert any(search.same(each, half_turn) for each in found)
+    assert any(search.poses.same(each, half_turn) for each in found)
     poses = [Pose.identity(), *found]
-    assert not any(search.same(one, other) for k, one in enumerate(poses) for other in poses[:k])
+    assert not any(
+        search.poses.same(one, other) for k, one in enumerate(poses) for other in poses[:k]
+    )
 
 
 def test_attitudes_cover_all_rotations() -> None:
@@ -349,8 +351,8 @@ def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     off = distance.copy()
     off[:45] = 0.1 * extent
     turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
-    found = registrar._symmetry.search._verdict(
-        [Candidate(turned, off), Candidate(Pose.identity(), distance)]
+    found = registrar._loop.symmetry.search._verdict(
+        [Measured(turned, off), Measured(Pose.identity(), distance)]
     )
     assert np.array_equal(found.best.matrix, np.eye(4))
     assert bool(found.rivals) is not unique
@@ -361,7 +363,7 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
     model, T_ac = boxes(), example_pose()
     scan = T_ac.apply(view(model, 2000, T_ac.inverse().t))
     apart = Pose(exp([0.0, 0.0, 1.0]), np.zeros(3)) @ T_ac.inverse()
-    found = registrar._symmetry.search.search(scan, known=apart)
+    found = registrar._loop.symmetry.search.search(scan, known=apart)
     assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
     assert not found.rivals
 
@@ -372,13 +374,15 @@ def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
     """
     surface, T_ac = _box((1.0, 0.8, 0.4)), example_pose()
     points, missing = T_ac.apply(view(surface, 500, T_ac.inverse().t)), np.zeros((5, 3))
-    rays = Registrar(surface)._symmetry
-    expected = rays.decided(points, T_ac.inverse(), [], True)
-    found = rays.decided(np.concatenate([points, missing]), T_ac.inverse(), [], True)
-    np.testing.assert_array_equal(found[0].matrix, expected[0].matrix)
-    np.testing.assert_array_equal(
-        rays.decided(missing, T_ac.inverse(), [], True)[0].matrix, T_ac.inverse().matrix
-    )
+    registrar, T_ca = Registrar(surface), T_ac.inverse()
+    symmetry = registrar._loop.symmetry
+    rays, padded = (symmetry.rays(p) for p in (points, np.concatenate([points, missing])))
+    assert len(padded.points) == len(rays.points)
+    expected, found = (symmetry.turned_poses(each, T_ca, False)[0] for each in (rays, padded))
+    assert [T.matrix.tolist() for T in found] == [T.matrix.tolist() for T in expected]
+    assert not len(symmetry.rays(missing).points)
+    scan = np.concatenate([points, missing])
+    assert registrar.register(scan, T_ac).status is registrar.register(points, T_ac).status
 
 
 def test_faces_of_many_bodies_must_be_all_that_is_visible() -> None:

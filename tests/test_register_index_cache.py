@@ -13,9 +13,9 @@ from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.register.global_search import GlobalSearch
+from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.rivals import NearSymmetry
 from avsreplay.register.surface_index import SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
@@ -160,7 +160,7 @@ def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
 
 
 def _searched(registrar: Registrar) -> list[bytes]:
-    symmetry = registrar._symmetry
+    symmetry = registrar._loop.symmetry
     arrays = [symmetry.search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
     return [a.tobytes() for a in arrays] + [repr((symmetry._share, symmetry._area)).encode()]
 

@@ -10,7 +10,6 @@ import pytest
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register.budget import HEALTHY_SCANS, Budget, healthy_work
 from avsreplay.register.contract import example_pose, view
 from avsreplay.register.plausibility import robust_noise
 from avsreplay.register.registrar import Registrar
@@ -18,6 +17,7 @@ from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.shown import Effort, effort_for, shown
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.visibility import Visibility
+from avsreplay.register.work import HEALTHY_SCANS, Work, healthy_work
 
 SEED = 7
 
@@ -62,7 +62,7 @@ def test_points_well_off_the_model_are_counted_as_their_distances_say(
     scan[stray] += rng.uniform(-1.0, 1.0, (stray.sum(), 3)) * registrar.limits.reach_m
     found = registrar.register(scan, T_ac)
     few = scan[np.linspace(0, len(scan) - 1, 1000).astype(int)] if len(scan) > 1000 else scan
-    distance = registrar._test.measure(few, found.T_ac.inverse())
+    distance = registrar._loop.test.measure(few, found.T_ac.inverse())
     off = (distance > 2.0 * registrar.limits.gate_m) & (distance < registrar.index.reach_m)
     assert found.inlier_ratio > 0.9
     assert found.well_off == np.count_nonzero(off) > 10
@@ -96,7 +96,7 @@ def test_what_is_called_aligned_is_right(
 
 
 def test_the_budget_counts_work() -> None:
-    budget = Budget(20_000)
+    budget = Work(20_000)
     budget.spend(budget.left - 500)
     assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
     assert budget.allows(500)
@@ -117,13 +117,13 @@ def test_no_scan_costs_more_than_twenty_ordinary_registrations(
     """Of the last step, too: it is counted how much each scan takes in all, whatever its
     result is.
     """
-    spent, spend, rng, T_ac = [0], Budget.spend, np.random.default_rng(SEED), example_pose()
+    spent, spend, rng, T_ac = [0], Work.spend, np.random.default_rng(SEED), example_pose()
 
-    def counted(self: Budget, searches: int) -> None:
+    def counted(self: Work, searches: int) -> None:
         spent[0] += searches
         spend(self, searches)
 
-    monkeypatch.setattr(Budget, "spend", counted)
+    monkeypatch.setattr(Work, "spend", counted)
     scan, middle = hidden_view(surface, T_ac, 2500, rng), T_ac.t
     if scene == "outliers":
         scan[rng.random(len(scan)) < 0.6] += rng.uniform(-2.0, 2.0, 3)
@@ -140,13 +140,13 @@ def test_no_scan_costs_more_than_twenty_ordinary_registrations(
 def test_an_ordinary_registration_costs_about_what_is_assumed(
     registrar: Registrar, surface: Surface, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spent, spend, T_ac = [0], Budget.spend, example_pose()
+    spent, spend, T_ac = [0], Work.spend, example_pose()
 
-    def counted(self: Budget, searches: int) -> None:
+    def counted(self: Work, searches: int) -> None:
         spent[0] += searches
         spend(self, searches)
 
-    monkeypatch.setattr(Budget, "spend", counted)
+    monkeypatch.setattr(Work, "spend", counted)
     scan = hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED))
     found = registrar.register(
         scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0]))

@@ -14,15 +14,15 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import quality
-from avsreplay.register.budget import Budget
+from avsreplay.register import loop, quality
 from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.generators.weak_directions import WeakDirections
 from avsreplay.register.global_search import GlobalSearch
-from avsreplay.register.neighbourhood import Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.restarts import Restarter
+from avsreplay.register.screening import Screen
 from avsreplay.register.shown import Effort
+from avsreplay.register.valley import along_valley
 from avsreplay.simulate.scenario import scenario_of
 from avsreplay.simulate.simulation import simulate
 from avsreplay.simulate.target import builtin_surface
@@ -65,9 +65,9 @@ def test_no_far_guess_ends_beside_the_truth(scans):
 
 def test_a_close_guess_is_registered_once(scans, monkeypatch):
     registrar, calls = Registrar(builtin_surface()), []
-    graded = registrar._grader.graded
+    graded = registrar._loop.grader.graded
     monkeypatch.setattr(
-        registrar._grader,
+        registrar._loop.grader,
         "graded",
         lambda *args, **named: calls.append(1) or graded(*args, **named),
     )
@@ -81,9 +81,9 @@ def test_a_scan_of_scattered_points_costs_few_restarts():
     not a second start.
     """
     registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
-    restarter = registrar._restarter
-    calls, graduated = [], restarter.graduated
-    restarter.graduated = lambda *args: calls.append(args[1]) or graduated(*args)
+    screen = registrar._loop.screen
+    calls, graduated = [], screen.graduated
+    screen.graduated = lambda *args: calls.append(args[1]) or graduated(*args)
     stray = rng.uniform([-3.0, -3.0, 2.0], [3.0, 3.0, 8.0], (120, 3))
     found = registrar.register(stray, Pose.identity() @ Pose([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 5.0]))
     assert not found.measured
@@ -116,14 +116,16 @@ def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
     surface, T_ac = boxes(), example_pose()
     registrar, calls, restarts = Registrar(surface), [], []
     scan = seen(surface, T_ac, noise, np.random.default_rng(3))
-    graded, best = registrar._grader.graded, registrar._restarter.best
+    graded, graduated = registrar._loop.grader.graded, registrar._loop.screen.graduated
     monkeypatch.setattr(
-        registrar._grader,
+        registrar._loop.grader,
         "graded",
         lambda *args, **named: calls.append(1) or graded(*args, **named),
     )
     monkeypatch.setattr(
-        registrar._restarter, "best", lambda *args: restarts.append(1) or best(*args)
+        registrar._loop.screen,
+        "graduated",
+        lambda *args: restarts.append(1) or graduated(*args),
     )
     found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
     assert found.status is AlignStatus.ALIGNED
@@ -223,10 +225,10 @@ def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() 
     error = found.T_ac.inverse() @ guess
     d = np.concatenate([geometry.log(error.q), error.t])
     sure = replace(found, covariance=1e-4 * found.covariance)
-    wider = registrar._restarter.consistent(scan, guess, sure, Budget(30_000)).covariance
+    wider = registrar._loop.decision.consistent(scan, guess, sure)[0].covariance
     assert d @ np.linalg.solve(sure.covariance, d) > 100.0 * d @ np.linalg.solve(wider, d)
     assert np.all(np.linalg.eigvalsh(wider - sure.covariance) > -1e-12)
-    assert registrar._restarter.consistent(scan, T_ac @ T_ac, sure, Budget(30_000)) is sure
+    assert registrar._loop.decision.consistent(scan, T_ac @ T_ac, sure)[0] is sure
 
 
 def test_a_pose_beside_the_truth_is_left_along_the_valley():
@@ -254,10 +256,10 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
         "",
     )
     T_ac = Pose(geometry.exp([0.0, -np.pi / 3, 0.0]), np.array([0.0, 0.0, 12.0]))
-    neighbourhood = Registrar(surface)._neighbourhood
+    registrar = Registrar(surface)
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
     turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
-    moved = neighbourhood.along_valley(scan, turned.inverse(), Budget(30_000))
+    moved = along_valley(registrar._target, registrar._loop.screen, scan, turned.inverse())[0]
     assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
 
 
@@ -289,9 +291,7 @@ def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(
     found = registrar.register(part, guess)
     assert found.status is AlignStatus.ALIGNED
     assert off(found.T_ac) < 0.003
-    monkeypatch.setattr(
-        registrar._neighbourhood, "best", lambda points, guess, at, budget: (None, at.status, "")
-    )
+    monkeypatch.setattr(WeakDirections, "needed", lambda *_: False)
     alone = registrar.register(part, guess)
     assert alone.inlier_ratio > 0.95, error
     assert off(alone.T_ac) > 0.009, error
@@ -302,7 +302,8 @@ def test_a_pose_with_one_point_on_the_model_has_no_valley():
     surface, T_ac = boxes(), example_pose()
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
     scan[1:] += [0.0, 0.0, 50.0]
-    kept = Registrar(surface)._neighbourhood.along_valley(scan, T_ac.inverse(), Budget(30_000))
+    registrar = Registrar(surface)
+    kept = along_valley(registrar._target, registrar._loop.screen, scan, T_ac.inverse())[0]
     assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
 
 
@@ -363,17 +364,15 @@ def test_where_the_guess_is_only_tested_nothing_is_searched(
     scan = 2.0 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
     made: list[str] = []
     for kind, name in (
-        (Neighbourhood, "along_valley"),
-        (Restarter, "graduated"),
+        (loop, "along_valley"),
+        (Screen, "graduated"),
         (GlobalSearch, "search"),
     ):
         original = getattr(kind, name)
 
-        def counted(
-            self: object, *given: object, _name: str = name, _original: object = original
-        ) -> object:
+        def counted(*given: object, _name: str = name, _original: object = original) -> object:
             made.append(_name)
-            return _original(self, *given)
+            return _original(*given)
 
         monkeypatch.setattr(kind, name, counted)
     registrar = Registrar(boxes())

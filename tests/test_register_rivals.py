@@ -11,9 +11,12 @@ import trimesh
 from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.budget import Budget, healthy_work
+from avsreplay.register.evidence import Observed
+from avsreplay.register.generators.turns import Turns
+from avsreplay.register.hypotheses import Candidate, Case, Hypothesis
 from avsreplay.register.quality import left_undetermined
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.work import Work, healthy_work
 
 
 def stage(edge_m: float, sides: int, nozzle: bool, tilt: float) -> trimesh.Trimesh:
@@ -126,13 +129,13 @@ def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most
     """
     handle = trimesh.creation.box((0.3, 0.1, 0.4)).apply_translation((0.5, 0.0, 0.1))
     mug = trimesh.util.concatenate([trimesh.creation.cylinder(0.4, 0.9, sections=64), handle])
-    symmetry = Registrar(surface_of(mug))._symmetry
+    symmetry = Registrar(surface_of(mug))._loop.symmetry
     assert symmetry.marked
     assert len(symmetry._marks) > 400
     assert sum(len(motions) for motions in symmetry._kinds) > 100
     assert (
         symmetry.search_work(points, 0)
-        < 0.9 * Budget(healthy_work(points, symmetry._target.near_work)).left
+        < 0.9 * Work(healthy_work(points, symmetry._target.near_work)).left
     )
 
 
@@ -153,7 +156,7 @@ def pot() -> trimesh.Trimesh:
 @pytest.mark.parametrize("stride", [1, 4])
 def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
     mesh, rng = pot(), np.random.default_rng(5)
-    symmetry = Registrar(surface_of(mesh))._symmetry
+    symmetry = Registrar(surface_of(mesh))._loop.symmetry
     marks, normals = symmetry._marks, symmetry._normals
     assert len(marks) > 100
     for _ in range(6):
@@ -173,7 +176,7 @@ def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
 def test_the_marks_tested_for_all_turns_are_part_of_the_work(monkeypatch):
     """Where the scan contradicts most turns, the marks are tested at many of them."""
     registrar = Registrar(surface_of(pot()))
-    symmetry, tested = registrar._symmetry, list[int]()
+    symmetry, tested = registrar._loop.symmetry, list[int]()
     T_ac = seen_from(0.3, 0.5)
     scan = scan_of(pot(), T_ac, 1)
     visible = symmetry._visible
@@ -183,8 +186,18 @@ def test_the_marks_tested_for_all_turns_are_part_of_the_work(monkeypatch):
         return visible(T_ca, stride)
 
     monkeypatch.setattr(symmetry, "_visible", counted)
-    best, rivals, extra = symmetry.decided(scan, T_ac.inverse(), [], True)
-    assert np.degrees(geometry.angle((T_ac @ best).q)) < 1.0
-    assert not rivals
-    assert extra > 0
-    assert 3 * sum(tested) <= symmetry.work(len(scan)) + extra
+    case = Case(Observed(scan), scan, scan, Work(10**9))
+    case.current = Candidate(registrar.register(scan, T_ac))
+    turns, found, work = Turns(symmetry), list[Hypothesis](), 0
+    steps = turns.hypotheses(case)
+    while True:
+        try:
+            found.append(next(steps))
+        except StopIteration as end:
+            work = end.value
+            break
+    best, at = turns.compared(case, found)
+    assert best is None
+    assert not at.rivals
+    assert work > turns.work(case)
+    assert 3 * sum(tested) <= work

@@ -410,3 +410,21 @@ def test_any_rows_get_a_verdict(make_rows):
             dataclasses.replace(r, gamma=int(rng.integers(2)), fault=None) for r in make_rows(n)
         ]
         assert _judged(rows, labels=None, header=None).line
+
+
+def test_what_the_poses_show_of_the_motion_is_said(make_rows):
+    """No free motion, random disturbances, two rates; each is a reason of its own."""
+
+    def texts(rows):
+        return " ".join(reason.text for reason in verdict_of(rows, Summary.fold(rows)).reasons)
+
+    free = make_rows(40, blackout=range(0))
+    assert "move freely" not in texts(free)
+    replaced = dataclasses.replace
+    driven = [replaced(r, motion="driven") if r.seq >= 30 else r for r in free]
+    assert "no free motion explains the poses of 10 of 40 scans, first at" in texts(driven)
+    pushed = [replaced(r, motion="disturbed", torque_noise_radps15=1e-4) for r in free]
+    assert "does not move freely: random torques or forces act, 0.0001 rad/s^1.5" in texts(pushed)
+    assert "both explain" not in texts(free)
+    fast = [replaced(r, alias_slow_radps=5.57, alias_fast_radps=7.0) for r in free]
+    assert "rates of 5.57 and 7 rad/s both explain the poses" in texts(fast)

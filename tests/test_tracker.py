@@ -104,6 +104,23 @@ def test_poses_after_a_jump_are_not_confirmed_until_one_is_used():
     assert all(found[33:])
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("errors", [1.0, 10.0])
+def test_the_covariance_of_poses_with_larger_errors_is_multiplied(seed, errors):
+    """By a factor below the true one, and by none where the errors are as claimed."""
+    rng, tracker, state, found = np.random.default_rng(seed), Tracker(MIDDLE, EXTENT), None, None
+    factors = []
+    for k, pose in enumerate(driven(seed, 60)):
+        found = alignment(pose, rng, errors=errors)
+        weighed = tracker.weighed(state, found)
+        factors.append(np.trace(weighed.covariance[:3, :3]) / np.trace(found.covariance[:3, :3]))
+        assert np.allclose(weighed.info, np.linalg.inv(weighed.covariance))
+        state, _ = tracker.after(state, round(k / HZ * 1e9), found)
+    late = np.sqrt(factors[30:])
+    assert factors[0] == 1.0
+    assert (0.3 * errors < np.median(late) < 1.2 * errors) if errors > 1.0 else late.max() < 2.0
+
+
 def test_a_pose_that_is_repeated_is_not_confirmed():
     """As of a sensor that sends its last scan again, while the target moves slowly."""
     rng, tracker, state = np.random.Generator(np.random.PCG64(9)), Tracker(MIDDLE, EXTENT), None

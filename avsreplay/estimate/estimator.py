@@ -409,6 +409,15 @@ class Estimator:
             self.batch.filtered(track, prediction, innovation), spread
         )
 
+    def disturbances_of(self, track: Track) -> tuple[float, float] | None:
+        """Root densities of the random torque [rad/s^1.5] and force [m/s^1.5] in use.
+
+        Args:
+            track: after a scan.
+        """
+        torque, force = self.batch.noise_levels(track)
+        return torque, force
+
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that the filter does not carry.
 

@@ -56,6 +56,8 @@ _MOST_FACTOR = 100.0  # largest factor on a claimed variance
 _WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
 _MOST_STEPS = 6
 _ESTABLISHED = 3.0  # log evidence of a random disturbance that the poses show
+# the same from which it is reported: the poses of free bodies reach it in none of 40 logs
+_REPORTED = 10.0
 _LARGEST = 4.0  # largest squared residual with disturbances over the mean one
 BLOCKS = 2  # attitude, position
 
@@ -71,7 +73,8 @@ class NoiseLevels:
         slack: by which disturbances enlarge the squared residuals of a fit without them, at least
             1.
         count: poses of the estimate, 0 for the prior.
-        established: the poses show a random disturbance.
+        evidence: log likelihood of the random disturbance that the poses show most clearly, over
+            none.
         excluded: root densities of torque and force from which on the poses exclude a random
             disturbance.
     """
@@ -82,7 +85,7 @@ class NoiseLevels:
     force: float = 0.0
     slack: float = 1.0
     count: int = 0
-    established: bool = False
+    evidence: float = 0.0
     excluded: tuple[float, float] = (math.inf, math.inf)
 
     def factors(self, share: float) -> Array:
@@ -92,6 +95,16 @@ class NoiseLevels:
         return np.sqrt(
             [w * (1.0 - share) + c * share for w, c in zip(self.white, self.common, strict=True)]
         )
+
+    @property
+    def established(self) -> bool:
+        """Return whether the poses show a random disturbance."""
+        return self.evidence > _ESTABLISHED
+
+    @property
+    def certain(self) -> bool:
+        """Return whether the poses show one that is reported."""
+        return self.evidence > _REPORTED
 
 
 NO_LEVELS = NoiseLevels()
@@ -177,7 +190,7 @@ def estimate_levels(
         torque=math.sqrt(theta[4]),
         force=math.sqrt(theta[5]),
         slack=slack,
-        established=any(each.evidence > _ESTABLISHED for each, _ in found.values()),
+        evidence=max((each.evidence for each, _ in found.values()), default=0.0),
         excluded=(
             found[4][0].excluded if 4 in found else 0.0,
             found[5][0].excluded if 5 in found else 0.0,

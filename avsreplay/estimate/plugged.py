@@ -128,6 +128,10 @@ class PluggedEstimator:
             plugged = self._method.update(plugged, T_ac, in_fixture(innovation.R, T_ac.q, x.q_bc))
         return self._track(plugged, track.changed)
 
+    def disturbances_of(self, track: Track) -> tuple[float, float] | None:  # noqa: ARG002
+        """None: what a plug-in allows for is its own."""
+        return None
+
     def published(self, track: Track) -> Belief:
         """The belief in {A}."""
         return track.belief

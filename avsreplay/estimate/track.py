@@ -20,7 +20,7 @@ from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre
+from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = (
     5,
@@ -314,6 +314,13 @@ def in_doubt(track: Track) -> bool:
         or track.change_probability > 0.5
         or (track.bias is not None and track.bias.doubted)
     )
+
+
+def moves(track: Track) -> Moves:
+    """Return what the poses of a track show of the motion."""
+    if track.drift is not None:
+        return Moves.ACCELERATED
+    return Moves.DISTURBED if track.levels.certain else Moves.FREE
 
 
 def with_history(then: Track, now: Track) -> Track:

@@ -1,60 +1,77 @@
 """Whether the poses determine the angular rate, or another rate explains them as well.
 
-Poses at multiples of one interval T are the same for a rotation about a fixed axis by the angle
-w T and by w T - 2 pi. Where the target turns by more than about 2 rad between two poses, the
-slower of these motions is taken, whichever is right. The poses exclude it only if their intervals
-are no multiples of one.
+Poses at multiples of one interval T are the same for a rotation by the angle w T and by w T - 2 pi
+about one axis. Where the target turns by more than about 2 rad from pose to pose, the slower of
+these motions is as large as the faster one, so that nothing favours it. The poses exclude one of
+them only if their intervals are no multiples of one. The measured poses show this whether the
+estimate follows one of the two motions or neither.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import field
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.errors import value_class
-from avsreplay.geometry import Array
+from avsreplay.geometry import Array, frozen
 
 MOST_TURN_RAD = 2.0  # between two poses: less is far enough from half a turn for any tumbling body
 ALIKE_RAD = 0.35  # the other rate differs at no pose by more than this, so that none excludes it
-KEPT = 32  # poses whose instants are compared
+KEPT = 32  # poses that are compared
+FEWEST = 6  # turns from pose to pose whose median counts
+# Interquartile range of these turns; that of poses that have nothing to do with one another is 1.0
+MOST_SPREAD_RAD = 0.7
+
+
+_NO_POSES = frozen(np.zeros((0, 4)))
 
 
 @value_class
-class Instants:
-    """Instants of the last healthy poses [ns], oldest first."""
+class Turns:
+    """The last measured attitudes and their instants [ns], oldest first."""
 
     t_ns: tuple[int, ...] = ()
+    q: Array = field(default_factory=lambda: _NO_POSES)
 
-    def after(self, t_ns: int) -> Instants:
-        """Return the instants with that of one more healthy pose."""
-        return Instants((*self.t_ns, t_ns)[-KEPT:])
+    def after(self, t_ns: int, q: Array) -> Turns:
+        """Return the turns with one more pose.
+
+        Args:
+            t_ns: its instant [ns].
+            q: (4,) its attitude.
+        """
+        return Turns((*self.t_ns, t_ns)[-KEPT:], frozen(np.vstack([self.q, q])[-KEPT:]))
 
 
-def other_rate(instants: Instants, w: Array) -> float | None:
-    """Return another angular rate that explains the poses [rad/s], None where there is none.
+def two_rates(turns: Turns) -> tuple[float, float] | None:
+    """Return the slower and the faster angular rate [rad/s] that explain the poses, None where only
+    one does.
 
     Args:
-        instants: of the healthy poses so far.
-        w: (3,) estimated angular rate [rad/s].
+        turns: of the poses so far.
     """
-    rate = float(np.linalg.norm(w))
-    spans = np.diff(instants.t_ns) * 1e-9
-    spans = spans[spans > 0.0]
-    if not len(spans) or rate * float(spans.min()) <= MOST_TURN_RAD:
+    spans = np.diff(turns.t_ns) * 1e-9
+    if not len(spans) or not (spans > 0.0).any():
         return None
-    period = float(spans.min())
-    turns = spans / period
-    differs = 2.0 * math.pi * float(np.abs(turns - np.round(turns)).max())
-    return None if differs > ALIKE_RAD else abs(2.0 * math.pi / period - rate)
+    period = float(spans[spans > 0.0].min())
+    number = spans / period
+    single = np.round(number) == 1.0
+    if np.count_nonzero(single) < FEWEST:
+        return None
+    q = turns.q
+    angles = geometry.angle(geometry.multiply(geometry.conjugate(q[:-1]), q[1:]))[single]
+    low, turn, high = np.quantile(angles, (0.25, 0.5, 0.75)).tolist()
+    if turn <= MOST_TURN_RAD or high - low > MOST_SPREAD_RAD:
+        return None
+    if 2.0 * math.pi * float(np.abs(number - np.round(number)).max()) > ALIKE_RAD:
+        return None
+    mean_s = float(np.median(spans[single]))
+    return turn / mean_s, (2.0 * math.pi - turn) / mean_s
 
 
-def in_words(w: Array, other: float) -> str:
-    """Return both rates in words.
-
-    Args:
-        w: (3,) estimated angular rate [rad/s].
-        other: the other rate [rad/s].
-    """
-    rate = float(np.linalg.norm(w))
-    return f"rates of {rate:.3g} and {other:.3g} rad/s both explain the poses"
+def in_words(rates: tuple[float, float]) -> str:
+    """Return two rates [rad/s] in words."""
+    return f"rates of {rates[0]:.3g} and {rates[1]:.3g} rad/s both explain the poses"

@@ -131,6 +131,32 @@ def constrained(
     )
 
 
+def linearised_s(
+    scene: Scene, path: StepPath, params: PlanParams, limits: Limits, extent_m: float
+) -> float:
+    """Return the time to go for a target that differs little from that of a plan: the solution of
+    one convex subproblem about its path [s]; NaN where that has none.
+
+    Args:
+        scene: The target.
+        path: The path of the plan, whose escapes are kept.
+        params: Thrust, horizon, latency and grid.
+        limits: The constraints.
+        extent_m: Diagonal of the target's bounding box [m].
+    """
+    limits, params = limits.resolved(extent_m), finer(params, scene.goal)
+    n, end_s = len(path.u), path.t_go_s
+    sampled = SampledScene(scene, params.horizon_s, params.grid_s, 1.5 * end_s + COAST_S)
+    limits = replace(limits, nodes=n)
+    case = Case(sampled, limits, params, path.r0, path.v0, BUFFER_OF_EXTENT * extent_m)
+    tried = Tried.near(path.escapes, case.wait_s, end_s)
+    away = withdrawn(case, path, tried, improve=False)
+    reference = warm_reference(case, path, 0.0)
+    change, off = largest_change(case, reference, TRUST), np.zeros((2 * n, len(CONSTRAINTS)))
+    found = solve(convex_subproblem(case, reference, off, change, away.rows))
+    return math.nan if found is None else case.wait_s + n * found.h
+
+
 def with_safety(
     scene: Scene,
     plan: Plan,
@@ -284,12 +310,10 @@ def _best_path(
     """
     best: StepPath | None = None
     if warm is not None:
-        again = shortened(case, *warm)
-        best = _refined(again, *warm, rough=True)
-        if (
-            best is not None
-            and best.t_go_s <= LATER * max(expected_s(case, *warm), case.earliest_s) + LATER_S
-        ):
+        again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
+        enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
+        best = _refined(again, *warm, rough=True, enough_s=enough_s)
+        if best is not None and best.t_go_s <= LATER * expected + LATER_S:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -399,6 +423,7 @@ def _refined(
     latest_s: float = math.inf,
     trust: float = TRUST,
     rough: bool = False,
+    enough_s: float = -math.inf,
 ) -> StepPath | None:
     """Iterate from the rest of an earlier path, whose withdrawals the first iteration
     requires.
@@ -406,7 +431,7 @@ def _refined(
     known = path.escapes if isinstance(path, StepPath) else None
     away = withdrawn(case, path, Tried.near(known, since_s + case.wait_s, path.t_go_s), since_s)
     reference = warm_reference(case, path, since_s)
-    return _converged(case, reference, latest_s, trust, rough, away)
+    return _converged(case, reference, latest_s, trust, rough, away, enough_s)
 
 
 @dataclass
@@ -440,12 +465,14 @@ class _Search:
                 0 if better or best is None or path.short_m < best.short_m else self.idle,
             )
 
-    def done(self, settled: bool) -> bool:
-        """Return whether the best path is the latest one and moves no more, or is safe and has not
-        become better in ``IDLE`` iterations.
+    def done(self, settled: bool, enough_s: float) -> bool:
+        """Return whether the best path is the latest one and moves no more, or is safe and not
+        later than ``enough_s``, or has not become better in ``IDLE`` iterations.
         """
         if self.best is None:
             return False
+        if self.best.short_m <= 0.0 and self.best.t_go_s <= enough_s:
+            return True
         idle = self.idle >= IDLE and self.best.short_m <= 0.0
         return idle or (settled and self.idle == 0)
 
@@ -485,12 +512,14 @@ def _converged(
     trust: float = TRUST,
     rough: bool = False,
     away: Withdrawn | None = None,
+    enough_s: float = -math.inf,
 ) -> StepPath | None:
     """Iterate from a reference until the best feasible path seen no longer becomes better, and
     return it.
 
-    The iterations end without a result where the end time remains later than ``latest_s``. The
-    first iteration requires ``away``, the withdrawals of an earlier path.
+    The iterations end without a result where the end time remains later than ``latest_s``, and with
+    a safe path that is not later than ``enough_s``. The first iteration requires ``away``, the
+    withdrawals of an earlier path.
     """
     n = case.limits.nodes
     tolerance = ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
@@ -511,7 +540,7 @@ def _converged(
         if found.slack <= case.allowed_slack_m:
             _accepted(case, path, over, search)
         moved = abs(t - reference.t)
-        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t)):
+        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t), enough_s):
             break
         if _hopeless(case, search, path, iteration, latest_s, stuck):
             break

@@ -429,7 +429,7 @@ def flown_positions(
     instants = begin_ns + steps * (end_ns - begin_ns) // PATH_INSTANTS
     if segment.path is not None:
         instants = instants[instants <= segment.end_ns]
-    return instants, np.array([segment.at(int(t))[0] for t in instants]).reshape(-1, 3)
+    return instants, segment.positions(instants)
 
 
 def relative_path(

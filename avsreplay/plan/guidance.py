@@ -13,6 +13,7 @@ from dataclasses import field, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
@@ -97,6 +98,19 @@ class Segment:
             return self.r0 + span * self.v0, self.v0
         position, velocity = self.path.at(np.array([span]))
         return position[0], velocity[0]
+
+    def positions(self, instants: NDArray[np.int64]) -> Array:
+        """Return positions of the robot (n, 3) in {A} [m].
+
+        Args:
+            instants: (n,) on the clock of the scans [ns].
+        """
+        spans: Array = np.asarray((instants - self.t_ns) * 1e-9, np.float64)
+        r = self.r0 + spans[:, None] * self.v0 if self.path is None else self.path.at(spans)[0]
+        if self.previous is not None:
+            early = instants < self.t_ns
+            r[early] = self.previous.positions(instants[early])
+        return r
 
     @property
     def end_ns(self) -> int:

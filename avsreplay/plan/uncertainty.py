@@ -16,7 +16,6 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
-from avsreplay.outcome import Plan
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.limits import Scene, in_fixture_axes
 from avsreplay.plan.path import RobotPath
@@ -176,18 +175,19 @@ def _root(P: Array) -> Array:
 def spread(
     path: RobotPath,
     futures: Sequence[Scene],
-    planner: Callable[[Scene], Plan],
+    time_to_go: Callable[[Scene], float],
     tolerance: Tolerance,
     attitude: Array | None = None,
     disturbance: Disturbance | None = None,
     contact: Contact | None = None,
 ) -> Spread:
-    """Evaluate one plan in every future, and plan anew for each future.
+    """Evaluate one plan in every future, with the time to go that each future allows.
 
     Args:
         path: Path planned for the mean of the belief.
         futures: Possible motions of the target after the instant of planning, equally probable.
-        planner: Plans for a future from the same start, under the same limits.
+        time_to_go: Returns the time to go to a future from the same start, under the same limits
+            [s]; NaN where there is no plan.
         tolerance: Largest errors of a capture.
         attitude: (4,) q_ac of the gripper at the end.
         disturbance: Errors of the thrust; none where None.
@@ -207,7 +207,7 @@ def spread(
         if contact is not None and future.attitude is not None:
             R, rho = geometry.matrix(future.attitude(times)), future.goal(times)[0]
             touched[k] = contact.touched(in_fixture_axes(R, r + dr - rho)[None])[0]
-    own = np.array([planner(future).t_go_s for future in futures])
+    own = np.array([time_to_go(future) for future in futures])
     allowed = (tolerance.position_m, tolerance.speed_mps, tolerance.angle_deg)
     inside = np.all((misses <= allowed) | np.isnan(misses), axis=1)
     checked = contact is not None and futures[0].attitude is not None

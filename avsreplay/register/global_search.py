@@ -23,9 +23,10 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
-from avsreplay.register.evidence import robust_noise
+from avsreplay.register.comparison import Measured, as_good, least_noise
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT
+from avsreplay.register.poses import Sameness
 from avsreplay.register.sampling import (
     attitudes,
     sample_evenly,
@@ -87,11 +88,8 @@ RIVALS, RIVAL_WITHIN = (
     6,
     0.15,
 )  # poses that are registered to the end: share of unexplained points over the least
-SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # poses that differ by less are the same
-SIGMAS = FAVOURED = (
-    # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
-    5.0
-)
+# noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
+FAVOURED = 5.0
 REFINED_POINTS = 500  # fine points with which the last poses are registered
 STOP_RAD, STOP_OF_EXTENT = (
     1e-4,
@@ -124,20 +122,6 @@ SHIFTS, SHIFT_OF_EXTENT = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A pose T_ca and the distances (k,) [m] of the points of the scan from the faces that the
-    camera sees.
-    """
-
-    T_ca: Pose
-    distance: Array
-
-    def unexplained(self, width_m: float) -> Array:
-        """Return min(1, squared distance in units of the width) of each point."""
-        return np.minimum(self.distance / width_m, 1.0) ** 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
     """Result of a global search.
 
@@ -155,7 +139,7 @@ class SearchResult:
     rivals: tuple[Pose, ...]
     width_m: float
     inlier_ratio: float
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Measured, ...]
     work: int
 
 
@@ -163,32 +147,33 @@ class GlobalSearch:
     """Searches the pose of one target. Built once; a search does not change it.
 
     Attributes:
+        poses: says when two poses are the same.
         symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the
             identity.
-        same_rad: rotation below which two poses nearly at one place are the same.
+        field, centroids, middle: sampled points by place, their mean from each side, and of all.
+        spent, most, registered: work of the last round, its limit [point searches], and the points
+            of its last registrations.
     """
 
-    def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
+    def __init__(
+        self, target: Target, params: AcquireParams, poses: Sameness, kept: dict[str, Array]
+    ) -> None:
         """Sample the model and find its near-symmetries, or take both from ``kept``; what is
         missing is added to it.
         """
-        self._target, self._params, self._sided, self.same_rad = (
-            target,
-            params,
-            target.visibility.sided,
-            SAME_RAD,
-        )
+        self._target, self._params, self.poses = target, params, poses
+        self._sided = target.visibility.sided
         self._extent = target.surface.extent
         if "sampled" not in kept:
             kept["sampled"] = np.stack(sample_evenly(target.surface, MODEL_POINTS))
         points, normals = kept["sampled"]
         planes = normals if self._sided else target.index.closest(points).normal
-        self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
-        self._centroids = VisibleCentroids(
+        self.field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
+        self.centroids = VisibleCentroids(
             points, normals if self._sided else np.zeros_like(normals), self._extent
         )
-        self._middle = points.mean(axis=0)
-        self._spent, self._most, self._registered = (
+        self.middle = points.mean(axis=0)
+        self.spent, self.most, self.registered = (
             0,
             2**62,
             REFINED_POINTS,
@@ -243,9 +228,9 @@ class GlobalSearch:
             left: work that is left, in point searches; after most of it no pose is registered.
             kept: work of it that a later step needs.
         """
-        self._most = min(int(REGISTERED_SHARE * left), left - kept)
-        self._spent = self._looked(len(points), number)
-        self._registered = REFINED_POINTS // (
+        self.most = min(int(REGISTERED_SHARE * left), left - kept)
+        self.spent = self._looked(len(points), number)
+        self.registered = REFINED_POINTS // (
             2 if left < SHORT * self.work(len(points), number) else 1
         )
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
@@ -258,7 +243,7 @@ class GlobalSearch:
         starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
-        found = found if known is None else [*found, self._measured(fine, known)]
+        found = found if known is None else [*found, self.measured(fine, known)]
         return self._verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(
@@ -288,7 +273,7 @@ class GlobalSearch:
         starts = np.tile(np.eye(4), (len(sights), len(shifts), len(R_ca), 1, 1))
         starts[..., :3, :3] = R_ca
         for k, sight in enumerate(sights):
-            middle = self._middle if sight is None else self._centroids.of(R_ca @ sight)
+            middle = self.middle if sight is None else self.centroids.of(R_ca @ sight)
             for j, shift in enumerate(shifts):
                 starts[k, j, :, :3, 3] = middle - R_ca @ (centroid_a + shift)
         return starts.reshape(-1, 4, 4)
@@ -303,74 +288,65 @@ class GlobalSearch:
         coarse = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         middle = (FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
-        poses, costs = self._field.refine(
+        poses, costs = self.field.refine(
             np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
         poses = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
-        poses, costs = self._field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
+        poses, costs = self.field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
         poses, narrow = (
             best_of(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)),
             narrow * FALL**SECOND_PASSES,
         )
-        poses, costs = self._field.refine(
+        poses, costs = self.field.refine(
             few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse
         )
-        poses = self._different(best_of(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
+        poses = self.poses.different(best_of(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
-        poses, costs = self._field.refine(
+        poses, costs = self.field.refine(
             some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle
         )
         poses, narrow = best_of(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
-        poses, costs = self._field.refine(
+        poses, costs = self.field.refine(
             some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle
         )
-        found = self._different(best_of(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
+        found = self.poses.different(best_of(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
         return [Pose.from_matrix(T) for T in found]
 
-    def _different(self, poses: Array, most: int, scale: float) -> Array:
-        """The first few of (k, 4, 4) that are different poses."""
-        trace, near = 1.0 + 2.0 * np.cos(scale * SAME_RAD), scale * SAME_OF_EXTENT * self._extent
-        return np.ascontiguousarray(
-            poses[kernel_module().different(poses, self._middle, most, trace, near)]
-        )
-
-    def _refined(
-        self, some: Array, fine: Array, poses: list[Pose], facing: bool
-    ) -> list[Candidate]:
+    def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Measured]:
         """The poses measured on the model; the best, and the very best by a near-symmetry,
         are registered to it.
         """
         width = MIDDLE_OF_EXTENT * self._extent
-        found = [self._measured(some, T_ca, MIDDLE_OF_EXTENT) for T_ca in poses]
+        found = [self.measured(some, T_ca, MIDDLE_OF_EXTENT) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [
             each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most
         ]
-        found, least = self._to_the_end(fine, best, width)
+        found, least = self.to_the_end(fine, best, width)
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         starts = np.concatenate([first.matrix[None], self.symmetries @ first.matrix])
-        turned, costs = self._field.refine(some, starts, TURNED_PASSES, width, *rule)
+        turned, costs = self.field.refine(some, starts, TURNED_PASSES, width, *rule)
         near = 1 + np.flatnonzero(costs[1:] < costs[0] + RIVAL_WITHIN)
         others = np.concatenate([starts[:1], best_of(turned[near], costs[near], len(near))])
-        rivals = [Pose.from_matrix(T) for T in self._different(others, 1 + TURNED_RIVALS, 0.5)[1:]]
-        return [*found, *self._to_the_end(fine, rivals, width, least)[0]]
+        rivals = [
+            Pose.from_matrix(T) for T in self.poses.different(others, 1 + TURNED_RIVALS, 0.5)[1:]
+        ]
+        return [*found, *self.to_the_end(fine, rivals, width, least)[0]]
 
-    def _to_the_end(
+    def to_the_end(
         self, fine: Array, poses: list[Pose], width_m: float, least: float = np.inf
-    ) -> tuple[list[Candidate], float]:
-        """The poses registered to the model by a few passes, and to the end those that may be as
-        good as the best.
-
-        Also returned: the least cost after the few passes, also of other poses if it is given
-            (``least``).
+    ) -> tuple[list[Measured], float]:
+        """Return the poses registered to the model by a few passes, and to the end those that may
+        be as good as the best; and the least cost after the few passes, also of other poses
+        (``least``).
         """
-        part = np.ascontiguousarray(fine[:: max(1, len(fine) // self._registered)])
+        part = np.ascontiguousarray(fine[:: max(1, len(fine) // self.registered)])
         brief = [self._ended(self._brief, part, T_ca, width_m) for T_ca in poses]
-        found = [self._measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
+        found = [self.measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
         least = min(least, float(costs.min(initial=np.inf)))
         order = [
@@ -379,27 +355,27 @@ class GlobalSearch:
         last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
         ended = [self._ended(self._refine, part, found[k].T_ca, width_m, True) for k in last]
         best, others = (
-            [self._measured(fine, T_ca) for T_ca in ended],
+            [self.measured(fine, T_ca) for T_ca in ended],
             (found[k].T_ca for k in order if k not in last),
         )
         return best + [
-            self._measured(fine, T_ca) for T_ca in others if self._spent < self._most
+            self.measured(fine, T_ca) for T_ca in others if self.spent < self.most
         ], least
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different
         ones, not the identity.
         """
-        starts = self._starts(self._middle, [None], np.zeros((1, 3)))
+        starts = self._starts(self.middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
         rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
-        poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)
-        apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
+        poses, costs = self.field.refine(points, poses, 0, self._extent, *rule)
+        apart = [not self.poses.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         best, width = poses[apart & (costs < SYMMETRIC)], COARSE_OF_EXTENT * self._extent
         ended = [self._ended(self._refine, points, Pose.from_matrix(T), width).matrix for T in best]
         exact = [T for T in principal_turns(self._target.surface) if self._is_exact(points, T)]
-        return self._different(np.stack([np.eye(4), *exact, *ended]), 1 + SYMMETRIES, 1.0)[1:]
+        return self.poses.different(np.stack([np.eye(4), *exact, *ended]), 1 + SYMMETRIES, 1.0)[1:]
 
     def _is_exact(self, points: Array, T: Array) -> bool:
         """Whether a motion (4, 4) carries nearly all points (n, 3) of the surface onto it."""
@@ -407,12 +383,13 @@ class GlobalSearch:
         off = self._target.index.closest(moved).d2 > (EXACT_OF_EXTENT * self._extent) ** 2
         return bool(np.count_nonzero(off) <= MOST_INEXACT * len(points))
 
-    def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
+    def measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Measured:
+        """Return the distances of points (n, 3) in {A} at a pose, at most ``most`` extents."""
         distance, work = self._target.visibility.distances(
             self._target.index, points, T_ca, most * self._extent
         )
-        self._spent += work
-        return Candidate(T_ca, distance)
+        self.spent += work
+        return Measured(T_ca, distance)
 
     def _ended(
         self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False
@@ -420,20 +397,21 @@ class GlobalSearch:
         """The pose registered to the model; the pose itself where the work of the round is
         spent.
         """
-        if self._spent >= self._most:
+        if self.spent >= self.most:
             return T_ca
-        fit = horn.align_within(points, T_ca, width_m, near, most_work=self._most - self._spent)
-        self._spent += fit.work
+        fit = horn.align_within(points, T_ca, width_m, near, most_work=self.most - self.spent)
+        self.spent += fit.work
         return fit.T_ca
 
-    def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
-        noise = self.noise_of(found)
+    def _verdict(self, found: Sequence[Measured]) -> SearchResult:
+        noise = least_noise(found)
         width = max(
             self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent)
         )
         best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
-        others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
-        good = takewhile(lambda other: as_good(best, other, width, self.margin(noise)), others)
+        others = (other for other in rest if not self.poses.same(best.T_ca, other.T_ca))
+        costs, margin = best.unexplained(width), self.margin(noise)
+        good = takewhile(lambda other: as_good(costs, other.unexplained(width), margin), others)
         rivals = tuple(other.T_ca for other in good)
         return SearchResult(
             best.T_ca,
@@ -441,12 +419,8 @@ class GlobalSearch:
             width,
             float(np.mean(best.distance < width)),
             tuple(found),
-            self._spent,
+            self.spent,
         )
-
-    def noise_of(self, found: Sequence[Candidate]) -> float:
-        """Return the least robust noise [m] of the poses."""
-        return min(robust_noise(each.distance) for each in found)
 
     def margin(self, noise_m: float) -> float:
         """Return the share of the scan by which a unique pose explains more than any other one."""
@@ -457,24 +431,6 @@ class GlobalSearch:
         ``width_m`` [m].
         """
         return self._refine.align_within(points, T_ca, width_m).T_ca
-
-    def same(self, first: Pose, other: Pose) -> bool:
-        """Return whether two poses T_ca differ by less than ``same_rad`` and 0.05 of the extent."""
-        step = first @ other.inverse()  # in {C}
-        near = (
-            float(np.linalg.norm(step.apply(self._middle) - self._middle))
-            < SAME_OF_EXTENT * self._extent
-        )
-        return near and float(geometry.angle(step.q)) < self.same_rad
-
-
-def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:
-    """Return whether the excess cost of the second, point by point, is below 5 sigma of its mean or
-    the margin.
-    """
-    excess = second.unexplained(width) - best.unexplained(width)
-    error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
-    return bool(excess.mean() < max(margin, error))
 
 
 def principal_turns(surface: Surface) -> Array:

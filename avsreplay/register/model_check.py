@@ -54,11 +54,11 @@ from avsreplay.register.mirror import (
     reflected,
     wanted,
 )
-from avsreplay.register.neighbourhood import POSTPONED
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import at_instant, diameter, without_scattered_points
 from avsreplay.register.sensor_frame import SensorFrame
+from avsreplay.register.shown import POSTPONED
 from avsreplay.register.size import (
     MOST_OF_MODEL,
     SIGMAS,

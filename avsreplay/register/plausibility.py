@@ -147,8 +147,11 @@ class PlausibilityTest:
         """Return what the rays of a scan say of a pose; None with too few near the model."""
         return self._evidence.at(scan, T_ca)
 
-    def reason(self, scan: Observed, T_ca: Pose, guess: Pose | None = None) -> str:
-        """Return why a pose is not accepted, "" if it is, also with another size of the target.
+    def judged(
+        self, scan: Observed, T_ca: Pose, guess: Pose | None = None
+    ) -> tuple[Evidence | None, str]:
+        """Return what the rays of a scan say of a pose, None with too few near the model; and why
+        it is not accepted, "" if it is, also with another size of the target.
 
         Args:
             scan: the scan.
@@ -157,9 +160,9 @@ class PlausibilityTest:
         """
         found = self.check(scan, T_ca)
         if found is None:
-            return TOO_FEW
+            return None, TOO_FEW
         reason = found.reason(self.predicted(T_ca, guess))
-        return "" if reason and self._has_other_size(scan, T_ca) else reason
+        return found, "" if reason and self._has_other_size(scan, T_ca) else reason
 
     def _has_other_size(self, scan: Observed, T_ca: Pose) -> bool:
         """Whether the pose is accepted with the size of the target that the scan shows."""

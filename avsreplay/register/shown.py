@@ -24,6 +24,9 @@ CHANGE = 0.03
 # A principal standard deviation counts as at least this share of the largest one, so that the noise
 # of a flat view is no change of its shape.
 LEAST_OF_LARGEST = 0.05
+POSTPONED = (
+    "the search for a pose is postponed, because the searches of the scans before found none"
+)
 POINTS = 2000  # of a scan, from which its shape is measured
 
 

@@ -163,11 +163,32 @@ def events(
         yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
+    yield from _not_free(rows)
     stated = list(zip(column_of(rows, "t_s"), column_of(rows, "reason"), strict=True))
     if biased := [t_s for t_s, reason in stated if reason == "sensor_bias"]:
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
     if frozen := [t_s for t_s, reason in stated if reason == "frozen"]:
         yield f"the sensor repeated a scan {times(len(frozen))}, first at {frozen[0]:.1f} s"
+
+
+def _not_free(rows: Sequence[Row]) -> Iterator[str]:
+    """That no free motion explains the poses, or only one with random torques or forces."""
+    moved = list(zip(column_of(rows, "t_s"), column_of(rows, "motion"), strict=True))
+    if driven := [t_s for t_s, motion in moved if motion == "driven"]:
+        scans = f"{len(driven)} of {len(rows)} scans, first at {driven[0]:.1f} s"
+        yield f"the target does not move freely: no free motion explains the poses of {scans}"
+    elif moved and moved[-1][1] == "disturbed":
+        last = rows[-1]
+        sizes = [
+            f"{value:.2g} {unit}"
+            for value, unit in (
+                (last.torque_noise_radps15, "rad/s^1.5"),
+                (last.force_noise_mps15, "m/s^1.5"),
+            )
+            if value
+        ]
+        what = f"random torques or forces act, {' and '.join(sizes)}"
+        yield f"the target does not move freely: {what}"
 
 
 @value_class(eq=True)

@@ -42,6 +42,7 @@ GROWN_LEAST, TURNED_LEAST = (
 )  # smallest median of the last third, over the extent, and [deg]
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SAME_ERROR = 0.2
+ALIASED = 0.1  # share of the scans whose poses two angular rates explain
 FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -317,6 +318,7 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
 
 def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Consistency, changes of the motion and new starts of the estimate, what it determines."""
+    yield from _aliases(rows)
     yield from _consistency(rows, summary)
     yield from _new_starts(rows, summary)
     if (used := column_of(used_rows(rows), "free_directions")) and all(used):
@@ -326,6 +328,18 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         )
     if summary.assessment is None:  # else it states whether the estimate suffices
         yield from _convergence(rows, summary)
+
+
+def _aliases(rows: Sequence[Row]) -> Iterator[Concern]:
+    """Two angular rates that explain the poses alike."""
+    named = [row for row in rows if row.alias_fast_radps is not None]
+    if len(named) > ALIASED * len(rows):
+        slow, fast = named[-1].alias_slow_radps, named[-1].alias_fast_radps
+        yield Concern(
+            Grade.CHECK,
+            "the target turns too far from scan to scan: rates of"
+            f" {slow:.3g} and {fast:.3g} rad/s both explain the poses; more scans a second tell",
+        )
 
 
 def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:

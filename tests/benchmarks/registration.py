@@ -417,7 +417,7 @@ def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         scan, truth = look(mesh, args.scan, 0.0, 3, partial(_ranges, one))
         guess = off(truth, 0.5, 0.01, 4)
         fit = one._backend.align(scan, guess)
-        rest = (one._grader._accuracy, True, guess)
+        rest = (one._loop.grader._accuracy, True, guess)
         cases = {
             "register": Case(registered(one, scan, guess)),
             "align": Case(aligned(one, scan, guess)),

@@ -10,13 +10,15 @@ main directions of its faces; the displacements are in the plane of the scan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Generator as Steps
+from dataclasses import replace
 from functools import cached_property
 from itertools import permutations, product
 
 import numpy as np
 
 from avsreplay.geometry import Array, Pose
+from avsreplay.register.backend import Target
 from avsreplay.register.global_search import (
     COARSE_OF_EXTENT,
     FALL,
@@ -29,17 +31,15 @@ from avsreplay.register.global_search import (
     REFINED_POINTS,
     REGISTERED_WORK,
     RIVAL_AFTER,
-    SAME_RAD,
-    Candidate,
-    GlobalSearch,
     best_of,
 )
+from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
+from avsreplay.register.near_symmetry import NearSymmetry
+from avsreplay.register.plausibility import PlausibilityTest
+from avsreplay.register.poses import SAME_RAD
 from avsreplay.register.sampling import sample_evenly, thin_to
+from avsreplay.register.work import LEAST_RATIO, NOT_COMPARED
 
-OFF = 2.0  # a point farther from the model than this many widths is off it
-CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
-LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
-MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 POINTS, STEP_OF_EXTENT, STEPS = (
     50,
     0.06,
@@ -65,88 +65,112 @@ SQUARE, ALONG, LEAST_FACES = (
     0.98,
     0.05,
 )  # cosines of normals at right angles and parallel; share of the surface
+ALIKE = 0.5  # starts turned by less than this share of SAME_RAD are one
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Contradicted(Candidate):
-    """A pose with what contradicts it.
-
-    Attributes:
-        passed: rays that passed through a mark that should be visible.
-        empty: rays expected on marks in directions in which nothing was measured.
+class Displaced(Generator):
+    """The result of a search turned and displaced, where the scan shows a part of the target or
+    another object.
     """
 
-    passed: float
-    empty: float
+    missing = NOT_COMPARED
 
+    def __init__(self, target: Target, test: PlausibilityTest, symmetry: NearSymmetry) -> None:
+        self._target, self._test, self._symmetry = target, test, symmetry
+        self._search, self._extent = symmetry.search, target.surface.extent
+        self._gate, self._most = target.limits.gate_m, 2**62
 
-class Search(GlobalSearch):
-    """A global search that also finds other poses of its result."""
+    def needed(self, case: Case) -> bool:
+        """Return whether such poses are possible."""
+        near = case.at.found.inliers >= LEAST_RATIO * len(case.target)
+        return self._partial(case) or not (near or self._symmetry.marked)
 
-    def elsewhere_work(self, points: int, partial: bool) -> int:
-        """Return the usual cost of :meth:`elsewhere` for a scan of so many points, in point
-        searches.
-        """
-        return (
-            FIXED_WORK
-            + POINT_WORK[partial] * POINTS
-            + REGISTERED_WORK * min(points, REFINED_POINTS)
-        )
+    def _partial(self, case: Case) -> bool:
+        return self._test.partial(case.target, case.at.T_ca)
 
-    def elsewhere(
-        self, points: Array, T_ca: Pose, partial: bool, left: int
-    ) -> tuple[list[Pose], int]:
-        """Return other poses that explain the points of the result of a search nearly as well, and
-        the work.
+    def work(self, case: Case) -> int:
+        """Return the usual cost for the points on the model."""
+        return self.usual(case.at.found.inliers, len(case.points), self._partial(case))
+
+    def usual(self, on: int, points: int, partial: bool) -> int:
+        """Return the usual cost for a scan with so many points on the model, and in all.
 
         Args:
-            points: (n, 3) in {A} [m], those on the model at the result.
-            T_ca: the result.
-            partial: the scan shows a part of the target, which may be anywhere on it; else starts
-                are hardly displaced.
-            left: work that is left, in point searches; after most of it no pose is registered.
-
-        Returns:
-            At most ``COMPARED`` poses T_ca, and the work in point searches.
+            on: points on the model.
+            points: of the scan.
+            partial: the scan shows a part of the target.
         """
-        self._spent, self._registered = 0, REFINED_POINTS
-        L, width, threads = (
-            self._extent,
-            MIDDLE_OF_EXTENT * self._extent,
-            self._target.limits.threads,
+        registered = REGISTERED_WORK * min(on, REFINED_POINTS)
+        compared = self._symmetry.compared_work(points, 1 + COMPARED)
+        return FIXED_WORK + POINT_WORK[partial] * POINTS + registered + compared
+
+    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+        """Yield at most ``COMPARED`` poses that explain the points on the model nearly as well."""
+        rays, T_ca = self._symmetry.rays(case.points), case.at.T_ca
+        on = self._test.measure(rays.points, T_ca) < self._gate
+        compared = self._symmetry.compared_work(len(rays.points), 1 + COMPARED)
+        found, work = self._poses(
+            rays.points[on], T_ca, self._partial(case), case.work.left - compared
         )
+        for each in found:
+            yield Hypothesis(each)
+        return work + compared
+
+    def compared(
+        self, case: Case, found: list[Hypothesis]
+    ) -> tuple[Hypothesis | None, Candidate | None]:
+        """Return the pose for which the rays decide, by the points on the model at one of them."""
+        at, partial = case.at, self._partial(case)
+        rays = self._symmetry.rays(case.points)
+        measured = [self._symmetry.measured(rays, T) for T in (at.T_ca, *(h.T_ca for h in found))]
+        on = np.min([each.distance for each in measured], axis=0) < self._symmetry.width(measured)
+        measured = [replace(each, distance=each.distance[on]) for each in measured]
+        best, as_near, open_ = self._symmetry.decided(measured, not partial)
+        # there may be more of them, which were not compared
+        rivals = as_near if len(as_near) >= COMPARED else open_
+        kept = replace(at, rivals=tuple(each.T_ca for each in rivals))
+        moved = not self._symmetry.poses.same(best.T_ca, at.T_ca)
+        return (Hypothesis(best.T_ca) if moved else None), kept
+
+    def _poses(self, points: Array, T_ca: Pose, partial: bool, left: int) -> tuple[list[Pose], int]:
+        """Other poses that explain points (n, 3) in {A} on the model nearly as well, and the work.
+
+        After most of the work that is ``left`` no pose is registered.
+        """
+        search = self._search
+        search.spent, search.registered = 0, REFINED_POINTS
+        L, width = self._extent, MIDDLE_OF_EXTENT * self._extent
+        threads = self._target.limits.threads
         few, some, fine = (
             np.ascontiguousarray(thin_to(points, n)) for n in (POINTS, MIDDLE_POINTS, FINE_POINTS)
         )
         sight = self._target.visibility.direction_to_camera(points)
-        facing, starts = (
-            self._sided and sight is not None,
-            self._displaced(few, T_ca, sight, STEPS if partial else 1),
-        )
+        facing = self._target.visibility.sided and sight is not None
+        starts = self._displaced(few, T_ca, sight, STEPS if partial else 1)
         looked = len(few[::2]) * sum(map(len, starts)) * 3
         rule = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         kept = []
         for each, most in zip(starts, MOST, strict=True):
-            poses, costs = self._field.refine(
+            poses, costs = search.field.refine(
                 few[::2].copy(), each, FIRST_PASSES, FIRST_GATE * L, *rule
             )
-            kept.append(self._different(best_of(poses, costs, len(poses)), most, 0.3))
+            kept.append(search.poses.different(best_of(poses, costs, len(poses)), most, 0.3))
         poses = np.concatenate(kept)
         looked += len(few) * len(poses) * (1 + SECOND)
-        poses, costs = self._field.refine(few, poses, SECOND, SECOND_GATE * L, *rule)
-        poses = self._different(best_of(poses, costs, len(poses)), sum(MOST), 0.3)
+        poses, costs = search.field.refine(few, poses, SECOND, SECOND_GATE * L, *rule)
+        poses = search.poses.different(best_of(poses, costs, len(poses)), sum(MOST), 0.3)
         moved = few @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
         d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=width).d2.reshape(
             len(poses), -1
         )
-        costs, self._spent = np.minimum(d2 / width**2, 1.0).mean(axis=1), d2.size
-        poses = self._different(best_of(poses, costs, len(poses)), COMPARED_FIRST, 0.5)
+        costs, search.spent = np.minimum(d2 / width**2, 1.0).mean(axis=1), d2.size
+        poses = search.poses.different(best_of(poses, costs, len(poses)), COMPARED_FIRST, 0.5)
         looked += len(some) * len(poses) * (1 + LAST)
         rule = (FALL, 0.01 * L, width, facing, threads)
-        poses, _ = self._field.refine(some, poses, LAST, 2.0 * width, *rule)
-        self._most = left - FIXED_WORK - looked // LOOK_UPS
+        poses, _ = search.field.refine(some, poses, LAST, 2.0 * width, *rule)
+        search.most = left - FIXED_WORK - looked // LOOK_UPS
         first, *found = [
-            self._measured(some, each, MIDDLE_OF_EXTENT)
+            search.measured(some, each, MIDDLE_OF_EXTENT)
             for each in (T_ca, *map(Pose.from_matrix, poses))
         ]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
@@ -156,10 +180,11 @@ class Search(GlobalSearch):
             *(each.T_ca.matrix for each in ranked if each.unexplained(width).mean() < dearest),
         ]
         others = [
-            Pose.from_matrix(T) for T in self._different(np.stack(near), 1 + COMPARED, 0.5)[1:]
+            Pose.from_matrix(T)
+            for T in search.poses.different(np.stack(near), 1 + COMPARED, 0.5)[1:]
         ]
-        ended = self._to_the_end(fine, others, width)[0]
-        return [each.T_ca for each in ended], FIXED_WORK + looked // LOOK_UPS + self._spent
+        ended = search.to_the_end(fine, others, width)[0]
+        return [each.T_ca for each in ended], FIXED_WORK + looked // LOOK_UPS + search.spent
 
     def _displaced(
         self, few: Array, T_ca: Pose, sight: Array | None, most: int
@@ -171,10 +196,10 @@ class Search(GlobalSearch):
         Those turned by the near-symmetries, (k, 4, 4), and those turned otherwise.
         """
         turns: list[Array] = []
-        alike = (np.eye(3), *self.symmetries[:, :3, :3])
+        alike = (np.eye(3), *self._search.symmetries[:, :3, :3])
         for R in (*alike, *self._square):
             if not any(
-                np.trace(R.T @ other) > 1.0 + 2.0 * np.cos(0.5 * SAME_RAD) for other in turns
+                np.trace(R.T @ other) > 1.0 + 2.0 * np.cos(ALIKE * SAME_RAD) for other in turns
             ):
                 turns.append(R)
         rotations, near = (
@@ -208,7 +233,7 @@ class Search(GlobalSearch):
         starts = []
         for R in rotations:
             middle = (
-                self._middle if sight is None else self._centroids.of(R @ sight)
+                self._search.middle if sight is None else self._search.centroids.of(R @ sight)
             ) + steps @ R.T
             inside = ((middle > low) & (middle < high)).all(axis=1)
             T = np.tile(np.eye(4), (int(inside.sum()), 1, 1))
@@ -241,30 +266,3 @@ def cube_rotations() -> Array:
         for signs in product((1.0, -1.0), repeat=3)
     ]
     return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
-
-
-def decides(better: Contradicted, other: Contradicted, width_m: float, complete: bool) -> bool:
-    """Return whether the rays decide for one pose against another.
-
-    Args:
-        better: the pose that is to be decided for.
-        other: the other pose, measured on the same points.
-        width_m: distance within which a point is on the model [m].
-        complete: as of ``NearSymmetry.decided``.
-    """
-    a, b, off = better.distance, other.distance, OFF * width_m
-    share = max(CONTRADICTING, float(np.mean((a > width_m) & (b > width_m))))
-    if share >= 0.5:
-        return False
-    rays_for = (
-        np.count_nonzero((a < width_m) & (b > off))
-        + other.passed
-        + (other.empty if complete else 0.0)
-    )
-    against = (
-        np.count_nonzero((b < width_m) & (a > off))
-        + better.passed
-        + (better.empty if complete else 0.0)
-    )
-    enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
-    return bool(enough and against <= MOST_AGAINST * rays_for)

@@ -1,64 +1,43 @@
-"""Decision between poses that differ by a near-symmetry of the model, by the rays that contradict
-each of them.
+"""The motions that carry most of a model onto itself, and the marks that distinguish its turned
+copies.
 
 A nearly symmetric body differs from its turned copies only by its marks: the parts that no
-near-symmetry carries onto the surface. Three kinds of rays decide between two poses. Some points
-are on the model at one pose and well off it at the other. Some rays pass through a mark of one
-pose, because the point measured in that direction lies behind it. In some directions a mark should
-be visible and nothing was measured; they count if the visible side of the model is complete in the
-scan.
-
-With a share e of rays that contradict the true pose (other objects, errors of the model), a ray
-that contradicts one pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is
-below ``LEAST_LIKELIHOOD`` stay rivals.
+near-symmetry carries onto the surface.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register import index_cache
 from avsreplay.register.backend import Target
-from avsreplay.register.budget import TEST_WORK, healthy_work
-from avsreplay.register.degenerate import turn_words
-from avsreplay.register.elsewhere import COMPARED, OFF, Contradicted, Search, decides
-from avsreplay.register.global_search import FINE_PASSES, as_good
-from avsreplay.register.grading import FAR_RAD
+from avsreplay.register.comparison import OFF, Measured, decided, least_noise
+from avsreplay.register.global_search import FINE_PASSES, GlobalSearch
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
-from avsreplay.register.quality import view_directions
+from avsreplay.register.poses import Sameness
 from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
+from avsreplay.register.work import TEST_WORK, healthy_work
 
-VERSION = 11  # version of the kept data of a model
+VERSION = 12  # version of the kept data of a model
 SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
 # a point within this (over the extent), or within three sigma of the noise, is on the model
 NEAR = 0.004
-TURNED_RAD = np.radians(
-    12.0
-)  # rotation from the guess above which a pose is far, with near-symmetries
-NOT_VERIFIED = (
-    f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a"
-    " search"
-)
-NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 # an exact symmetry carries all but this share of the surface to within this of it, over the extent
 EXACT_OF_EXTENT, MOST_INEXACT = 5e-4, 5e-4
-MOST_NAMED = 4  # turned poses that are named in words
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
@@ -73,20 +52,17 @@ class NearSymmetry:
 
     Attributes:
         search: the global search of the same target.
+        poses: says when two poses are the same.
     """
 
     def __init__(
-        self, target: Target, test: PlausibilityTest, search: Search, kept: dict[str, Array]
+        self, target: Target, test: PlausibilityTest, search: GlobalSearch, kept: dict[str, Array]
     ) -> None:
         """Find the axis of revolution, if there is one, and sample the marks; or take both
         from ``kept``.
         """
-        self._target, self._test, self.search, self._gate = (
-            target,
-            test,
-            search,
-            target.limits.gate_m,
-        )
+        self._target, self._test, self.search = target, test, search
+        self.poses, self._gate = search.poses, target.limits.gate_m
         surface = target.surface
         if "kinds" not in kept:
             found = (
@@ -98,7 +74,7 @@ class NearSymmetry:
             kept["ends"] = np.cumsum([len(motions) for motions in found.kinds], dtype=np.int64)
             kept["least"] = np.array(found.least_rad)
         self._kinds = np.split(kept["kinds"], kept["ends"])[:-1]
-        search.same_rad = min(search.same_rad, 0.5 * float(kept["least"]))
+        self.poses.same_rad = min(self.poses.same_rad, 0.5 * float(kept["least"]))
         if "exact" not in kept:
             kept["exact"] = self._exact_ones()
         self._exact = kept["exact"]
@@ -154,6 +130,11 @@ class NearSymmetry:
         return moved
 
     @property
+    def count(self) -> int:
+        """Return the number of kinds of motions."""
+        return len(self._kinds)
+
+    @property
     def turned(self) -> bool:
         """Whether some motion carries most of the model onto itself."""
         return len(self._kinds) > 0
@@ -178,20 +159,14 @@ class NearSymmetry:
         point searches.
         """
         finalists = FINALISTS * len(self._kinds)
-        rays = RAY_WORK * len(self._marks)
-        measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
+        measured = self.compared_work(points, 1 + others + finalists)
         return (
-            self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self._ray_work) + measured
+            self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self.ray_work) + measured
         )
 
-    def elsewhere_work(self, points: int, measured: int, partial: bool) -> int:
-        """Return the usual cost of :meth:`elsewhere` for a scan with so many points on the model,
-        and in all.
-        """
-        return self.search.elsewhere_work(points, partial) + self._compared_work(measured)
-
-    def _compared_work(self, points: int) -> int:
-        return (1 + COMPARED) * (min(points, MOST_POINTS) + RAY_WORK * len(self._marks))
+    def compared_work(self, points: int, poses: int) -> int:
+        """Return the usual cost of comparing so many poses by the rays of a scan."""
+        return poses * (min(points, MOST_POINTS) + RAY_WORK * len(self._marks))
 
     def after_search(self, points: int) -> int:
         """Return the usual cost of what follows a search for a scan of so many points, in point
@@ -208,59 +183,30 @@ class NearSymmetry:
             + healthy_work(points, self._target.near_work)
         )
 
-    def better(self, scan: NDArray[np.floating], T_ca: Pose) -> tuple[list[Pose], int]:
-        """Return the poses turned by a near-symmetry that explain more of a scan (n, 3) in {A}, and
-        the work.
-        """
-        turned, tested = self._turned(self._rays(scan), T_ca, True)
-        return turned, self.turning_work + (1 + tested) * self._ray_work
-
-    def _rays(self, scan: NDArray[np.floating]) -> Rays:
+    def rays(self, scan: NDArray[np.floating]) -> Rays:
+        """Return the rays of at most about ``MOST_POINTS`` points of a scan (n, 3) in {A}."""
         return Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
 
     def decided(
-        self,
-        scan: NDArray[np.floating],
-        T_ca: Pose,
-        others: list[Pose],
-        complete: bool,
-        turned: list[Pose] | None = None,
-    ) -> tuple[Pose, list[Pose], int]:
-        """Return the pose for which the rays decide, the others that explain the scan as well, and
-        extra work.
-
-        The extra work is what the comparison took beyond ``work``, because the rays spoke against
-        many motions.
+        self, found: list[Measured], complete: bool
+    ) -> tuple[Measured, list[Measured], list[Measured]]:
+        """Return the pose for which the rays decide, see ``comparison.decided``.
 
         Args:
-            scan: (n, 3) in {A} [m].
-            T_ca: registered pose.
-            others: other poses that explain the scan.
-            complete: the visible side of the model is complete in the scan, so that empty
-                directions count.
-            turned: poses turned by a near-symmetry; None: the best ones.
+            found: poses measured on the same points, see :meth:`measured`.
+            complete: the visible side of the model is complete in the scan.
         """
-        rays = self._rays(scan)
-        if not len(rays.points):
-            return T_ca, others, 0
-        extra = 0
-        if turned is None:
-            turned, tested = self._turned(rays, T_ca, False)
-            extra = max(0, tested - FINALISTS * len(self._kinds)) * self._ray_work
-        found = [self._measured(rays, pose) for pose in (T_ca, *others, *turned)]
-        noise, best = self.search.noise_of(found), found[0]
-        width = max(NEAR * self._target.index.extent_m, 3.0 * noise)
-        for each in found[1:]:
-            best = each if decides(each, best, width, complete) else best
+        noise = least_noise(found)
+        near, width = self._near(noise), max(self._gate, self._near(noise))
         margin = self.search.margin(noise)
-        rivals = [
-            each.T_ca
-            for each in found
-            if not self.search.same(best.T_ca, each.T_ca)
-            and as_good(best, each, max(self._gate, width), margin)
-            and not decides(best, each, width, complete)
-        ]
-        return best.T_ca, rivals, extra
+        return decided(found, self.poses.same, (near, width), margin, complete)
+
+    def width(self, found: list[Measured]) -> float:
+        """Return the width of the costs of poses [m], which follows the least noise."""
+        return max(self._gate, self._near(least_noise(found)))
+
+    def _near(self, noise_m: float) -> float:
+        return max(NEAR * self._target.index.extent_m, 3.0 * noise_m)
 
     def images(self, T_ca: Pose) -> list[Pose]:
         """Return the poses onto which the exact symmetries of the model carry a pose, where they
@@ -269,104 +215,25 @@ class NearSymmetry:
         No scan can tell them apart. Each is a different pose. A registration could only move it
         away.
         """
-        found = list[Pose]()
-        for T in self._exact:
-            turned = Pose.from_matrix(T) @ T_ca
-            if not any(self.search.same(turned, each) for each in (T_ca, *found)):
-                found.append(turned)
-        return found
+        return [motion @ T_ca for motion in self._images]
 
-    def elsewhere(
-        self, scan: NDArray[np.floating], T_ca: Pose, partial: bool, left: int
-    ) -> tuple[Pose, list[Pose], int]:
-        """Return the pose for which the rays decide among those far from a result that explain its
-        points as well.
-
-        Args:
-            scan: (n, 3) in {A} [m].
-            T_ca: the result of a search.
-            partial: the scan shows a part of the target, so that displaced poses are tried as well.
-            left: work that is left.
-
-        Returns:
-            The pose, the others that explain the points on the model as well, and the work in point
-            searches.
+    @cached_property
+    def _images(self) -> list[Pose]:
+        """The exact symmetries that give different poses: whether they do is the same for all
+        poses.
         """
-        rays, gate = self._rays(scan), self._gate
-        on, compared = (
-            self._test.measure(rays.points, T_ca) < gate,
-            self._compared_work(len(rays.points)),
-        )
-        poses, work = self.search.elsewhere(rays.points[on], T_ca, partial, left - compared)
-        found = [self._measured(rays, each) for each in (T_ca, *poses)]
-        width = max(NEAR * self._target.index.extent_m, 3.0 * self.search.noise_of(found))
-        on = np.min([each.distance for each in found], axis=0) < max(gate, width)
-        found = [replace(each, distance=each.distance[on]) for each in found]
-        best = found[0]
-        for each in found[1:]:
-            best = each if decides(each, best, width, not partial) else best
-        margin = self.search.margin(width / 3.0)
-        others = [each for each in found if not self.search.same(best.T_ca, each.T_ca)]
-        as_near = [each for each in others if as_good(best, each, max(gate, width), margin)]
-        repeated = len(as_near) >= COMPARED  # there may be more of them, which were not compared
-        rivals = [
-            each.T_ca for each in as_near if repeated or not decides(best, each, width, not partial)
-        ]
-        return best.T_ca, rivals, work + compared
-
-    def rivalled(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> Alignment:
-        """Return the alignment; AMBIGUOUS with rivals that differ not only along its
-        unobservable directions, and by no exact symmetry.
-        """
-        images, same = self.images(found.T_ac.inverse()), self.search.same
-        rivals = [each for each in rivals if not any(same(each, image) for image in images)]
-        rivals = self._apart(scan, found, rivals)
-        return self._named(found, rivals) if rivals else found
-
-    def equal(self, scan: NDArray[Any], found: Alignment) -> Alignment:
-        """Return the alignment; AMBIGUOUS with its images by the exact symmetries of the model,
-        which no scan can tell apart.
-        """
-        images = self._apart(scan, found, self.images(found.T_ac.inverse()))
-        return replace(self._named(found, images), equal=True) if images else found
-
-    def revolved(self, scan: NDArray[Any], found: Alignment) -> bool:
-        """Return whether the only unobservable direction of a result is a turn that carries the
-        model onto itself.
-        """
-        free = found.free if found.status is AlignStatus.DEGENERATE else None
-        if free is None or free.shape[1] != 1:
-            return False
-        images = self.images(found.T_ac.inverse())
-        return len(images) > 0 and not self._apart(scan, found, images)
-
-    def _apart(self, scan: NDArray[Any], found: Alignment, others: list[Pose]) -> list[Pose]:
-        """Those of other poses T_ca that differ from a result not only along its unobservable
-        directions.
-        """
-        at, target = found.T_ac.inverse(), self._target
-        if others and found.status is AlignStatus.DEGENERATE:
-            free = view_directions(target.index, target.visibility, scan, at, self._gate)
-            others = [T_ca for T_ca in others if not self.search.same(T_ca, free.nearest(at, T_ca))]
-        return others
-
-    def _named(self, found: Alignment, others: list[Pose]) -> Alignment:
-        """The alignment as one of several poses that explain the scan."""
-        words = dict.fromkeys(turn_words(found.T_ac.inverse() @ each.inverse()) for each in others)
-        return replace(
-            found,
-            status=AlignStatus.AMBIGUOUS,
-            covariance=None,
-            free_directions=", ".join([*words][:MOST_NAMED]),
-            members=(found.T_ac, *(each.inverse() for each in others)),
-        )
+        found = [Pose.identity()]
+        for T in map(Pose.from_matrix, self._exact):
+            if not self.poses.among(T, found):
+                found.append(T)
+        return found[1:]
 
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
 
-    def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
-        """The best poses that the near-symmetries give, registered, and at how many of them the
-        marks were tested.
+    def turned_poses(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
+        """Return the best poses that the near-symmetries give, registered, and at how many of them
+        the marks were tested.
 
         Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose
         pass through a mark. ``better``: only poses that explain more rays, by ``LEAST_RAYS`` at
@@ -396,9 +263,7 @@ class NearSymmetry:
             order = np.argsort(cost, kind="stable")
             for k in order[cost[order] < most_cost]:
                 start = Pose.from_matrix(motions[k]) @ T_ca
-                if any(
-                    self.search.same(start, other) for other in (kept if better else (T_ca, *kept))
-                ):
+                if self.poses.among(start, kept if better else [T_ca, *kept]):
                     continue
                 tested += 1
                 if self._passed(rays, start, stride)[0] < min(
@@ -410,8 +275,9 @@ class NearSymmetry:
         evenly = np.ascontiguousarray(rays.points[:: max(1, len(rays.points) // len(part))])
         return [self.search.refined(evenly, start, width) for start in kept], tested
 
-    def _measured(self, rays: Rays, T_ca: Pose) -> Contradicted:
-        return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
+    def measured(self, rays: Rays, T_ca: Pose) -> Measured:
+        """Return the distances of the points of rays at a pose, and what contradicts it."""
+        return Measured(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
 
     @property
     def _stride(self) -> int:
@@ -419,8 +285,8 @@ class NearSymmetry:
         return max(1, -(-len(self._marks) // SCREENED_MARKS))
 
     @property
-    def _ray_work(self) -> int:
-        """Cost of the rays to these marks in point searches."""
+    def ray_work(self) -> int:
+        """Return the cost of the rays to the marks where all motions are compared."""
         return RAY_WORK * -(-len(self._marks) // self._stride)
 
     def _passed(self, rays: Rays, T_ca: Pose, stride: int = 1) -> tuple[float, float]:
@@ -458,7 +324,11 @@ class NearSymmetry:
 
 
 def prepared(
-    target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None
+    target: Target,
+    test: PlausibilityTest,
+    params: AcquireParams,
+    poses: Sameness,
+    folder: Path | None,
 ) -> NearSymmetry:
     """Return the near-symmetries of a target with its search. They are kept in a folder where one
     is given.
@@ -467,6 +337,7 @@ def prepared(
         target: what is searched.
         test: tests of poses of this target.
         params: of the search.
+        poses: says when two poses are the same.
         folder: cache folder; the file is named by all that its content depends on.
     """
     kernel, surface, limits, path = kernel_module(), target.surface, target.limits, None
@@ -480,7 +351,7 @@ def prepared(
         )
     kept = index_cache.read_arrays(path, kernel.checksum)
     known = len(kept)
-    search = Search(target, params, kept)
+    search = GlobalSearch(target, params, poses, kept)
     symmetry = NearSymmetry(target, test, search, kept)
     if len(kept) > known:
         index_cache.write_arrays(path, kept, kernel.checksum)

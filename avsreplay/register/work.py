@@ -51,6 +51,7 @@ LAST_WORK = (
     30_000  # cost of registering a scan once more from its pose, and of the test of the result
 )
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
+NOT_COMPARED = "no work is left to compare the poses near this one"
 LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work
 
 
@@ -91,10 +92,26 @@ def grade_work(points: int, noisy: bool = False) -> int:
     return GRADE_WORK + points // POINTS_GRADED + simulated
 
 
-class Budget:
+def alignment_work(fit: Fit, found: Alignment, graded: int, noisy: bool) -> int:
+    """Return the work of an alignment, estimated if not counted, and of its quality.
+
+    Args:
+        fit: of the back end.
+        found: the alignment.
+        graded: points by which its quality was measured.
+        noisy: its noise was simulated.
+    """
+    share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
+    free = FREE_WORK + found.points if found.status is AlignStatus.DEGENERATE else 0
+    aligned = fit.work or fit.iterations * found.points * share
+    return aligned + grade_work(graded, noisy) + free
+
+
+class Work:
     """Point searches left for one scan: counted work, so that results do not depend on the machine.
 
-    The work of fitting the size, which follows the last pose, is kept.
+    Only the loop over hypotheses has one. The work of fitting the size, which follows the last
+    pose, is kept.
 
     Args:
         healthy: work of an ordinary registration of the scan.
@@ -113,24 +130,6 @@ class Budget:
     def spend(self, searches: int) -> None:
         """Subtract work that was done."""
         self.left -= searches
-
-    def registered(self, fit: Fit, found: Alignment, graded: int, noisy: bool) -> None:
-        """Subtract the work of an alignment, estimated if not counted, and of its quality by
-        ``graded`` points.
-
-        ``noisy``: its noise was simulated.
-        """
-        share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        free = FREE_WORK + found.points if found.status is AlignStatus.DEGENERATE else 0
-        self.spend(
-            (fit.work or fit.iterations * found.points * share) + grade_work(graded, noisy) + free
-        )
-
-    def for_alignment(self, points: int) -> int:
-        """Return the searches that an alignment may take, so that its pose can be graded (with
-        noise) and tested.
-        """
-        return max(1, self.left - grade_work(points, noisy=True) - TEST_WORK)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without

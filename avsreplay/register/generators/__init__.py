@@ -1,0 +1,1 @@
+"""Generators of hypotheses of the pose of a scan, one file each."""

@@ -1,0 +1,156 @@
+"""The pose turned by the motions that carry most of the model onto itself: by near-symmetries,
+compared by the rays to the marks of the model, and by exact symmetries, which are not registered
+because that could only move them away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator as Steps
+from dataclasses import replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.register.backend import Target
+from avsreplay.register.degenerate import motions_outside
+from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis, Refine
+from avsreplay.register.near_symmetry import LEAST_RAYS, NearSymmetry
+from avsreplay.register.poses import ONE_MINIMUM
+from avsreplay.register.symmetry import FINALISTS
+from avsreplay.register.work import TEST_WORK
+
+NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
+# share of points off the model from which bodies with large marks are compared with their turned
+# poses
+MANY_OFF = 0.1
+
+
+class Turns(Generator):
+    """Poses turned by near-symmetries, for the result of a search."""
+
+    missing = NOT_TURNED
+    examined = True
+
+    def __init__(self, symmetry: NearSymmetry) -> None:
+        self._symmetry = symmetry
+
+    def needed(self, case: Case) -> bool:  # noqa: ARG002 (that of a guess depends on the scan)
+        """Return whether a mark alone distinguishes the turned copies of the model."""
+        return self._symmetry.marked
+
+    def work(self, case: Case) -> int:
+        """Return the usual cost of the comparison."""
+        return self._symmetry.work(len(case.target), len(case.at.rivals))
+
+    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+        """Yield the different poses that are known to explain the scan, and the turned ones."""
+        for each in case.at.rivals:
+            yield Hypothesis(each)
+        poses, tested = self._turned(case, False)
+        for each in poses:
+            yield Hypothesis(each)
+        more = max(0, tested - FINALISTS * self._symmetry.count) * self._symmetry.ray_work
+        return Turns.work(self, case) + more
+
+    def _turned(self, case: Case, better: bool) -> tuple[list[Pose], int]:
+        """The turned poses, and at how many of them the marks were tested."""
+        rays = self._symmetry.rays(case.target)
+        if not len(rays.points):
+            return [], 0
+        return self._symmetry.turned_poses(rays, case.at.T_ca, better)
+
+    def compared(
+        self, case: Case, found: list[Hypothesis]
+    ) -> tuple[Hypothesis | None, Candidate | None]:
+        """Return the pose for which the rays decide."""
+        at, rays = case.at, self._symmetry.rays(case.target)
+        if not len(rays.points):
+            return None, at
+        measured = [self._symmetry.measured(rays, T) for T in (at.T_ca, *(h.T_ca for h in found))]
+        best, _, rivals = self._symmetry.decided(measured, at.covered)
+        moved = not self._symmetry.poses.same(best.T_ca, at.T_ca, ONE_MINIMUM)
+        kept = replace(at, rivals=tuple(each.T_ca for each in rivals))
+        return (Hypothesis(best.T_ca) if moved else None), kept
+
+
+class TurnsOfGuess(Turns):
+    """The same for a pose that was registered from a guess: only where points off the model can
+    decide, and only poses that explain more of them.
+
+    Where the guess has no information of some motions, all turned poses are compared.
+    """
+
+    refine = Refine.BOTH
+
+    def __init__(self, target: Target, symmetry: NearSymmetry) -> None:
+        super().__init__(symmetry)
+        self._extent, self._complete = target.surface.extent, True
+
+    def needed(self, case: Case) -> bool:
+        """Return whether enough points are off the model, or some motion is not known."""
+        found, near = case.at.found, self._symmetry.near
+        least = LEAST_RAYS if near else max(LEAST_RAYS, MANY_OFF * found.points)
+        off = found.points - found.inliers >= least
+        return case.at.accepted and (self._open(case).size > 0 or off) and self._symmetry.turned
+
+    def _open(self, case: Case) -> Array:
+        """The motions (6, k) that neither guess nor view determine."""
+        return motions_outside(case.unknown, case.at.found.free, self._extent)
+
+    def work(self, case: Case) -> int:  # noqa: ARG002
+        """Return the usual cost of finding that no turned pose explains more."""
+        return self._symmetry.turning_work
+
+    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+        """Yield the turned poses."""
+        self._complete = True
+        if self._open(case).size:
+            work = yield from super().hypotheses(case)
+            return work
+        poses, tested = self._turned(case, True)
+        screened = self._symmetry.turning_work + (1 + tested) * self._symmetry.ray_work
+        if not poses:
+            return screened
+        work = Turns.work(self, case)
+        self._complete = case.work.allows(work + TEST_WORK)
+        for each in poses if self._complete else ():
+            yield Hypothesis(each)
+        return work if self._complete else screened
+
+    def compared(
+        self, case: Case, found: list[Hypothesis]
+    ) -> tuple[Hypothesis | None, Candidate | None]:
+        """Return the pose for which the rays decide; the others leave only motions open of which
+        the guess has no information.
+        """
+        if not self._complete:
+            return None, replace(case.at, missing=self.missing)
+        chosen, kept = super().compared(case, found)
+        assert kept is not None
+        motions = self._open(case)
+        undetermined = motions if motions.size and kept.rivals else None
+        return chosen, replace(kept, rivals=(), undetermined=undetermined)
+
+
+class NearestImage(Generator):
+    """Of the poses that no scan can tell from the result of a search, the one nearest to a
+    guess.
+    """
+
+    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+        """Yield these poses unmoved."""
+        for each in case.at.images or ():
+            yield Hypothesis(each)
+        return 0
+
+    def compared(
+        self, case: Case, found: list[Hypothesis]
+    ) -> tuple[Hypothesis | None, Candidate | None]:
+        """Return the nearest one."""
+        assert case.guess is not None
+        guess = case.guess.q
+        poses = [case.at.T_ca, *(each.T_ca for each in found)]
+        turned = [float(geometry.angle_between(each.inverse().q, guess)) for each in poses]
+        best = int(np.argmin(turned))
+        return (found[best - 1] if best else None), case.current
