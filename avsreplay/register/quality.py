@@ -31,7 +31,7 @@ from avsreplay.register.covariance import (
 from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
-from avsreplay.register.surface_index import Closest, SurfaceIndex
+from avsreplay.register.surface_index import Closest, GradeRule, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
 WELL_OFF, PART = (
@@ -185,96 +185,144 @@ def grade(
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
-    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``:
-    compare the poses from two halves of the scan. ``accuracy``: of the back end on an exact scan
-    [deg, share of the extent]. ``systematic``: the covariance includes errors that vary slowly over
-    the target. ``guess``: T_ca from which the back end began. A pose that equals this guess,
-    although the residuals require a step, is FAILED, unless it is one of least squared distances:
-    these do not move from where they end. The pose of a degenerate view has its
-    unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the
-    pose is one of least squared distances. The bias that noise causes in it is taken from the pose,
-    and the mean that noise adds to the residuals from the covariance, see ``kernel/noise.hpp``. The
-    size is not fitted; if it should be (``Alignment.size_1s``), ``Neighbourhood.with_size`` fits it
-    for the pose that is returned in the end.
+    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. A pose that
+    equals its guess, although the residuals require a step, is FAILED, unless it is one of least
+    squared distances: these do not move from where they end. The pose of a degenerate view has its
+    unobservable directions as in the guess, if the surface then fits as well. The size is not
+    fitted; if it should be (``Alignment.size_1s``), ``Decision.with_size`` fits it for the pose
+    that is returned.
+
+    Args:
+        index: of the model.
+        visibility: where the camera may be.
+        points: (n, 3) in {A} [m].
+        fit: the pose of the back end.
+        limits: of the registration.
+        params: settings of the registration.
+        halves: compare the poses from two halves of the scan.
+        accuracy: of the back end on an exact scan [deg, share of the extent].
+        systematic: the covariance includes errors that vary slowly over the target.
+        guess: T_ca from which the back end began.
+        simulated: the pose is one of least squared distances. The bias that noise causes in it is
+            taken from the pose, and the mean that noise adds to the residuals from the covariance,
+            see ``kernel/noise.hpp``.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    found = _grade(
-        index,
-        visibility,
-        points,
-        fit,
-        limits.gate_m,
-        params,
-        across,
-        accuracy,
-        systematic,
-        simulated,
-    )
+    rule = _rule(index, visibility, points, fit, limits.gate_m, params)
+    rule["across"], rule["systematic"] = np.ascontiguousarray(across), systematic
+    rule["turn_rad"] = float(np.radians(accuracy[0]))
+    rule["move_m"] = accuracy[1] * index.extent_m
+    rule["numbers"] = normal_numbers(NUMBERS) if simulated else np.empty(0)
+    found = PoseQuality(**index.grade(points, fit.T_ca, rule, fit.matches))
     step = found.overlap and found.statistic > UNCHANGED and not simulated
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(
             failed, message="returned its guess unchanged, although the residuals require a step"
         )
-    info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
-    weakest, free = tuple[str, ...](), None
     if found.observable:
-        b, uncertain = (
-            found.bias,
-            UNCERTAIN_BIAS**2 * np.outer(found.bias, found.bias) + found.chance,
-        )
-        P = found.covariance + uncertain + np.outer(found.left, found.left)
-        if not found.bounded:
-            weakest, free = unbounded_directions(P, index.extent_m)
-        if weakest:
-            info, P = pseudo_inverse(P), None
-        elif b.any():
-            T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
+        measured = _determined(found, fit.T_ca, index.extent_m)
     elif found.overlap:
-        used = Evidence(
-            found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
+        kept = guess if fit.converged else None
+        measured = _degenerate(
+            index, visibility, points, fit.T_ca, kept, found, limits.gate_m, systematic
         )
-        view = _directions(used)
-        info = _observable_information(view, used, index.extent_m, systematic)
-        weakest, free = view.words, view.motions
-        if guess is not None and fit.converged:
-            kept = view.nearest(
-                T_ca, guess
-            )  # passes over a curved surface drift along the unobservable directions
-            facing = visibility.camera_c(index, points, kept) is not None
-            at = index.normal_equations(points, kept, limits.gate_m, facing=facing)
-            fits = (
-                at.inliers >= AS_MANY * found.inliers
-                and at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
-            )
-            T_ca = (
-                view.refined(kept, at.info, at.gradient) if fits else T_ca
-            )  # corrects the observable directions
-    settled = P is None or not found.beyond
-    fitted = P is not None and settled and systematic and _other_size(found)
+    else:
+        measured = _Measured(fit.T_ca, found.total / found.noise_m**2)
+    return _alignment(found, fit, measured, systematic)
+
+
+@value_class
+class _Measured:
+    """What a scan says of the pose.
+
+    Attributes:
+        T_ca: the pose.
+        info: (6, 6) information.
+        P: (6, 6) covariance, None where not every motion is determined.
+        weakest: words for the directions that are not determined.
+        free: (6, k) these motions, None without them.
+    """
+
+    T_ca: Pose
+    info: Array
+    P: Array | None = None
+    weakest: tuple[str, ...] = ()
+    free: Array | None = None
+
+
+def _determined(found: PoseQuality, T_ca: Pose, extent_m: float) -> _Measured:
+    """The pose without its bias, and its covariance, where every motion is observable."""
+    b = found.bias
+    uncertain = UNCERTAIN_BIAS**2 * np.outer(b, b) + found.chance
+    P = found.covariance + uncertain + np.outer(found.left, found.left)
+    if not found.bounded:
+        weakest, free = unbounded_directions(P, extent_m)
+        if weakest:
+            return _Measured(T_ca, pseudo_inverse(P), None, weakest, free)
+    if b.any():
+        T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
+    return _Measured(T_ca, found.total / found.noise_m**2, P)
+
+
+def _degenerate(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    T_ca: Pose,
+    guess: Pose | None,
+    found: PoseQuality,
+    gate_m: float,
+    systematic: bool,
+) -> _Measured:
+    """The pose of a view that does not determine every motion.
+
+    Passes over a curved surface drift along the unobservable directions. Where the surface fits as
+    well with these as in the ``guess``, they are kept, and the observable ones are corrected.
+    """
+    used = Evidence(
+        found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
+    )
+    view = _directions(used)
+    info = _observable_information(view, used, index.extent_m, systematic)
+    if guess is not None:
+        kept = view.nearest(T_ca, guess)
+        facing = visibility.camera_c(index, points, kept) is not None
+        at = index.normal_equations(points, kept, gate_m, facing=facing)
+        as_near = at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
+        if as_near and at.inliers >= AS_MANY * found.inliers:
+            T_ca = view.refined(kept, at.info, at.gradient)
+    return _Measured(T_ca, info, None, view.words, view.motions)
+
+
+def _alignment(found: PoseQuality, fit: Fit, pose: _Measured, systematic: bool) -> Alignment:
+    """The alignment of a graded pose."""
+    determined = pose.P is not None
+    settled = not determined or not found.beyond
+    sized = determined and systematic
+    fitted = sized and settled and _other_size(found)
+    converged = fit.converged and settled
     return Alignment(
-        T_ac=T_ca.inverse(),
+        T_ac=pose.T_ca.inverse(),
         iterations=fit.iterations,
-        converged=fit.converged and settled,
+        converged=converged,
         points=found.points,
         inliers=found.inliers,
         rms_m=found.rms_m,
-        info=frozen(info),
-        status=_status(found.overlap, fit.converged and settled, bool(weakest)),
-        covariance=None if P is None else frozen(P),
-        free_directions=", ".join(weakest),
+        info=frozen(pose.info),
+        status=_status(found.overlap, converged, bool(pose.weakest)),
+        covariance=None if pose.P is None else frozen(pose.P),
+        free_directions=", ".join(pose.weakest),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
-        message=_message(
-            settled, found.size_1s if P is not None and systematic and not fitted else 0.0
-        ),
-        dof=np.inf if P is None else found.dof,
-        free=free if weakest else None,
+        message=_message(settled, found.size_1s if sized and not fitted else 0.0),
+        dof=found.dof if determined else np.inf,
+        free=pose.free if pose.weakest else None,
         well_off=found.well_off,
         size_1s=found.size_1s if fitted else None,
-        systematic=frozen(found.systematic) if P is not None and systematic else None,
-        size=(found.size, found.size_1s) if P is not None and systematic else None,
+        systematic=frozen(found.systematic) if sized else None,
+        size=(found.size, found.size_1s) if sized else None,
     )
 
 
@@ -292,43 +340,43 @@ def _message(settled: bool, size_1s: float) -> str:
     return size_remark(None, size_1s)
 
 
-def _grade(
+def _rule(
     index: SurfaceIndex,
     visibility: Visibility,
     points: NDArray[Any],
     fit: Fit,
     gate_m: float,
     params: RegisterParams,
-    across: Array,
-    accuracy: tuple[float, float],
-    systematic: bool,
-    simulated: bool,
-) -> PoseQuality:
-    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the
-    test of halves.
-    """
+) -> GradeRule:
+    """The rule of a pose, without test of halves, systematic errors and simulated noise."""
     extent = index.extent_m
-    camera = (visibility.faced(index, points, fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
-    noise = (params.noise_m or 0.0, NOISE_FLOOR_OF_GATE * gate_m)
-    overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
-    step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
-    rule = (
-        min(gate_m, index.reach_m),
-        PATCH_OF_EXTENT * extent,
-        LEAST_PATCHES,
-        *camera,
-        *noise,
-        *overlap,
-        *step,
+    return GradeRule(
+        gate_m=min(gate_m, index.reach_m),
+        patch_m=PATCH_OF_EXTENT * extent,
+        least_patches=LEAST_PATCHES,
+        camera=visibility.faced(index, points, fit.T_ca),
+        tested=TESTED_POINTS,
+        least_facing=LEAST_FACING,
+        extent_m=extent,
+        noise_m=params.noise_m or 0.0,
+        noise_floor_m=NOISE_FLOOR_OF_GATE * gate_m,
+        least_inliers=float(params.min_inliers),
+        least_ratio=params.min_inlier_ratio,
+        least_information=FREE_BELOW,
+        systematic=False,
+        turn_rad=0.0,
+        move_m=0.0,
+        across=np.empty((0, 3)),
+        beyond_m=WELL_OFF * gate_m,
+        least_close=MANY_INLIERS,
+        part=PART,
+        numbers=np.empty(0),
+        many=SIMULATED,
+        least_share=SHARES[0],
+        most_share=SHARES[1],
+        small_share=SHARES[2],
+        quiet_m=SMALL_NOISE * extent,
     )
-    counted = (np.ascontiguousarray(across), WELL_OFF * gate_m, MANY_INLIERS, PART)
-    drawn = (
-        normal_numbers(NUMBERS) if simulated else np.empty(0),
-        SIMULATED,
-        *SHARES,
-        SMALL_NOISE * extent,
-    )
-    return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, *drawn, 1, fit.matches))
 
 
 def _observable_information(
