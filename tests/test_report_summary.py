@@ -388,6 +388,16 @@ def test_shares_count_what_is_inside(make_rows):
     assert (nis.count, nis.inside, nis.median) == (4, 0.5, 8.0)
 
 
+def test_the_share_of_nis_leaves_out_the_scans_to_which_the_noise_is_adapted(make_rows):
+    """Of a long log; a short one has no others."""
+    rows = [
+        dataclasses.replace(r, nis=0.5 if k < 30 else 6.0)
+        for k, r in enumerate(make_rows(60, blackout=range(0)))
+    ]
+    assert Summary.fold(rows).nis.inside == 1.0
+    assert Summary.fold(rows[:35]).nis.count == 25  # since convergence
+
+
 def test_counts_are_passed_on(make_rows):
     counts = {"messages lost": 2}
     assert Summary.fold(make_rows(2), counts=counts).counts == counts

@@ -428,3 +428,11 @@ def test_what_the_poses_show_of_the_motion_is_said(make_rows):
     assert "both explain" not in texts(free)
     fast = [replaced(r, alias_slow_radps=5.57, alias_fast_radps=7.0) for r in free]
     assert "rates of 5.57 and 7 rad/s both explain the poses" in texts(fast)
+
+
+def test_a_noise_that_was_assumed_too_large_is_no_reason(make_rows):
+    """The innovations are then small; those that are large are one."""
+    for nis, said in ((0.5, False), (25.0, True)):
+        rows = [dataclasses.replace(r, nis=nis) for r in make_rows(80, blackout=range(0))]
+        reasons = verdict_of(rows, Summary.fold(rows)).reasons
+        assert any("NIS" in reason.text for reason in reasons) == said

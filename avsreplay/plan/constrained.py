@@ -467,13 +467,14 @@ class _Search:
 
     def done(self, settled: bool, enough_s: float) -> bool:
         """Return whether the best path is the latest one and moves no more, or is safe and not
-        later than ``enough_s``, or has not become better in ``IDLE`` iterations.
+        later than ``enough_s``, or has not become better in ``IDLE`` iterations, after which only
+        a search that no later one renews goes on to make it safe.
         """
         if self.best is None:
             return False
         if self.best.short_m <= 0.0 and self.best.t_go_s <= enough_s:
             return True
-        idle = self.idle >= IDLE and self.best.short_m <= 0.0
+        idle = self.idle >= IDLE and (self.best.short_m <= 0.0 or math.isfinite(enough_s))
         return idle or (settled and self.idle == 0)
 
     def tighten(self, over: Array, buffer_m: float, near: bool) -> None:

@@ -222,86 +222,90 @@ def grade(
         return replace(
             failed, message="returned its guess unchanged, although the residuals require a step"
         )
+    pose = Determined(fit.T_ca, found.total / found.noise_m**2)
     if found.observable:
-        measured = _determined(found, fit.T_ca, index.extent_m)
+        pose = _determined(found, fit.T_ca, index.extent_m)
     elif found.overlap:
-        kept = guess if fit.converged else None
-        measured = _degenerate(
-            index, visibility, points, fit.T_ca, kept, found, limits.gate_m, systematic
-        )
-    else:
-        measured = _Measured(fit.T_ca, found.total / found.noise_m**2)
-    return _alignment(found, fit, measured, systematic)
+        view = _seen(index, visibility, points, limits.gate_m, found)
+        pose = view.pose(fit, guess if fit.converged else None, systematic)
+    return _alignment(found, fit, pose, systematic)
 
 
 @value_class
-class _Measured:
-    """What a scan says of the pose.
-
-    Attributes:
-        T_ca: the pose.
-        info: (6, 6) information.
-        P: (6, 6) covariance, None where not every motion is determined.
-        weakest: words for the directions that are not determined.
-        free: (6, k) these motions, None without them.
+class Determined:
+    """A pose T_ca, its information and covariance, and the motions that are not determined, in
+    words and as columns d (6, k).
     """
 
     T_ca: Pose
     info: Array
-    P: Array | None = None
-    weakest: tuple[str, ...] = ()
+    covariance: Array | None = None
+    words: tuple[str, ...] = ()
     free: Array | None = None
 
 
-def _determined(found: PoseQuality, T_ca: Pose, extent_m: float) -> _Measured:
-    """The pose without its bias, and its covariance, where every motion is observable."""
+def _determined(found: PoseQuality, T_ca: Pose, extent_m: float) -> Determined:
+    """A pose whose directions are all observed, without the bias that noise causes."""
     b = found.bias
     uncertain = UNCERTAIN_BIAS**2 * np.outer(b, b) + found.chance
     P = found.covariance + uncertain + np.outer(found.left, found.left)
     if not found.bounded:
-        weakest, free = unbounded_directions(P, extent_m)
-        if weakest:
-            return _Measured(T_ca, pseudo_inverse(P), None, weakest, free)
+        words, free = unbounded_directions(P, extent_m)
+        if words:
+            return Determined(T_ca, pseudo_inverse(P), None, words, free)
     if b.any():
         T_ca = Pose(geometry.exp(b[:3]), b[3:]).inverse() @ T_ca
-    return _Measured(T_ca, found.total / found.noise_m**2, P)
+    return Determined(T_ca, found.total / found.noise_m**2, P)
 
 
-def _degenerate(
+@value_class
+class _Seen:
+    """A view that does not determine a pose."""
+
+    index: SurfaceIndex
+    visibility: Visibility
+    points: NDArray[Any]
+    gate_m: float
+    found: PoseQuality
+    used: Evidence
+    view: Directions
+
+    def pose(self, fit: Fit, guess: Pose | None, systematic: bool) -> Determined:
+        """Return the pose with its unobservable directions as in the guess T_ca, if the surface
+        then fits as well; passes over a curved surface drift along them.
+        """
+        info = _observable_information(self.view, self.used, self.index.extent_m, systematic)
+        T_ca = fit.T_ca if guess is None else self._kept(fit.T_ca, guess)
+        return Determined(T_ca, info, None, self.view.words, self.view.motions)
+
+    def _kept(self, T_ca: Pose, guess: Pose) -> Pose:
+        kept = self.view.nearest(T_ca, guess)
+        facing = self.visibility.camera_c(self.index, self.points, kept) is not None
+        at = self.index.normal_equations(self.points, kept, self.gate_m, facing=facing)
+        many = at.inliers >= AS_MANY * self.found.inliers
+        near = at.sum_d2 <= (AS_NEAR * self.found.rms_m) ** 2 * at.inliers
+        # corrects the observable directions
+        return self.view.refined(kept, at.info, at.gradient) if many and near else T_ca
+
+
+def _seen(
     index: SurfaceIndex,
     visibility: Visibility,
     points: NDArray[Any],
-    T_ca: Pose,
-    guess: Pose | None,
-    found: PoseQuality,
     gate_m: float,
-    systematic: bool,
-) -> _Measured:
-    """The pose of a view that does not determine every motion.
-
-    Passes over a curved surface drift along the unobservable directions. Where the surface fits as
-    well with these as in the ``guess``, they are kept, and the observable ones are corrected.
-    """
+    found: PoseQuality,
+) -> _Seen:
     used = Evidence(
         found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
     )
-    view = _directions(used)
-    info = _observable_information(view, used, index.extent_m, systematic)
-    if guess is not None:
-        kept = view.nearest(T_ca, guess)
-        facing = visibility.camera_c(index, points, kept) is not None
-        at = index.normal_equations(points, kept, gate_m, facing=facing)
-        as_near = at.sum_d2 <= (AS_NEAR * found.rms_m) ** 2 * at.inliers
-        if as_near and at.inliers >= AS_MANY * found.inliers:
-            T_ca = view.refined(kept, at.info, at.gradient)
-    return _Measured(T_ca, info, None, view.words, view.motions)
+    return _Seen(index, visibility, points, gate_m, found, used, _directions(used))
 
 
-def _alignment(found: PoseQuality, fit: Fit, pose: _Measured, systematic: bool) -> Alignment:
-    """The alignment of a graded pose."""
-    determined = pose.P is not None
-    settled = not determined or not found.beyond
-    sized = determined and systematic
+def _alignment(found: PoseQuality, fit: Fit, pose: Determined, systematic: bool) -> Alignment:
+    """The alignment of a pose with its quality."""
+    P = pose.covariance
+    settled = P is None or not found.beyond
+    sized = P is not None and systematic
     fitted = sized and settled and _other_size(found)
     converged = fit.converged and settled
     return Alignment(
@@ -312,13 +316,13 @@ def _alignment(found: PoseQuality, fit: Fit, pose: _Measured, systematic: bool) 
         inliers=found.inliers,
         rms_m=found.rms_m,
         info=frozen(pose.info),
-        status=_status(found.overlap, converged, bool(pose.weakest)),
-        covariance=None if pose.P is None else frozen(pose.P),
-        free_directions=", ".join(pose.weakest),
+        status=_status(found.overlap, converged, bool(pose.words)),
+        covariance=None if P is None else frozen(P),
+        free_directions=", ".join(pose.words),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
         message=_message(settled, found.size_1s if sized and not fitted else 0.0),
-        dof=found.dof if determined else np.inf,
-        free=pose.free if pose.weakest else None,
+        dof=np.inf if P is None else found.dof,
+        free=pose.free if pose.words else None,
         well_off=found.well_off,
         size_1s=found.size_1s if fitted else None,
         systematic=frozen(found.systematic) if sized else None,

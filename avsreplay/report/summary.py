@@ -40,6 +40,8 @@ BLOCK_BANDS = {
     3: (0.2158, 9.3484),
 }  # the same points with 2 and 3 degrees of freedom
 NEES_BAND = (9.5908, 34.1696)  # the same points with 20 degrees of freedom
+_ADAPTED = 30  # used scans to which the noise is adapted (default of estimator.window)
+_LEAST_LATER = 20  # used scans after them of whose innovations shares are stated
 _BY_STATE = (
     "pos_err_m",
     "rot_err_deg",
@@ -242,8 +244,10 @@ def _figures(taken: Columns) -> dict[str, Array]:
     for name in (*_BY_STATE, *_OF_ALL):
         column = taken.numbers(name)
         known = np.isfinite(column)
-        if name == "nis" or name in _OF_ALL:
+        if name in _OF_ALL:
             known = known & claimed
+        if name == "nis":
+            known = _adapted(known & claimed, healthy)
         if name in _BY_STATE:
             out[f"{name}/healthy"], out[f"{name}/coasting"] = (
                 column[known & healthy],
@@ -254,10 +258,20 @@ def _figures(taken: Columns) -> dict[str, Array]:
     return out
 
 
+def _adapted(known: NDArray[np.bool_], healthy: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The scans after those to which the noise of the poses is adapted first, where enough
+    remain.
+
+    Before, the innovations show how good the noise was that was assumed, and not the estimate.
+    """
+    later = known & (np.cumsum(healthy) > _ADAPTED)
+    return later if np.count_nonzero(later & healthy) >= _LEAST_LATER else known
+
+
 def _since_convergence(converged: Sequence[bool]) -> NDArray[np.bool_]:
     """The scans from convergence on, all of them without it.
 
-    The noise of the poses is adapted by then, and no plan relies on the covariance before.
+    No plan relies on the covariance before.
     """
     flags = np.array(converged, dtype=bool)
     return np.logical_or.accumulate(flags) if flags.any() else np.ones(len(flags), dtype=bool)
