@@ -1,8 +1,9 @@
 """The result directory of a run: written scan by scan, complete or not at all; beliefs are read
 back here.
 
-``rows.jsonl``, ``estimate.tum``, ``registration.tum``, ``truth.tum``, ``beliefs.npz``, ``view.npz``
-and ``result.mcap`` depend on the input alone, byte for byte; ``run.json`` also names the versions.
+``rows.jsonl``, ``estimate.tum``, ``smoothed.tum``, ``registration.tum``, ``truth.tum``,
+``beliefs.npz``, ``view.npz`` and ``result.mcap`` depend on the input alone, byte for byte;
+``run.json`` also names the versions.
 An interrupted run also leaves its checkpoint, ``resume.npz``.
 """
 
@@ -52,6 +53,7 @@ OWN = frozenset(
         "estimate.tum",
         "registration.tum",
         "truth.tum",
+        "smoothed.tum",
         "beliefs.npz",
         "view.npz",
         "run.json",
@@ -434,6 +436,13 @@ class ResultWriter:
         """
         self._log.close()
         self._directory.write(self._run.taken, self._beliefs)
+        if (motion := self._run.smoothed()) is not None:
+            poses = (
+                (t_ns, motion.at(t_ns).T_ac)
+                for t_ns in column_of(self._run.taken, "t_ns")
+                if motion.epoch_ns <= t_ns <= motion.end_ns
+            )
+            write_tum(self._directory.file("smoothed.tum"), poses)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
         if resumable:

@@ -20,8 +20,6 @@ from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.grasp_point import at_grasp
-from avsreplay.estimate.initialise import PoseFix
-from avsreplay.estimate.reference import Reference
 from avsreplay.geometry import Pose
 from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
 from avsreplay.log.streams import ahead
@@ -36,7 +34,7 @@ from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.registrar import Registrar
 from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
-from avsreplay.score import HealthyPoses, Scorer, matched_truth, pose_error, reference_motion
+from avsreplay.score import HealthyPoses, Reference, Scorer, matched_truth, pose_error
 from avsreplay.tables import RowTable
 from avsreplay.toml_document import own_settings
 
@@ -158,7 +156,9 @@ class Run:
         self._labels = header.labels if labelled else None
         self.taken = RowTable()
         self._reference: Reference | None = None
-        self._fixes: list[PoseFix] = []  # poses of the reference motion
+        self._healthy = HealthyPoses(self.estimator)
+        self._fitted = HealthyPoses(self.estimator)  # poses of the reference motion
+        self._smoothed: tuple[int, Reference | None] | None = None
         self._reference_instants: list[int] = []
         self._state, self.done = first_state(self._stages), 0
         self._scored: Scorer | None = None
@@ -208,7 +208,7 @@ class Run:
             poses.add(state, outcome)
             if outcome.scan.status is not ScanStatus.CLOCK:
                 instants.add(outcome.scan.t_ns)
-        self._reference, self._fixes = poses.reference(), poses.fixes
+        self._reference, self._fitted = poses.reference(), poses
         self._reference_instants = sorted(instants)
         return self._reference
 
@@ -250,6 +250,7 @@ class Run:
         """
         if self._image is None and outcome.verdict.gamma:
             self._follow(outcome)
+        self._healthy.add(state, outcome)
         assert self._scored is not None
         truth = self._truth_of(outcome.scan)
         if self.job.growing:
@@ -272,6 +273,17 @@ class Run:
         self._state, self.done = state, self.done + 1
         return row
 
+    def smoothed(self) -> Reference | None:
+        """The best motion of all scans so far and its events; None with fewer than four healthy
+        poses. It is computed once.
+        """
+        if self._smoothed is None or self._smoothed[0] != self.done:
+            try:
+                self._smoothed = self.done, self._healthy.reference()
+            except UsageError:
+                self._smoothed = self.done, None
+        return self._smoothed[1]
+
     def rescore(self) -> list[int]:
         """Score the plans of a log that grew with all its true poses; replace the rows that change
         and return their indices.
@@ -289,7 +301,8 @@ class Run:
             *(self._scored, self.flight),
         )
         motion = None if self._scored is None else self._scored.motion
-        return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
+        poses = *self._fitted.store.arrays(), *self._healthy.store.arrays()
+        return pack((*own, *poses, self._reference_instants, more), self._named(motion))
 
     def restore(self, path: Path, rows: RowTable, more: Any = None) -> Any:
         """Continue from a checkpoint; returns what was stored with it.
@@ -305,15 +318,18 @@ class Run:
         scored = self._scorer()
         motion, scored.motion = scored.motion, None  # it is named and not stored
         judged = self.model_check, None, None, scored, self.flight
-        like: Any = (self._state, 0, *judged, [], [], more)
+        empty = (*self._fitted.store.arrays(), *self._healthy.store.arrays())
+        like: Any = (self._state, 0, *judged, *empty, [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self.model_check, self._end, *rest = found
         self.taken = rows
         self._image, self._scored, self.flight, *rest = rest
-        self._fixes, self._reference_instants, stored = rest
-        if self._fixes:
-            self._reference = reference_motion(self._fixes, self.estimator)
-        self._scored.motion = self._scorer().motion if self._fixes else motion
+        *arrays, self._reference_instants, stored = rest
+        self._fitted.store.extend(*arrays[:2])
+        self._healthy.store.extend(*arrays[2:])
+        if len(self._fitted.store):
+            self._reference = self._fitted.reference()
+        self._scored.motion = self._scorer().motion if self._reference else motion
         return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:

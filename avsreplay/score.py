@@ -7,16 +7,16 @@ The reference is the truth in the log, or a motion fitted to all healthy poses o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate.chart import nearest_permutation, nees_by_block
-from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.events.smoothing import PoseStore, Smoothed, smoothed
 from avsreplay.estimate.plugged import AnyEstimator
-from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
+from avsreplay.estimate.reference import healthy_pose
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
 from avsreplay.pipeline import PipelineState, planned_segment
@@ -152,6 +152,22 @@ class Scorer:
         return CaptureError(found.distance_m, found.speed_mps, found.angle_deg)
 
 
+@value_class
+class Reference:
+    """The motion that is fitted to all healthy poses of a log, in {A}.
+
+    Attributes:
+        smoothed: it, in the coordinates of the estimator.
+        epoch_ns, end_ns: instants of the first and the last pose.
+        at: instant [ns] between these -> state.
+    """
+
+    smoothed: Smoothed
+    epoch_ns: int
+    end_ns: int
+    at: Callable[[int], State]
+
+
 class HealthyPoses:
     """Collects the healthy poses of a run, for a fit to all of them."""
 
@@ -161,7 +177,7 @@ class HealthyPoses:
         Args:
             estimator: that of the run.
         """
-        self._estimator, self.fixes = estimator, list[PoseFix]()
+        self._estimator, self.store = estimator, PoseStore()
 
     def add(self, state: PipelineState, outcome: Outcome) -> None:
         """Take the outcome of one scan; a pose that is not healthy is ignored.
@@ -173,22 +189,14 @@ class HealthyPoses:
         if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
             t_ns, T_ac = outcome.scan.t_ns, state.last_pose
             T_ac = self._estimator.frame.pose_into(T_ac, t_ns)
-            self.fixes.append(healthy_pose(state.track, t_ns, T_ac, self._estimator.params))
+            self.store.append(healthy_pose(state.track, t_ns, T_ac, self._estimator.params))
 
     def reference(self) -> Reference:
         """Fit one motion to all of them. Raises UsageError where they are too few."""
-        return reference_motion(self.fixes, self._estimator)
-
-
-def reference_motion(fixes: Sequence[PoseFix], estimator: AnyEstimator) -> Reference:
-    """Return one motion fitted to healthy poses, in {A}. Raises UsageError where they are too few.
-
-    Args:
-        fixes: healthy poses as the estimator keeps them.
-        estimator: that of the run.
-    """
-    found = reference_of(fixes, estimator.params)
-    return replace(found, at=lambda t_ns: estimator.frame.state_out(found.at(t_ns), t_ns))
+        frame, found = self._estimator.frame, smoothed(self.store.fixes(), self._estimator.params)
+        return Reference(
+            found, found.epoch_ns, found.end_ns, lambda t_ns: frame.state_out(found.at(t_ns), t_ns)
+        )
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:

@@ -6,7 +6,7 @@ import filecmp
 
 import pytest
 
-POSES = ("estimate.tum", "registration.tum", "truth.tum")
+POSES = ("estimate.tum", "registration.tum", "smoothed.tum", "truth.tum")
 RESULTS = ("rows.jsonl", *POSES, "beliefs.npz", "result.mcap", "view.npz", "run.json")
 ELSEWHERE = {
     "PYTHONHASHSEED": "77",

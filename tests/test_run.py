@@ -38,6 +38,7 @@ def test_result_directory_holds_every_documented_file(result):
         "estimate.tum",
         "registration.tum",
         "truth.tum",
+        "smoothed.tum",
         "beliefs.npz",
     } <= names
     rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
@@ -45,6 +46,11 @@ def test_result_directory_holds_every_documented_file(result):
     estimate = np.loadtxt(out / "estimate.tum")
     truth = np.loadtxt(out / "truth.tum")
     assert estimate.shape == truth.shape == (len(rows), 8)
+    smoothed = np.loadtxt(out / "smoothed.tum")
+    after = np.searchsorted(truth[:, 0], smoothed[:, 0])
+    np.testing.assert_array_equal(truth[after, 0], smoothed[:, 0])
+    away = np.linalg.norm(smoothed[:, 1:4] - truth[after, 1:4], axis=1)
+    assert np.sqrt(np.mean(away**2)) < 0.01
     healthy = [r["gamma"] == 1 for r in rows]
     distance = np.linalg.norm(estimate[:, 1:4] - truth[:, 1:4], axis=1)
     np.testing.assert_allclose(distance, [r["pos_err_m"] for r in rows], atol=1e-12)

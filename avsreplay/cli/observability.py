@@ -16,12 +16,12 @@ from avsreplay.errors import counted
 
 if TYPE_CHECKING:
     from avsreplay.estimate.initialise import PoseFix
-    from avsreplay.estimate.reference import Reference
     from avsreplay.geometry import Array
     from avsreplay.monitor.gramian import Gramian
     from avsreplay.records import Belief, State
     from avsreplay.rows import Row
     from avsreplay.run import ReplayedScan, Run
+    from avsreplay.score import Reference
 
 WIDTH = 100
 HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
@@ -117,7 +117,9 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     start = run.estimator.frame.state_into(
         _in_axes_of(beliefs[inside[-1].t_ns], reference), reference.epoch_ns
     )
-    lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
+    lines, ends = _summed(
+        inside, start, {fix.scan_ns: fix for fix in poses.store.fixes()}, scales[0]
+    )
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF
     from avsreplay.monitor.gramian import unobserved

@@ -336,6 +336,9 @@ class Outdated(Exception):
     """A log that has grown gives other rows than before; it is replayed again."""
 
 
+_SAME_EVENT_S = 2.0  # between the time of a manoeuvre in the rows and by all poses
+
+
 @value_class(eq=True)
 class _Finished:
     """Result of a replay; ``record`` is the content of ``run.json``."""
@@ -385,6 +388,7 @@ def _replayed(
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
+            record["smoothed"] = _smoothed_record(run, summary)
             keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
@@ -543,6 +547,25 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
         "capture": None if summary.assessment is None else summary.assessment.record(),
         "measured_1s": None if run.flight.noise is None else list(run.flight.noise),
     }
+
+
+def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
+    """The events of the whole log, with the time at which each was first known from the scans so
+    far; None where too few poses are healthy.
+    """
+    motion = run.smoothed()
+    if motion is None:
+        return None
+    record = motion.smoothed.record(run.taken[0].t_ns)
+    for event in record["events"]:
+        away = 3.0 * event["onset_1s_s"] + _SAME_EVENT_S
+        near = (
+            change.reported_s
+            for change in summary.velocity_changes
+            if abs(change.t_s - event["onset_s"]) <= away
+        )
+        event["first_known_s"] = min(near, default=None)
+    return record
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

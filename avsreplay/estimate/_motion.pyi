@@ -88,6 +88,20 @@ def state(chart: Array) -> Array: ...
 def errors(chart: Array) -> Array: ...
 def body(chart: Array, P: Array, largest: float) -> Array: ...
 def transition(chart: Array, h: float, path: Array) -> tuple[Array, Array]: ...
+def chains(
+    charts: Array, steps: Array, counts: NDArray[np.int64], paths: Array
+) -> tuple[Array, Array]: ...
+def passes(
+    F: Array,
+    b: Array,
+    Q: Array,
+    z: Array,
+    H: Array,
+    R: Array,
+    used: NDArray[np.bool_],
+    m0: Array,
+    P0: Array,
+) -> tuple[float, Array, Array, Array, Array, Array, Array]: ...
 def carry(
     charts: Array,
     references: Array,

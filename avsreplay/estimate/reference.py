@@ -66,25 +66,15 @@ def reference_fit(
     settings = (params or EstimatorParams()).resolved(extent_m)
     given = covariances or [r0_covariance(settings)] * len(poses)
     orbit = RelativeOrbit.of(settings, t_ns[0]) if len(t_ns) else None
-    fixes = [
+    fixes = tuple(
         PoseFix(t, pose, C, orbit=orbit) for t, pose, C in zip(t_ns, poses, given, strict=True)
-    ]
-    return reference_of(fixes, settings)
-
-
-def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference:
-    """Fit all poses of a log, in time order; ``params`` with auto values filled in.
-
-    Raises:
-        UsageError: fewer than four poses.
-    """
-    if len(poses) < _FEWEST:
+    )
+    if len(fixes) < _FEWEST:
         hint = "a reference needs four healthy poses at least"
         raise UsageError(
-            f"only {len(poses)} poses to fit a reference to", where="--reference fit", hint=hint
+            f"only {len(fixes)} poses to fit a reference to", where="--reference fit", hint=hint
         )
-    fixes = tuple(poses)
-    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), params)
+    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), settings)
     first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
     arc = None if fixes[0].orbit is None else fixes[0].orbit.at(first_ns)
     return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns, arc))

@@ -28,6 +28,7 @@ from avsreplay.report.flown import flight_facts
 from avsreplay.report.gate import RuleOutcome, gate_table
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import (
+    event_table,
     fact_lines,
     in_one_line,
     moments_table,
@@ -204,7 +205,7 @@ def build_page(
     if picture is not None:
         parts += [Section("Approach"), render("approach.svg", **picture)]
     parts += [
-        Folded("Faults and manoeuvres", parts=(faults, manoeuvres)),
+        Folded("Faults and manoeuvres", parts=(event_table(header), faults, manoeuvres)),
         Folded("Reasons and settings", parts=(verdict_table(verdict),)),
         Folded(
             "Errors, parameters and consistency",

@@ -8,6 +8,7 @@ import math
 import textwrap
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -277,6 +278,32 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
         for e in summary.faults.episodes
     )
     return Table("Injected faults", heads, lines, align="lrrrlr", wide=True)
+
+
+def event_table(header: Mapping[str, Any] | None) -> Table:
+    """Events of the whole log by the smoothing pass; no rows without it."""
+    heads = ("t\n[s]", "1 sigma\n[s]", "event", "log odds", "first known\n[s]")
+    record = (header or {}).get("smoothed")
+    found = record.get("events") if isinstance(record, dict) else None
+    lines = tuple(
+        (*(_figure(each.get(name), places) for name, places in _TIMES), *_told(each))
+        for each in (found if isinstance(found, list) else ())
+        if isinstance(each, dict)
+    )
+    return Table("Events by all poses of the log", heads, lines)
+
+
+_TIMES = (("onset_s", 2), ("onset_1s_s", 2))
+
+
+def _told(event: Mapping[str, Any]) -> tuple[str, str, str]:
+    known = _figure(event.get("first_known_s"), 1)
+    return str(event.get("words", "")), _figure(event.get("log_odds"), 1), known
+
+
+def _figure(value: Any, places: int) -> str:
+    """A number of a file; a dash where there is none."""
+    return f"{value:.{places}f}" if isinstance(value, (int, float)) else "-"
 
 
 def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:

@@ -11,6 +11,7 @@
 #include "covariance.hpp"
 #include "evidence.hpp"
 #include "innovation.hpp"
+#include "shocks.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -558,6 +559,56 @@ nb::tuple transition_of(const Flat& from, double h, const Matrix<6, 6>& path) {
   return nb::make_tuple(flat(c), made(F));
 }
 
+// Charts after `counts` equal steps from each of n charts, with the transition of each step; all steps in one list.
+nb::tuple chains(const Matrix<-1, CHART>& from, const Times& steps, const nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>& counts,
+                 const Matrix<-1, 6, 6>& paths) {
+  const size_t n = from.shape(0);
+  size_t total = 0;
+  if (steps.shape(0) != n || counts.shape(0) != n) throw std::invalid_argument("charts, steps and counts must be equally many");
+  for (size_t k = 0; k < n; ++k) total += (size_t)counts(k);
+  if (paths.shape(0) != total) throw std::invalid_argument("there must be one path for each step");
+  double *nodes, *F;
+  Numpy nodes_ = array({total, CHART}, &nodes), F_ = array({total, DIM, DIM}, &F);
+  {
+    nb::gil_scoped_release free;
+    size_t at = 0;
+    for (size_t k = 0; k < n; ++k) {
+      Chart c;
+      std::memcpy(&c, from.data() + k * CHART, sizeof c);
+      for (int64_t i = 0; i < counts(k); ++i, ++at) {
+        transition(c, steps(k), *reinterpret_cast<const double(*)[6][6]>(paths.data() + at * 36), nullptr, 0,
+                   *reinterpret_cast<double(*)[DIM][DIM]>(F + at * DIM * DIM), nullptr);
+        std::memcpy(nodes + at * CHART, &c, sizeof c);
+      }
+    }
+  }
+  return nb::make_tuple(nodes_, F_);
+}
+
+// The passes over a linear model in time; without `back` the likelihood and what is before each measurement only.
+nb::tuple passes(const Matrix<-1, -1, -1>& F, const Matrix<-1, -1>& b, const Matrix<-1, -1, -1>& Q, const Matrix<-1, 6>& z,
+                 const Matrix<-1, 6, -1>& H, const Matrix<-1, 6, 6>& R,
+                 const nb::ndarray<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>& used, const Times& m0, const Matrix<-1, -1>& P0) {
+  const size_t count = b.shape(0), n = b.shape(1);
+  for (const auto* each : {&F, &Q})
+    if (each->shape(0) != count || each->shape(1) != n || each->shape(2) != n) throw std::invalid_argument("a model in time has matrices (k, n, n)");
+  if (z.shape(0) != count || H.shape(0) != count || H.shape(2) != n || R.shape(0) != count || used.shape(0) != count || m0.shape(0) != n ||
+      P0.shape(0) != n || P0.shape(1) != n)
+    throw std::invalid_argument("the arrays of a model in time differ in length");
+  TimePasses out{};
+  Numpy mean = array({count, n}, &out.mean), covariance = array({count, n, n}, &out.covariance);
+  Numpy score = array({count, n}, &out.score), information = array({count, n, n}, &out.information);
+  Numpy error = array({count, SEEN}, &out.error), weight = array({count, SEEN, SEEN}, &out.weight);
+  std::fill(out.error, out.error + count * SEEN, 0.0);
+  std::fill(out.weight, out.weight + count * SEEN * SEEN, 0.0);
+  const TimeModel model{count, n, F.data(), b.data(), Q.data(), z.data(), H.data(), R.data(), m0.data(), P0.data(), used.data()};
+  {
+    nb::gil_scoped_release free;
+    pass_over(model, out);
+  }
+  return nb::make_tuple(out.likelihood, mean, covariance, score, information, error, weight);
+}
+
 // The poses (n) as they would be without an acceleration since an instant, or with it where `back`: turned and moved by
 // the difference of the two motions from a chart. `centre` is the centre of mass in free motion.
 nb::tuple without_drift(const Flat& from, const Vector<SEEN>& u, double onset, const Times& times, const Matrix<-1, 3>& centre,
@@ -788,6 +839,9 @@ NB_MODULE(_motion, m) {
   m.def("state", &state_at, nb::arg("chart"));
   m.def("errors", &errors, nb::arg("chart"));
   m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
+  m.def("chains", &chains, nb::arg("charts"), nb::arg("steps"), nb::arg("counts"), nb::arg("paths"));
+  m.def("passes", &passes, nb::arg("F"), nb::arg("b"), nb::arg("Q"), nb::arg("z"), nb::arg("H"), nb::arg("R"), nb::arg("used"),
+        nb::arg("m0"), nb::arg("P0"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
   m.def("carry", &carry_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));

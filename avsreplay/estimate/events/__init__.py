@@ -1,0 +1,1 @@
+"""One estimation problem over the poses of a log, whose events are variables."""
