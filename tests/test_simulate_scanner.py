@@ -49,7 +49,7 @@ def test_every_return_lies_on_the_mesh(engine):
     scan = scanner(replace(CLEAN, engine=engine))
     for t in (0.0, 3.3):
         returns = scan.cast(t)
-        R_ac, t_ac = scan._motion.poses([t])
+        R_ac, t_ac = scan.motion.poses([t])
         points_c = (returns.directions * returns.ranges[:, None] - t_ac) @ R_ac[0]
         assert len(points_c) > 200
         assert distance_to_mesh(points_c).max() < 1e-6
@@ -72,7 +72,7 @@ def test_nothing_stands_in_front_of_a_return():
     """Self-occlusion: between the camera and each return the exact caster finds no other face."""
     scan = scanner(replace(CLEAN, rays=(24, 24)))
     returns = scan.cast(0.0)
-    R_ac, t_ac = scan._motion.poses([0.0])
+    R_ac, t_ac = scan.motion.poses([0.0])
     origin, towards = (-t_ac @ R_ac[0]), returns.directions @ R_ac[0]
     located, ray, _ = MESH.ray.intersects_location(
         np.repeat(origin, len(towards), 0), towards, multiple_hits=True
@@ -165,10 +165,10 @@ def test_points_of_a_rolling_scan_put_back_by_their_own_pose_lie_on_the_mesh():
     params = replace(CLEAN, pattern=Pattern.RASTER, scan_s=1.0)
     scan = scanner(params)
     returns = scan.cast(2.0)
-    R_ac, t_ac = scan._motion.poses(2.0 + returns.times_s)
+    R_ac, t_ac = scan.motion.poses(2.0 + returns.times_s)
     points_c = np.einsum("nji,nj->ni", R_ac, returns.directions * returns.ranges[:, None] - t_ac)
     assert distance_to_mesh(points_c).max() < 1e-6
-    R_0, t_0 = scan._motion.poses([2.0])
+    R_0, t_0 = scan.motion.poses([2.0])
     as_one = (returns.directions * returns.ranges[:, None] - t_0) @ R_0[0]
     assert (
         distance_to_mesh(as_one).max() > 0.05
@@ -234,7 +234,7 @@ def test_a_small_target_is_scanned_as_well():
     motion = MotionParams(position_m=(0, 0, 0.3), rate_radps=(0.1, 0, 0))
     scan = scanner(params, motion, small)
     returns = scan.cast(0.0)
-    R_ac, t_ac = scan._motion.poses([0.0])
+    R_ac, t_ac = scan.motion.poses([0.0])
     back = (returns.directions * returns.ranges[:, None] - t_ac) @ R_ac[0]
     mesh = trimesh.Trimesh(small.vertices, small.faces, process=False)
     assert len(back) > 100

@@ -416,8 +416,8 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
 
 def _accepted(space: Space, found: Certificate) -> float:
     """The margin that is required: what the withdrawal from the start itself lacks is accepted."""
-    first = found.worst.t == found.worst.t.min()
-    return min(0.0, float(found.margins_m[first].min())) - space.resolution_m
+    first = float(found.margins_m[found.worst.t == found.worst.t.min()].min())
+    return 0.0 if first >= 0.0 else first - space.resolution_m
 
 
 def _withdrawal_rows(

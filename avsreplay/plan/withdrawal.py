@@ -183,14 +183,13 @@ class Space:
             limits: Resolved limits: clearance, corridor and sigmas.
             a_max: Acceleration that the robot has in every direction [m/s2].
             extent_m: Diagonal of the target's bounding box [m].
-            planned: Require of withdrawals what plans aim at: more than what is stated, by the
-                shortage that a plan may have.
+            planned: Require of withdrawals from the corridor what plans aim at: more than what is
+                stated.
         """
         self.sampled, self.a_max = sampled, a_max
         self.enough_m = ENOUGH_OF_EXTENT * extent_m
         self.resolution_m = RESOLUTION_OF_EXTENT * extent_m
-        kept = limits.kept_m + (self.resolution_m if planned else 0.0)
-        self.limits = replace(limits, clearance_m=kept or None)
+        self.limits = replace(limits, clearance_m=limits.kept_m or None)
         self.kept_share = PLANNED_SHARE if planned else KEPT_SHARE
         scene = sampled.scene
         self.centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c

@@ -180,6 +180,7 @@ class Index:
         self,
         points: NDArray[Any],
         T_ca: NDArray[np.float64],
+        *,
         gate_m: float,
         patch_m: float,
         least_patches: int,
@@ -207,7 +208,7 @@ class Index:
         quiet_m: float,
         threads: int = 1,
         matches: Matches | None = None,
-    ) -> tuple[Any, ...]: ...
+    ) -> dict[str, Any]: ...
     def distances(
         self,
         points: NDArray[Any],

@@ -102,7 +102,7 @@ class Loop:
         is better than the one before.
         """
         usual = generator.work(case)
-        if usual > case.work.left:
+        if usual and usual > case.work.left:
             case.work.exhausted = True
             case.current = replace(case.at, missing=generator.missing)
             return

@@ -173,31 +173,30 @@ class ModelCheck:
             scan: points in {A} [m]; points that are not finite are left out.
             found: its alignment; None, or a scan without points, is ignored.
         """
-        points = scan.points
-        if found is None or not len(points):
+        if found is None or not len(scan.points):
             return
-        if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
+        on_model = found.inlier_ratio >= LEAST_ON_MODEL
+        if found.measured and on_model:
             self._matched = True  # the scan is on the model, although the pose is not accepted
-        if found.status is AlignStatus.AMBIGUOUS:
-            self._ambiguous, self._several = (
-                self._ambiguous or found.free_directions,
-                self._several + 1,
-            )
-        elif found.status is not AlignStatus.ALIGNED and found.message != POSTPONED:
-            self._several -= 1
-        on_model = (
-            found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_ON_MODEL
-        )
-        if (found.status is AlignStatus.ALIGNED or on_model) and self._size_open:
+        aligned = found.status is AlignStatus.ALIGNED
+        unsettled = found.status is AlignStatus.NOT_CONVERGED and on_model
+        if (aligned or unsettled) and self._size_open:
             self._add_place(scan, found.T_ac)
-        if found.status is not AlignStatus.ALIGNED:
-            self._unmatched = self._unmatched or scan
+        if aligned:
+            self._add_aligned(scan, found)
             return
+        self._unmatched = self._unmatched or scan
+        if found.status is AlignStatus.AMBIGUOUS:
+            self._ambiguous = self._ambiguous or found.free_directions
+            self._several += 1
+        elif found.message != POSTPONED:
+            self._several -= 1
+
+    def _add_aligned(self, scan: Scan, found: Alignment) -> None:
         self._aligned += 1
         if found.covariance is not None and found.systematic is not None:
-            self._systematic += (
-                float(np.trace(np.linalg.solve(found.covariance, found.systematic))) / 6.0
-            )
+            share = float(np.trace(np.linalg.solve(found.covariance, found.systematic))) / 6.0
+            self._systematic += share
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
             self._measure(scan, found.T_ac)
         if scan.places is not None and self._durations.wanted():

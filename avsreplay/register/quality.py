@@ -31,7 +31,7 @@ from avsreplay.register.covariance import (
 from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
-from avsreplay.register.surface_index import Closest, SurfaceIndex
+from avsreplay.register.surface_index import Closest, GradeRule, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
 WELL_OFF, PART = (
@@ -185,33 +185,37 @@ def grade(
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
-    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``:
-    compare the poses from two halves of the scan. ``accuracy``: of the back end on an exact scan
-    [deg, share of the extent]. ``systematic``: the covariance includes errors that vary slowly over
-    the target. ``guess``: T_ca from which the back end began. A pose that equals this guess,
-    although the residuals require a step, is FAILED, unless it is one of least squared distances:
-    these do not move from where they end. The pose of a degenerate view has its
-    unobservable directions as in the guess, if the surface then fits as well. ``simulated``: the
-    pose is one of least squared distances. The bias that noise causes in it is taken from the pose,
-    and the mean that noise adds to the residuals from the covariance, see ``kernel/noise.hpp``. The
-    size is not fitted; if it should be (``Alignment.size_1s``), ``Decision.with_size`` fits it
-    for the pose that is returned in the end.
+    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. A pose that
+    equals its guess, although the residuals require a step, is FAILED, unless it is one of least
+    squared distances: these do not move from where they end. The pose of a degenerate view has its
+    unobservable directions as in the guess, if the surface then fits as well. The size is not
+    fitted; if it should be (``Alignment.size_1s``), ``Decision.with_size`` fits it for the pose
+    that is returned.
+
+    Args:
+        index: of the model.
+        visibility: where the camera may be.
+        points: (n, 3) in {A} [m].
+        fit: the pose of the back end.
+        limits: of the registration.
+        params: settings of the registration.
+        halves: compare the poses from two halves of the scan.
+        accuracy: of the back end on an exact scan [deg, share of the extent].
+        systematic: the covariance includes errors that vary slowly over the target.
+        guess: T_ca from which the back end began.
+        simulated: the pose is one of least squared distances. The bias that noise causes in it is
+            taken from the pose, and the mean that noise adds to the residuals from the covariance,
+            see ``kernel/noise.hpp``.
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    found = _grade(
-        index,
-        visibility,
-        points,
-        fit,
-        limits.gate_m,
-        params,
-        across,
-        accuracy,
-        systematic,
-        simulated,
-    )
+    rule = _rule(index, visibility, points, fit, limits.gate_m, params)
+    rule["across"], rule["systematic"] = np.ascontiguousarray(across), systematic
+    rule["turn_rad"] = float(np.radians(accuracy[0]))
+    rule["move_m"] = accuracy[1] * index.extent_m
+    rule["numbers"] = normal_numbers(NUMBERS) if simulated else np.empty(0)
+    found = PoseQuality(**index.grade(points, fit.T_ca, rule, fit.matches))
     step = found.overlap and found.statistic > UNCHANGED and not simulated
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
         failed = not_measured(len(points), AlignStatus.FAILED)
@@ -340,43 +344,43 @@ def _message(settled: bool, size_1s: float) -> str:
     return size_remark(None, size_1s)
 
 
-def _grade(
+def _rule(
     index: SurfaceIndex,
     visibility: Visibility,
     points: NDArray[Any],
     fit: Fit,
     gate_m: float,
     params: RegisterParams,
-    across: Array,
-    accuracy: tuple[float, float],
-    systematic: bool,
-    simulated: bool,
-) -> PoseQuality:
-    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the
-    test of halves.
-    """
+) -> GradeRule:
+    """The rule of a pose, without test of halves, systematic errors and simulated noise."""
     extent = index.extent_m
-    camera = (visibility.faced(index, points, fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
-    noise = (params.noise_m or 0.0, NOISE_FLOOR_OF_GATE * gate_m)
-    overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
-    step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
-    rule = (
-        min(gate_m, index.reach_m),
-        PATCH_OF_EXTENT * extent,
-        LEAST_PATCHES,
-        *camera,
-        *noise,
-        *overlap,
-        *step,
+    return GradeRule(
+        gate_m=min(gate_m, index.reach_m),
+        patch_m=PATCH_OF_EXTENT * extent,
+        least_patches=LEAST_PATCHES,
+        camera=visibility.faced(index, points, fit.T_ca),
+        tested=TESTED_POINTS,
+        least_facing=LEAST_FACING,
+        extent_m=extent,
+        noise_m=params.noise_m or 0.0,
+        noise_floor_m=NOISE_FLOOR_OF_GATE * gate_m,
+        least_inliers=float(params.min_inliers),
+        least_ratio=params.min_inlier_ratio,
+        least_information=FREE_BELOW,
+        systematic=False,
+        turn_rad=0.0,
+        move_m=0.0,
+        across=np.empty((0, 3)),
+        beyond_m=WELL_OFF * gate_m,
+        least_close=MANY_INLIERS,
+        part=PART,
+        numbers=np.empty(0),
+        many=SIMULATED,
+        least_share=SHARES[0],
+        most_share=SHARES[1],
+        small_share=SHARES[2],
+        quiet_m=SMALL_NOISE * extent,
     )
-    counted = (np.ascontiguousarray(across), WELL_OFF * gate_m, MANY_INLIERS, PART)
-    drawn = (
-        normal_numbers(NUMBERS) if simulated else np.empty(0),
-        SIMULATED,
-        *SHARES,
-        SMALL_NOISE * extent,
-    )
-    return PoseQuality(*index.grade(points, fit.T_ca, *rule, *counted, *drawn, 1, fit.matches))
 
 
 def _observable_information(

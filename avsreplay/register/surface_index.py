@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -189,6 +189,60 @@ class PatchSums:
     places: Array
 
 
+class GradeRule(TypedDict):
+    """How the kernel grades a pose.
+
+    Attributes:
+        gate_m: largest distance of an inlier [m].
+        patch_m, least_patches: as of ``SurfaceIndex.evidence``.
+        camera: whether the camera may be where the faces look.
+        tested, least_facing: points that tell it, and the share of them on faces towards it.
+        extent_m: size of the model [m].
+        noise_m, noise_floor_m: standard deviation of the residuals [m], 0: estimated; its least
+            value.
+        least_inliers, least_ratio: with fewer inliers there is no overlap.
+        least_information: scaled information below which a motion is not observable.
+        systematic: the covariance includes systematic errors.
+        turn_rad, move_m: accuracy of the back end.
+        across: (k, 3) directions in {C} of the test of halves.
+        beyond_m: distance from which a point is well off the model [m].
+        least_close: share of inliers below which all other points are counted.
+        part: points per which those well off are counted.
+        numbers: normal numbers of the simulated noise; empty: none is simulated.
+        many: points that are simulated, about.
+        least_share, most_share, small_share: one of so many points is simulated at least, at most,
+            and where the noise is below ``quiet_m``.
+        quiet_m: noise below which a part of the points decides whether the others are simulated
+            [m].
+    """
+
+    gate_m: float
+    patch_m: float
+    least_patches: int
+    camera: bool
+    tested: int
+    least_facing: float
+    extent_m: float
+    noise_m: float
+    noise_floor_m: float
+    least_inliers: float
+    least_ratio: float
+    least_information: float
+    systematic: bool
+    turn_rad: float
+    move_m: float
+    across: Array
+    beyond_m: float
+    least_close: float
+    part: int
+    numbers: Array
+    many: int
+    least_share: int
+    most_share: int
+    small_share: int
+    quiet_m: float
+
+
 @value_class
 class SurfaceIndex:
     """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by
@@ -354,11 +408,17 @@ class SurfaceIndex:
         rule = (min(gate_m, self.reach_m), patch_m, least_patches, facing, threads, matches)
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
-    def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
-        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in
-        ``kernel/grade.hpp``.
+    def grade(
+        self, points: NDArray[Any], T_ca: Pose, rule: GradeRule, matches: Any = None
+    ) -> dict[str, Any]:
+        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.PoseQuality``.
+
+        ``matches``: of an alignment of the same points.
         """
-        return tuple(self._index.grade(_points(points), T_ca.matrix, *rule))
+        found: dict[str, Any] = self._index.grade(
+            _points(points), T_ca.matrix, **rule, matches=matches
+        )
+        return found
 
     def distances(
         self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any

@@ -189,36 +189,43 @@ def load_result(path: str | Path) -> Result:
     if path.is_file() and path.suffix.lower() in LOG_SUFFIXES:
         hint = f"replay it first: avsreplay run {shlex.quote(str(path))} -o results/"
         raise UnreadableInput("is a log, not a result", where=str(path), hint=hint)
-    folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
-    if folder and not rows_path.is_file():
+    rows_path = path / "rows.jsonl" if path.is_dir() else path
+    if path.is_dir() and not rows_path.is_file():
         raise UnreadableInput(
             "holds no rows.jsonl",
             where=str(path),
             hint="name the directory that 'avsreplay run LOG -o DIR' writes",
         )
-    whole = folder or (
-        path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None
-    )
-    header, unverified = (
-        _header(whole / "run.json") if whole else {},
-        "it is a single file of rows without run.json",
-    )
+    beside = rows_path.parent
+    whole = path.is_dir() or (path.name == "rows.jsonl" and (beside / "run.json").is_file())
+    header, unverified = dict[str, Any](), "it is a single file of rows without run.json"
     if whole:
-        unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
+        header = _header(beside / "run.json")
+        unverified = _verify(beside, header, None if path.is_dir() else ("rows.jsonl",))
     with without_garbage_collection():
-        rows = read_rows(rows_path)
-        if not len(rows):
-            raise UnreadableInput("has no rows", where=str(rows_path), hint=_RUN_AGAIN)
-        if not unverified and len(rows) != header.get("rows"):
-            what = f"{len(rows)} rows, run.json states {header.get('rows')}"
-            raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
+        rows = _rows(rows_path, None if unverified else header.get("rows", 0))
         labels, truth, counts = _facts(header.get("facts") or {}, str(path))
         summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
         summary = replace(summary, assessment=_assessment(header, str(path)))
-    poses = read_tum(folder / "truth.tum") if folder and (folder / "truth.tum").is_file() else []
-    view = read_view(folder / "view.npz") if folder and (folder / "view.npz").is_file() else None
-    name = path.resolve().name if folder else path.name.removesuffix(".jsonl").removesuffix(".rows")
-    return Result(name, rows, summary, header, truth, poses, view, unverified, whole is not None)
+    if not path.is_dir():
+        name = path.name.removesuffix(".jsonl").removesuffix(".rows")
+        return Result(name, rows, summary, header, truth, [], None, unverified, whole)
+    truth_tum, view_npz = path / "truth.tum", path / "view.npz"
+    poses = read_tum(truth_tum) if truth_tum.is_file() else []
+    view = read_view(view_npz) if view_npz.is_file() else None
+    name = path.resolve().name
+    return Result(name, rows, summary, header, truth, poses, view, unverified, whole)
+
+
+def _rows(path: Path, stated: int | None) -> RowTable:
+    """Read rows, and compare their number with the stated one, None where none is stated."""
+    rows = read_rows(path)
+    if not len(rows):
+        raise UnreadableInput("has no rows", where=str(path), hint=_RUN_AGAIN)
+    if stated is not None and len(rows) != stated:
+        what = f"{len(rows)} rows, run.json states {stated}"
+        raise UnreadableInput(what, where=str(path), hint=_RUN_AGAIN)
+    return rows
 
 
 def _header(path: Path) -> dict[str, Any]:

@@ -89,6 +89,7 @@ class Scanner:
 
     Attributes:
         params: Its parameters.
+        motion: Of the target.
         centre_c: (3,) centre of the target's bounding sphere in {C} [m].
         radius_m: Its radius [m].
     """
@@ -103,7 +104,7 @@ class Scanner:
         camera: MovingCamera | None = None,
     ) -> None:
         self.params = p = params
-        self._motion, self._camera = motion, camera
+        self.motion, self._camera = motion, camera
         optics, owner = face_optics(surface, materials), appendage_faces(surface, appendages)
         rigid = np.flatnonzero(owner < 0)
         self._caster = RayCaster(part_of(surface, rigid), params.engine)
@@ -149,7 +150,7 @@ class Scanner:
             limbs: the sunlit Earth where it is present, with the generator of its false returns.
         """
         times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times
-        target = self._motion.poses(times)
+        target = self.motion.poses(times)
         poses = self._seen(target, times)
         near = self._may_hit(*poses)
         found = [self._traced(self._caster, self._optics, poses, rays, near) for rays in self._rays]

@@ -48,7 +48,7 @@ from avsreplay.monitor.convergence import (
     ConvergenceParams,
 )
 from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
-from avsreplay.pipeline import Monitors
+from avsreplay.pipeline import Monitors, PlannedTime
 from avsreplay.records import Alignment, Belief, ScanStatus
 from avsreplay.run import Job, Run
 
@@ -183,10 +183,13 @@ def run_ms(world: tumbling.World) -> np.ndarray:
             state,
             estimator,
             prediction,
+            alignment,
             innovation,
             int(finding.used),
             track,
             estimator.published(track),
+            PlannedTime(False, lambda: 30.0),
+            np.zeros(3),
         )
         spent.append((1e3 * (middle - begun), 1e3 * (time.process_time() - middle)))
     return np.array(spent)

@@ -131,7 +131,7 @@ def tests_of(path: Path, folder: Path) -> list[str]:
 
 
 def passes(tests: list[str], folder: Path, slow: bool) -> bool:
-    """Whether tests pass in a copy of the checkout; tests that do not end fail."""
+    """Whether tests pass with the copy of the package; tests that do not end fail."""
     chosen = () if slow else ("-m", "not slow")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *chosen]
     try:
@@ -150,7 +150,7 @@ def passes(tests: list[str], folder: Path, slow: bool) -> bool:
 
 def killed(mutant: Mutant, tests: list[str], folder: Path, slow: bool) -> bool:
     """Whether a test fails with the mutant."""
-    place = folder / mutant.path
+    place = site_of(folder) / mutant.path
     text = place.read_text(encoding="utf-8")
     tree = _Change(mutant.number).visit(ast.parse(text))
     place.write_text(ast.unparse(ast.fix_missing_locations(tree)) + "\n", encoding="utf-8")
@@ -174,15 +174,25 @@ def named(mutant: Mutant) -> str:
     return f"{mutant.path} [{text.strip()}] {mutant.number} {mutant.what}"
 
 
-def _copied(folder: Path) -> None:
-    """Copy the checkout with the compiled modules of the installed package. An editable install
-    would import the original; every interpreter that is started removes what does this.
+def site_of(folder: Path) -> Path:
+    """The folder beside a copy of the checkout from which its tests import the package: they do not
+    import that of the checkout.
     """
-    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "build", ".mypy_cache"))
+    return folder.parent / "site"
+
+
+def _copied(folder: Path) -> None:
+    """Copy the checkout, and the package with the compiled modules of the installed one. An
+    editable install would import the original; every interpreter that is started removes what does
+    this.
+    """
+    left_out = shutil.ignore_patterns(".git", "build", ".mypy_cache", "__pycache__")
+    shutil.copytree(ROOT, folder, ignore=left_out)
+    shutil.copytree(ROOT / "avsreplay", site_of(folder) / "avsreplay", ignore=left_out)
     for each in metadata.files("avsreplay") or ():
         if each.suffix == ".so":
-            shutil.copy(str(each.locate()), folder / each)
-    (folder.parent / "sitecustomize.py").write_text(
+            shutil.copy(str(each.locate()), site_of(folder) / each)
+    (site_of(folder) / "sitecustomize.py").write_text(
         "import sys\nsys.meta_path[:] = [each for each in sys.meta_path"
         " if not type(each).__module__.startswith('_editable')]\n",
         encoding="utf-8",
@@ -190,22 +200,20 @@ def _copied(folder: Path) -> None:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    path = os.pathsep.join(map(str, (folder, folder.parent)))
+    path = str(site_of(folder))
     return {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _is_imported(folder: Path) -> bool:
-    """Whether Python imports the package from there; an editable install has another place."""
-    code = "import avsreplay; print(avsreplay.__file__)"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder.parent,
-        env=_environment(folder),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.stdout.startswith(str(folder))
+    """Whether the tests import the copy of the package; an editable install has another place."""
+    test = folder / "tests" / "test_of_the_copy.py"
+    place = str(site_of(folder))
+    text = f"import avsreplay\ndef test_place(): assert avsreplay.__file__.startswith({place!r})\n"
+    test.write_text(text, encoding="utf-8")
+    try:
+        return passes([str(test)], folder, slow=True)
+    finally:
+        test.unlink()
 
 
 def main() -> int:

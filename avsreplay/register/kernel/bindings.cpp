@@ -240,7 +240,7 @@ class Index {
     return nb::tuple(nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre) + patches(PatchArrays(e.patches)));
   }
 
-  nb::tuple grade(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool camera, int64_t tested,
+  nb::dict grade(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool camera, int64_t tested,
                   double least_facing, double extent, double noise, double noise_floor, double least_inliers,
                   double least_ratio, double least_information, bool systematic, double turn, double move,
                   const Doubles& across, double beyond, double least_close, int64_t part,
@@ -268,9 +268,18 @@ class Index {
     std::copy(g.bias.begin(), g.bias.end(), c);
     auto left = array<double>({6}, &c);
     std::copy(g.left.begin(), g.left.end(), c);
-    return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
-                          g.observable, g.bounded, g.beyond, array66(g.covariance.P), array66(g.covariance.systematic), g.covariance.dof, g.split,
-                          g.size[0], g.size[1], g.well_off, bias, left, array66(g.chance), patches(g.patches));
+    nb::dict found;  // by the names of quality.PoseQuality
+    found["points"] = g.points, found["inliers"] = g.inliers, found["used"] = g.used;
+    found["rms_m"] = g.rms, found["noise_m"] = g.noise, found["centre"] = centre;
+    found["total"] = array66(g.total), found["statistic"] = g.statistic;
+    found["overlap"] = g.overlap, found["observable"] = g.observable;
+    found["bounded"] = g.bounded, found["beyond"] = g.beyond;
+    found["covariance"] = array66(g.covariance.P), found["systematic"] = array66(g.covariance.systematic);
+    found["dof"] = g.covariance.dof, found["split_nis"] = g.split;
+    found["size"] = g.size[0], found["size_1s"] = g.size[1];
+    found["well_off"] = g.well_off, found["bias"] = bias, found["left"] = left;
+    found["chance"] = array66(g.chance), found["patches"] = patches(g.patches);
+    return found;
   }
 
   nb::tuple distances(nb::handle points, const Doubles& T_ca, double most, bool known, int64_t tested, double least_facing) const {
@@ -702,7 +711,7 @@ NB_MODULE(_kernel, m) {
       .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
            nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1,
            nb::arg("matches").none() = nb::none())
-      .def("grade", &Index::grade, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
+      .def("grade", &Index::grade, nb::arg("points"), nb::arg("T_ca"), nb::kw_only(), nb::arg("gate_m"), nb::arg("patch_m"),
            nb::arg("least_patches"), nb::arg("camera"), nb::arg("tested"), nb::arg("least_facing"), nb::arg("extent_m"),
            nb::arg("noise_m"), nb::arg("noise_floor_m"), nb::arg("least_inliers"), nb::arg("least_ratio"),
            nb::arg("least_information"), nb::arg("systematic"), nb::arg("turn_rad"), nb::arg("move_m"), nb::arg("across"),
