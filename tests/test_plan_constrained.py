@@ -353,6 +353,12 @@ def test_a_withdrawal_from_any_instant_keeps_the_stated_margin(phase):
         assert np.linalg.norm(rest) >= 0.8 + 1.0 - 1e-6
 
 
+@pytest.mark.parametrize("order", [0, 1])
+def test_the_sampled_motion_at_no_instant_is_empty(order):
+    rho, R = SampledScene(body(0.0), 60.0, 0.2, 45.0).at(np.zeros(0), order)
+    assert (rho.shape, R.shape) == ((0, 3), (0, 3, 3))
+
+
 def test_a_coast_that_passes_the_body_is_bounded_from_below():
     """Straight past a ball at rest: the exact smallest distance, and a bound just below it."""
     scene = replace(body(0.0), surface=ball, hull_c=np.array([[0.0, 0.0, 0.0]]))

@@ -332,9 +332,9 @@ def _animate(answer: Answer, index: int, path: Path) -> str:
         )
     facts = plan_facts(planning, answer.at_s, made)
     title = f"{planning.saved.name}: flight planned at {answer.at_s:.2f} s"
-    page = build_flight_page(
-        title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts
-    )
+    named = dict(facts)
+    lines = [f"Capture {named['capture']}: {named['status']}.", f"Robot {planning.robot_line}"]
+    page = build_flight_page(title, lines, planning.flight(index, made), facts)
     with output_text(path) as stream:
         stream.write(page)
     return f"{path} ({len(page) / 1e6:.2f} MB)"

@@ -381,7 +381,7 @@ class SampledScene:
         """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,)
         [s].
         """
-        return _cone.motion(*self.pieces(float(times.max())), times, order)
+        return _cone.motion(*self.pieces(float(times.max(initial=0.0))), times, order)
 
     def pieces(self, last_s: float) -> tuple[Array, Array]:
         """Return coefficients (4, n, 12), highest power first, of the pieces of rho and R_ac, and

@@ -19,10 +19,12 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import trimesh
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from avsreplay import geometry
+from avsreplay.build import target_geometry
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import boxplus
@@ -31,12 +33,11 @@ from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Conver
 from avsreplay.pipeline import planner_input
 from avsreplay.plan.flights import closed_miss, miss, with_thrust_error
 from avsreplay.plan.guidance import Guidance
-from avsreplay.plan.limits import TargetGeometry
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Tolerance
-from avsreplay.records import Alignment, AlignStatus, Belief, State
+from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
 NOISE_M, NOISE_DEG = 0.003, 0.15
@@ -125,14 +126,9 @@ def geometry_of(x):
     """Axis along the arm, and the ball about the true centre of mass, in {C}."""
     centre = -geometry.matrix(x.q_bc).T @ x.c_b
     arm = float(np.linalg.norm(centre))
-
-    def closest(y):
-        q = y - centre
-        size = np.linalg.norm(q, axis=1)
-        return centre + q * (BALL * arm / size)[:, None], size - BALL * arm
-
-    hull = centre + BALL * arm * np.concatenate([np.eye(3), -np.eye(3)])
-    return TargetGeometry(-centre / arm, hull, closest)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=BALL * arm)
+    surface = Surface(centre + ball.vertices, np.asarray(ball.faces, np.int32), "ball", "")
+    return target_geometry(surface, -centre / arm)
 
 
 def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
