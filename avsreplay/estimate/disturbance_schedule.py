@@ -142,34 +142,46 @@ class DisturbanceSchedule:
         The value that is reported is that of the last fit to all poses: where inertia and torque
         explain each other, the filter's covariance becomes too small between fits.
         """
-        count, last, known = pose_count(track.fixes), track.batch, track.drift
-        if not self.batch.checked_poses or last is None or track.testing is not None:
+        if not self.batch.checked_poses or track.batch is None or track.testing is not None:
             return track
-        late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        # Disturbances that are too large shorten the fit to fewer poses than are needed to estimate
-        # them again.
-        fixes = (
-            track.fixes
-            if count >= FEWEST or not _overestimated(track)
-            else _all_poses(track).fixes[-FEWEST:]
-        )
-        if pose_count(fixes) >= FEWEST and known is None and late > (0 if track.since else _LATEST):
-            start = self._start(track, last, fixes[0].t_ns)
-            poses = fixes, last, start, self.params, track.levels, _positions(track, start)
-            if len(fixes) < FEWEST_TO_SPREAD:
-                return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
-            return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
+        fixes = self._for_levels(track)
+        if fixes:
+            return self._levels_begun(track, track.batch, fixes)
         if track.untested <= FEWEST_TO_TEST or track.since == 0:
             return track
+        return self._drift_begun(track, track.batch)
+
+    def _for_levels(self, track: Track) -> tuple[PoseFix, ...]:
+        """The poses with which the noise levels are tested, empty if no test is due.
+
+        Disturbances that are too large shorten the fit to fewer poses than are needed to estimate
+        them again.
+        """
+        count, fixes = pose_count(track.fixes), track.fixes
+        late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
+        if track.drift is not None or late <= (0 if track.since else _LATEST):
+            return ()
+        if count < FEWEST and _overestimated(track):
+            fixes = _all_poses(track).fixes[-FEWEST:]
+        return fixes if pose_count(fixes) >= FEWEST else ()
+
+    def _levels_begun(self, track: Track, last: BatchResult, fixes: tuple[PoseFix, ...]) -> Track:
+        """The track with a test of the noise levels, which few poses have at once."""
+        start = self._start(track, last, fixes[0].t_ns)
+        poses = fixes, last, start, self.params, track.levels, _positions(track, start)
+        if len(fixes) < FEWEST_TO_SPREAD:
+            return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
+        return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
+
+    def _drift_begun(self, track: Track, last: BatchResult) -> Track:
+        """The track with a test of a drift, if one is due."""
+        known = track.drift
         every = _all_poses(track) if known is None else track
         count, epoch_ns = pose_count(every.fixes), every.fixes[0].t_ns
-        early = known is None or track.belief.t_ns - epoch_ns < _EARLY * (
-            known.detected_ns - epoch_ns
-        )
-        if (
-            count < FEWEST_WITH_DRIFT
-            or track.untested <= (DRIFT_GROWTH if early else CHECK_GROWTH) * count
-        ):
+        age_ns = track.belief.t_ns - epoch_ns
+        early = known is None or age_ns < _EARLY * (known.detected_ns - epoch_ns)
+        growth = DRIFT_GROWTH if early else CHECK_GROWTH
+        if count < FEWEST_WITH_DRIFT or track.untested <= growth * count:
             return track
         begun = None
         if known is not None:
