@@ -110,7 +110,7 @@ class AnomalyTest:
     ) -> tuple[Track, Finding]:
         """The track after a measured scan, and what was found of its pose.
 
-        ``update`` applies an admitted scan to a track; a refused one only predicts.
+        ``update`` applies an admitted scan to a track; a rejected one only predicts.
         """
         if not self.enabled or admission is Admission.REFUSED:
             if admission is Admission.ADMITTED:

@@ -293,7 +293,7 @@ SCAN_RULES = (
         lambda scan: scan.status is ScanStatus.CLOCK,
     ),
 )
-"""The rules on a scan alone, of which the first that holds refuses it."""
+"""The rules on a scan alone, of which the first that holds rejects it."""
 
 JUMP = Rule(Reason.POSE_JUMP, "the innovation reaches its limit", _jumps, (Policy.ANY,))
 
@@ -325,7 +325,7 @@ MOTION_RULES = (
         lambda scan: True,  # noqa: ARG005
     ),
 )
-"""The rules on a scan that none of the others has refused, with what the estimate and the tracker
+"""The rules on a scan that none of the others has rejected, with what the estimate and the tracker
 have found; the last one holds always."""
 
 RULES = (*SCAN_RULES, *MOTION_RULES)
@@ -338,12 +338,12 @@ class Examined:
 
     Attributes:
         scan: what is known of it.
-        refused: the rule that refused it, or None.
+        rejected: the rule that rejected it, or None.
         admission: what the estimate may do with its pose.
     """
 
     scan: ScanEvidence
-    refused: Rule | None
+    rejected: Rule | None
     admission: Admission
 
 
@@ -376,12 +376,12 @@ class FaultDetector:
             repeated: the scan has the points, or the pose, of the one before.
         """
         scan = ScanEvidence(scan_status, alignment, innovation, prior, self.params, repeated)
-        refused = self._first(SCAN_RULES, scan)
+        rejected = self._first(SCAN_RULES, scan)
         admission = Admission.REFUSED
-        if refused is None:
+        if rejected is None:
             large = JUMP.applies(scan, self.params.policy)
             admission = Admission.LARGE if large else Admission.ADMITTED
-        return Examined(scan, refused, admission)
+        return Examined(scan, rejected, admission)
 
     def judge(self, examined: Examined, finding: Finding, followed: bool = False) -> Verdict:
         """Return gamma and the reason of the first rule that holds.
@@ -391,7 +391,7 @@ class FaultDetector:
             finding: of the estimate.
             followed: the target does not move freely, and the tracker confirms the pose.
         """
-        rule = examined.refused
+        rule = examined.rejected
         if rule is None:
             scan = replace(examined.scan, finding=finding, followed=followed)
             rule = self._first(MOTION_RULES, scan)

@@ -1,5 +1,5 @@
 """The decision on a registered pose: aligned, ambiguous with its members, degenerate with its
-directions, implausible by the term that speaks against it, or exhausted.
+directions, implausible by the term of the evidence that excludes it, or exhausted.
 """
 
 from __future__ import annotations

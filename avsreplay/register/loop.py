@@ -120,7 +120,7 @@ class Loop:
             self._examine(case)
 
     def _drawn(self, case: Case, generator: Generator) -> Iterator[Hypothesis]:
-        """The hypotheses of a generator, whose work is counted; a generator that asks for it ends
+        """The hypotheses of a generator, whose work is counted; a generator that requests it ends
         at the first that another one confirmed and its evidence accepts.
         """
         steps, found, refused = generator.hypotheses(case), list[Screened](), None

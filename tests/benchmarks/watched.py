@@ -18,6 +18,8 @@ from avsreplay.monitor.convergence import (
 )
 from avsreplay.records import State
 
+AHEAD_S = 10.0  # after a scan: the instant for which the error of the capture is predicted
+
 
 def fold(
     world: tumbling.World,
@@ -38,7 +40,7 @@ def fold(
         track = estimator.update(track, prediction, seen, 1, words[0].converged)
         seen_so_far = watch.observe(seen_so_far, seen, 1)
         honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
-        forecast = estimator.track_forecast(track, tests[0].params.times_s)
+        forecast = estimator.track_forecast(track, np.array([AHEAD_S]))
         words = [
             test.judge(word, track.belief, forecast, honest)
             for test, word in zip(tests, words, strict=True)
