@@ -26,6 +26,8 @@ _MOST_FREQUENCIES = 40
 _FINER = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # cycles in a log by which a frequency is improved
 _INSTANTS = 10  # over which the odds of a kind are divided that acts over the whole log
 _MOST_EVENTS = 8
+_CERTAIN = 6.0  # log odds from which an event is kept without a fit of the set without it
+_MARGIN = 3.0  # log odds that an event must add: fits end within about this of their maximum
 _START_ROUNDS, _ROUNDS = 25, 8
 _START_DENSITY = 0.1  # random torque of the start, by which the rate changes within a radian
 
@@ -87,8 +89,8 @@ def odds(problem: Problem, event: Event) -> float:
 
 
 def total(problem: Problem, fit: Fit) -> float:
-    """Log evidence of a set with the odds of its events."""
-    return fit.evidence + sum(odds(problem, e) for e in fit.events)
+    """Log evidence of a set with the odds of its events, each of which must add a margin."""
+    return fit.evidence + sum(odds(problem, e) - _MARGIN for e in fit.events)
 
 
 def candidates(problem: Problem, fit: Fit, found: Passed) -> Iterator[tuple[float, Event]]:
@@ -131,9 +133,15 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
                 tried.append(_settled(problem, best, (*best.events, event)))
         sets += tried
         top = max(tried, key=lambda f: total(problem, f), default=None)
-        if top is None or total(problem, top) <= total(problem, best):
+        if top is None:
             break
-        best = pruned(problem, top, sets)
+        best = _settled(problem, best, best.events)  # with as many rounds as the larger sets
+        sets.append(best)
+        if total(problem, top) > total(problem, best):
+            top = pruned(problem, top, sets)
+        if total(problem, top) <= total(problem, best):
+            break
+        best = top
     sets.sort(key=lambda f: -total(problem, f))
     return sets
 
@@ -198,14 +206,18 @@ def _settled(problem: Problem, fit: Fit, events: Sequence[Event]) -> Fit:
 
 
 def pruned(problem: Problem, fit: Fit, sets: list[Fit]) -> Fit:
-    """The set without events whose removal raises the evidence."""
-    for event in fit.events[:-1]:
-        without = tuple(e for e in fit.events if e is not event)
-        if described(problem, fit, event).gain > 6.0:
+    """The set without events whose removal raises the evidence, or that the rest of the set makes
+    unlikely.
+    """
+    for event in fit.events:
+        gain = described(problem, fit, event).gain
+        if gain > _CERTAIN:
             continue
-        other = _settled(problem, fit, without)
+        other = _settled(problem, fit, tuple(e for e in fit.events if e is not event))
         sets.append(other)
-        if total(problem, other) > total(problem, fit):
+        if gain < 0.0:
+            sets[:] = [each for each in sets if each is not fit]
+        if gain < 0.0 or total(problem, other) > total(problem, fit):
             return pruned(problem, other, sets)
     return fit
 
