@@ -36,6 +36,7 @@ from avsreplay.estimate.chart import (
     to_state,
 )
 from avsreplay.estimate.driven import DrivenBelief
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import NoiseSource
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Plan, PlanStatus
@@ -581,7 +582,7 @@ def _seen_by_draws(setup: Setup, belief: Belief, times: Array, d: Array, z: Arra
     """Positions (m, n, 3) in {C} of the robot, displaced by ``d`` (n, 3) from the predicted grasp
     point, about m targets whose poses differ by ``z`` (m, 6) standard normal numbers.
     """
-    root = np.linalg.cholesky(setup.estimator.pose_covariance(belief) + 1e-18 * np.eye(6))
+    root = cholesky_root(setup.estimator.pose_covariance(belief) + 1e-18 * np.eye(6))
     errors = z @ root.T
     R_ac = geometry.matrix(setup.estimator.attitude(belief)(times))
     y = np.einsum("nji,mnj->mni", R_ac, d[None] - errors[:, None, :3])

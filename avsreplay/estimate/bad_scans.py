@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 
 from avsreplay.estimate import _motion
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.scan_window import (
     OFFSETS,
     PRIOR_ODDS,
@@ -105,7 +106,7 @@ def _densities(y: Array, C: Array) -> tuple[Array, Array]:
     """(k,) log densities of N(0, C) at y without their constant, and squared whitened norms, for C
     (k, m, m).
     """
-    root = np.linalg.cholesky(C)
+    root = cholesky_root(C)
     left = np.linalg.solve(root, np.broadcast_to(y[:, None], (len(C), len(y), 1)))[:, :, 0]
     chi2 = (left * left).sum(axis=1)
     return -0.5 * chi2 - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1), chi2

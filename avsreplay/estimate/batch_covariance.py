@@ -32,6 +32,7 @@ from avsreplay.estimate.driven import drift_equivalents
 from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, ROUNDING, definite
 from avsreplay.estimate.mixture import Component, volumes
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.work import Parts
@@ -209,7 +210,7 @@ def sandwich(
     """
     J, n = problem.core.rows()[1] @ to_errors(problem.chart), len(points)
     Q, R = np.linalg.qr(
-        np.vstack([J.reshape(-1, DIM), np.linalg.cholesky(problem.prior.info).T])
+        np.vstack([J.reshape(-1, DIM), cholesky_root(problem.prior.info).T])
     )  # P = (R' R)^-1
     white, total = Q[: 6 * n].reshape(n, 6, DIM), Q[6 * n :].T @ Q[6 * n :]
     plain = levels.factors(mean_share(points))

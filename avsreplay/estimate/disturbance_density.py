@@ -23,6 +23,7 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.geometry import Array
 
 DENSITIES = np.logspace(
@@ -131,7 +132,7 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
 
     V is the covariance of the errors of the poses alone, which is well conditioned.
     """
-    root = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
+    root = cholesky_root(V)
     prior, k = data.root, effects.shape[1]
     white = divided(root, np.hstack([effects, data.J, data.e[:, None]]))
     columns = np.vstack([white[:, :k], np.zeros((len(prior), k))])

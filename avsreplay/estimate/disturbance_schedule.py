@@ -41,7 +41,7 @@ from avsreplay.estimate.measurement import (
     innovation_vector,
     measurement_jacobian,
 )
-from avsreplay.estimate.noise import NO_INFLATION
+from avsreplay.estimate.noise import NO_INFLATION, cholesky_root
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.normal_points import PositionRows, position_rows
 from avsreplay.estimate.params import Adaptation
@@ -355,7 +355,7 @@ def no_worse_than_pose(belief: DrivenBelief, fix: PoseFix, factors: Array) -> Dr
     ``factors`` (2,) are on the standard deviations of attitude and position.
     """
     x, scale, H = belief.x, np.repeat(factors, 3), measurement_jacobian(belief.x)
-    root = np.linalg.cholesky(in_camera(fix.C * np.outer(scale, scale), fix.T_ac.q, x.q_bc))
+    root = cholesky_root(in_camera(fix.C * np.outer(scale, scale), fix.T_ac.q, x.q_bc))
     whiten = np.linalg.inv(root)
     values, axes = np.linalg.eigh(whiten @ H @ belief.P @ H.T @ whiten.T)
     if values[-1] <= 1.0 or fix.lag_ns:

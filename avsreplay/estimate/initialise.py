@@ -33,7 +33,7 @@ from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, RHO, VEL, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
-from avsreplay.estimate.noise import BOUND
+from avsreplay.estimate.noise import BOUND, cholesky_root
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
@@ -223,7 +223,7 @@ def given_prior(belief: Belief) -> Prior:
     x, mean, J = belief.x, to_chart(belief.x), np.eye(DIM)
     # position and velocity along the axes of the body, so that the draws turn with the camera
     J[RHO, RHO] = J[VEL, VEL] = geometry.matrix(x.q_ab)
-    root = J @ np.linalg.cholesky(J.T @ belief.P @ J)
+    root = J @ cholesky_root(J.T @ belief.P @ J)
     draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
     y = _motion.spread(x.flat, np.concatenate([draws, -draws]), _EDGE, mean.flat)
     return Prior(mean, y.T @ y / len(y))

@@ -43,6 +43,7 @@ from avsreplay.estimate.disturbance_density import (
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.dynamics import propagate_state, torque_density
 from avsreplay.estimate.error_state import RHO, VEL, W
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.normal_points import PositionRows, error_parts
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -364,7 +365,7 @@ def _improved(
         if theta[4 + k] > 0.0:
             impulses_k = parts.impulses(k, theta)
             everything = everything.extended(impulses_k, np.zeros(impulses_k.shape[1]))
-    root = np.asarray(np.linalg.cholesky(parts.errors(theta)))
+    root = cholesky_root(parts.errors(theta))
     white = divided(root, np.hstack([everything.J, data.e[:, None]]))
     Q, _ = np.linalg.qr(np.vstack([white[:, :-1], everything.root]))
     known = np.concatenate([white[:, -1], everything.root @ everything.off])

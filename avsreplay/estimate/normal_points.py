@@ -19,6 +19,7 @@ from avsreplay.estimate.disturbance_density import Present
 from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.geometry import Array
 from avsreplay.records import Manoeuvre
 
@@ -95,7 +96,7 @@ def position_rows(
         np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (poses.t, R, t)
     )
     noise = np.add.reduceat((w * w)[:, None, None] * (R @ C @ np.swapaxes(R, 1, 2)), first)
-    root = np.linalg.inv(np.linalg.cholesky(np.swapaxes(R[middle], 1, 2) @ noise @ R[middle]))
+    root = np.linalg.inv(cholesky_root(np.swapaxes(R[middle], 1, 2) @ noise @ R[middle]))
     root = root @ np.swapaxes(R[middle], 1, 2)
     late = np.maximum(times[:, None] - 0.5 * (times[1:] + times[:-1]), 0.0) * np.sqrt(
         np.diff(times)

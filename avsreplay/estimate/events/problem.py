@@ -32,6 +32,7 @@ from avsreplay.estimate.events.kinds import (
     Kind,
 )
 from avsreplay.estimate.events.linear import LinearModel, Passed, passed
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.geometry import Array
 
 _TURN_RAD = 0.4  # largest turn over which effects of accelerations are integrated by Simpson's rule
@@ -128,7 +129,7 @@ class Problem:
     def __init__(self, poses: Poses, body: Body) -> None:
         self.poses, self.body = poses, body
         self.times = poses.times_s
-        self.root = np.linalg.cholesky(poses.C)
+        self.root = cholesky_root(poses.C)
         counts = np.ones(len(poses)) if poses.counts is None else poses.counts
         self.single = self.root * np.sqrt(counts)[:, None, None]
         share = 0.0 if poses.shares is None else float(np.mean(poses.shares))
