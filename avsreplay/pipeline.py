@@ -666,7 +666,9 @@ def _examined(
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
-    alignment = _weighed(stages, state, measurement.alignment)
+    alignment = measurement.alignment
+    if state.following.driven:  # the noise of the free motion is adapted to its own innovations
+        alignment = _weighed(stages, state, alignment)
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return (
         predicted,

@@ -367,7 +367,8 @@ def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_fol
 @pytest.mark.slow
 def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
-    settings = "limits.final_deg=30", "limits.clearance_m=0.1", "task.position_m=0.05"
+    early = "limits.clearance_sigmas=1", "task.position_m=0.05"  # a capture is planned in 12 s
+    settings = "limits.final_deg=30", "limits.clearance_m=0.1", *early
     grasp = [word for each in settings for word in ("--set", each)]
     assert cli("run", log, "--require", "pass", *grasp).code == 0  # also after the occlusion
     done = cli("run", log, "--n-scans", 5, "--require", "pass")  # too short to converge
