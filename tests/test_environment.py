@@ -85,10 +85,14 @@ def test_too_few_descriptors_are_one_line(fixtures_folder, tmp_path, descriptors
 @posix
 @pytest.mark.parametrize("ignored", ["INT", "INT HUP QUIT"])
 def test_sigterm_ends_a_command_that_ignores_ctrl_c(fixtures_folder, tmp_path, ignored):
-    shell = f"trap '' {ignored}; exec \"$@\""
-    words = ["sh", "-c", shell, "sh", *COMMAND, "run", fixtures_folder / "tumble.mcap"]
+    """The log is still being written, so that the run does not end by itself."""
+    log = tmp_path / "part.mcap"
+    whole = (fixtures_folder / "tumble.mcap").read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+    words = ["sh", "-c", f"trap '' {ignored}; exec \"$@\"", "sh", *COMMAND, "run", log, "--follow"]
     process = subprocess.Popen([*words, "-o", tmp_path / "r"], stderr=subprocess.PIPE, text=True)
-    time.sleep(1.5)
+    while len(list(tmp_path.iterdir())) < 2 and process.poll() is None:
+        time.sleep(0.05)  # until the run writes its result
     process.send_signal(signal.SIGINT)
     time.sleep(0.2)
     assert process.poll() is None
