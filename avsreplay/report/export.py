@@ -200,8 +200,8 @@ people use; all follow by subject.
 
 A column whose type ends with ? is null where it does not apply, for example an error without ground
 truth. [Conventions](conventions.md) defines frames and units, the [glossary](glossary.md) terms.
-*Golden* is the tolerance of a [golden file](ci.md): absolute, or relative to the expected value;
-columns without one are equal. [rows.schema.json](rows.schema.json) is the JSON schema of a row.
+± is the tolerance of a [golden file](ci.md): absolute/relative to the expected value; ± alone stands
+for 1e-06/0.01%, and columns without it are equal. [rows.schema.json](rows.schema.json) is the JSON schema of a row.
 `python -m avsreplay.report.export` makes this page, with `--schema` the schema.
 """
 
@@ -214,6 +214,9 @@ FREQUENT = {
     "does the covariance fit the errors": ("nis", "nees"),
     "plan and action": ("capture_time_s", "action"),
 }  # what people look for: the columns that have it
+
+
+_USUAL = "1e-06/0.01%"
 
 
 def columns_page() -> str:
@@ -237,7 +240,7 @@ def columns_page() -> str:
 
 
 def _line(column: Column, kind: type, nullable: bool) -> str:
-    tolerance = ", ".join(
+    tolerance = "/".join(
         text
         for value, text in (
             (column.atol, f"{column.atol:g}"),
@@ -246,7 +249,7 @@ def _line(column: Column, kind: type, nullable: bool) -> str:
         if value
     )
     word = kind.__name__ + ("?" if nullable else "") + (f" {column.unit}" if column.unit else "")
-    kinds = f"{word}, golden {tolerance}" if tolerance else word
+    kinds = f"{word} ±{tolerance.replace(_USUAL, '')}" if tolerance else word
     return f"- `{column.name}` ({kinds}): {column.text}\n"
 
 
