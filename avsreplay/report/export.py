@@ -200,8 +200,9 @@ people use; all follow by subject.
 
 A column whose type ends with ? is null where it does not apply, for example an error without ground
 truth. [Conventions](conventions.md) defines frames and units, the [glossary](glossary.md) terms.
-± is the tolerance of a [golden file](ci.md): absolute/relative to the expected value; ± alone stands
-for 1e-06/0.01%, and columns without it are equal. [rows.schema.json](rows.schema.json) is the JSON schema of a row.
+± is the tolerance of a [golden file](ci.md): absolute/relative to the expected value; ± alone is
+1e-06/0.01%, and columns without it are equal. [rows.schema.json](rows.schema.json) is the JSON
+schema of a row.
 `python -m avsreplay.report.export` makes this page, with `--schema` the schema.
 """
 
