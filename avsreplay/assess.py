@@ -41,6 +41,7 @@ from avsreplay.estimate.params import NoiseSource
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Plan, PlanStatus
 from avsreplay.pipeline import planner_input
+from avsreplay.plan.constrained import constrained
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.flights import (
     Ended,
@@ -390,6 +391,14 @@ def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
         sigma = float(position[0]), float(attitude[0])
     blocked = axis_blocked(scene, limits, setup.extent_m, sigma)
     if blocked is None:
+        if sigma is not None and limits.clearance_sigmas > 0.0:
+            p = setup.guidance.params
+            start = np.array(p.robot_position_m), np.array(p.robot_velocity_mps)
+            exact = replace(limits, clearance_sigmas=0.0)
+            if constrained(scene, *start, p, exact, belief.t_ns, setup.extent_m).found:
+                cause = f"the predicted error of {1e3 * sigma[0]:.3g} mm takes the room to approach"
+                change = "a longer observation would help, or a smaller limits.clearance_sigmas"
+                return f": {cause}", change
         return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
     name, until_m, short_m = blocked
     if name != "body":

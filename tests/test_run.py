@@ -365,6 +365,16 @@ def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_fol
 
 
 @pytest.mark.slow
+def test_a_prediction_that_leaves_no_room_to_approach_is_named(cli, fixtures_folder):
+    """With the same limits and an allowance of 1 sigma a capture is planned (next test)."""
+    limits = "limits.final_deg=30", "limits.clearance_m=0.1", "task.position_m=0.05"
+    words = [word for each in limits for word in ("--set", each)]
+    said = " ".join(cli("run", fixtures_folder / "tumble.mcap", *words).out.split())
+    assert "the predicted error of" in said
+    assert "a longer observation would help" in said
+
+
+@pytest.mark.slow
 def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
     early = "limits.clearance_sigmas=1", "task.position_m=0.05"  # a capture is planned in 12 s
