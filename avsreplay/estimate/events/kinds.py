@@ -7,7 +7,8 @@ that is constant and zero before. A new kind is one more class here.
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 
@@ -17,8 +18,11 @@ from avsreplay.geometry import Array
 
 # the parts of the state after the 20 numbers of the chart
 COLOUR = slice(20, 26)  # common errors of the poses, in their 1 sigma
-TORQUE, FORCE = slice(26, 29), slice(29, 32)  # angular acceleration in {C}, acceleration in {A}
-DRAG, OFFSET, DRIFT = slice(32, 33), slice(33, 34), slice(34, 35)  # 1/s, m, m/s
+TORQUE = slice(26, 29)  # angular acceleration in {C} [rad/s2]
+FORCE = slice(29, 32)  # acceleration in {A} [m/s2]
+DRAG = slice(32, 33)  # [1/s]
+OFFSET = slice(33, 34)  # of the range [m]
+DRIFT = slice(34, 35)  # of the range [m/s]
 SINE = slice(35, 41)  # amplitudes of sine and cosine of a periodic torque in {C} [rad/s2]
 STATES = 41
 
@@ -54,7 +58,7 @@ class Intervals:
         return np.diff(self.times_s, prepend=self.times_s[0])
 
 
-class Kind(Protocol):
+class Kind(ABC):
     """What one kind of events declares.
 
     Attributes:
@@ -72,141 +76,160 @@ class Kind(Protocol):
     name: str
     words: str
     unit: str
-    factor: float
+    factor = 1e-3
     si: str
-    size: int
-    most: float
-    odds: float
-    anywhere: bool
-    periodic: bool
+    size = 3
+    most = math.inf
+    odds = -3.0
+    anywhere = True
+    periodic = False
 
+    @abstractmethod
     def columns(self, of: Intervals, late: Array) -> Array:
-        """(k, STATES, size) shock of the state at each knot by an event of unit size.
+        """Return the (k, STATES, size) shock of the state at each knot by an event of unit size.
 
         Args:
             of: the intervals between knots.
             late: (k,) instant of the onset as a part of the interval that ends at the knot.
         """
-        ...
+
+    def _zeros(self, of: Intervals) -> Array:
+        return np.zeros((len(of.times_s), STATES, self.size))
 
 
-def _zeros(of: Intervals, size: int) -> Array:
-    return np.zeros((len(of.times_s), STATES, size))
-
-
-class RateStep:
+class RateStep(Kind):
     """A sudden change of the rate, as by a collision or a thruster pulse."""
 
-    name, words, unit, factor = "rate_step", "rate changed by {size}", "mrad/s", 1e-3
+    name = "rate_step"
+    words = "rate changed by {size}"
+    unit = "mrad/s"
     si = "rad/s"
-    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """Effect of a change of the rate."""
-        out = _zeros(of, 3)
+        out = self._zeros(of)
         out[:, :20] = of.part(late)
         return out
 
 
-class VelocityStep:
+class VelocityStep(Kind):
     """A sudden change of the velocity of the mass centre."""
 
-    name, words, unit, factor = "velocity_step", "velocity changed by {size}", "mm/s", 1e-3
+    name = "velocity_step"
+    words = "velocity changed by {size}"
+    unit = "mm/s"
     si = "m/s"
-    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """Effect of a change of the velocity."""
-        out = _zeros(of, 3)
+        out = self._zeros(of)
         out[:, VELOCITY] = np.eye(3)
         out[:, POSITION] = (of.length() * (1.0 - late))[:, None, None] * np.eye(3)
         return out
 
 
-class Torque:
+class Torque(Kind):
     """A constant torque in {C}, as of a leak, from its onset to the end."""
 
-    name, words, unit, factor = "torque", "constant torque of {size}", "mrad/s2", 1e-3
+    name = "torque"
+    words = "constant torque of {size}"
+    unit = "mrad/s2"
     si = "rad/s2"
-    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The torque, and its effect since the onset within the interval."""
-        out = _zeros(of, 3)
+        out = self._zeros(of)
         rest = of.length() * (1.0 - late)
         out[:, :20] = rest[:, None, None] * of.part(0.5 * (1.0 + late))
         out[:, TORQUE] = np.eye(3)
         return out
 
 
-class Force:
+class Force(Kind):
     """A constant force in {A}, from its onset to the end."""
 
-    name, words, unit, factor = "force", "constant force of {size}", "mm/s2", 1e-3
+    name = "force"
+    words = "constant force of {size}"
+    unit = "mm/s2"
     si = "m/s2"
-    size, most, odds, anywhere, periodic = 3, np.inf, -3.0, True, False
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The acceleration, and its effect since the onset within the interval."""
-        out = _zeros(of, 3)
+        out = self._zeros(of)
         rest = (of.length() * (1.0 - late))[:, None, None]
         out[:, VELOCITY], out[:, POSITION] = rest * np.eye(3), 0.5 * rest**2 * np.eye(3)
         out[:, FORCE] = np.eye(3)
         return out
 
 
-class Drag:
+class Drag(Kind):
     """A torque against the rate, as of eddy currents or air, over the whole log."""
 
-    name, words, unit, factor = "drag", "drag of {size}", "%/s", 1e-2
+    name = "drag"
+    words = "drag of {size}"
+    unit = "%/s"
+    factor = 1e-2
     si = "1/s"
-    size, most, odds, anywhere, periodic = 1, np.inf, -3.0, False, False
+    size = 1
+    anywhere = False
 
     def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The coefficient."""
-        out = _zeros(of, 1)
+        out = self._zeros(of)
         out[:, DRAG] = 1.0
         return out
 
 
-class PeriodicTorque:
+class PeriodicTorque(Kind):
     """A torque in {C} with one frequency over the whole log, as of sloshing or of a panel."""
 
-    name, words, unit, factor = "periodic_torque", "periodic torque of {size}", "mrad/s2", 1e-3
+    name = "periodic_torque"
+    words = "periodic torque of {size}"
+    unit = "mrad/s2"
     si = "rad/s2"
-    size, most, odds, anywhere, periodic = 6, np.inf, -3.0, False, True
+    size = 6
+    anywhere = False
+    periodic = True
 
     def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The amplitudes of sine and cosine."""
-        out = _zeros(of, 6)
+        out = self._zeros(of)
         out[:, SINE] = np.eye(6)
         return out
 
 
-class SensorOffset:
+class SensorOffset(Kind):
     """A jump of the measured range, from its onset to the end."""
 
-    name, words, unit, factor = "sensor_offset", "measured range jumped by {size}", "mm", 1e-3
+    name = "sensor_offset"
+    words = "measured range jumped by {size}"
+    unit = "mm"
     si = "m"
-    size, most, odds, anywhere, periodic = 1, 0.2, -5.0, True, False
+    size = 1
+    most = 0.2
+    odds = -5.0
 
     def columns(self, of: Intervals, late: Array) -> Array:  # noqa: ARG002
         """The offset."""
-        out = _zeros(of, 1)
+        out = self._zeros(of)
         out[:, OFFSET] = 1.0
         return out
 
 
-class SensorDrift:
+class SensorDrift(Kind):
     """A linear drift of the measured range, from its onset to the end."""
 
-    name, words, unit, factor = "sensor_drift", "measured range drifts by {size}", "mm/s", 1e-3
+    name = "sensor_drift"
+    words = "measured range drifts by {size}"
+    unit = "mm/s"
     si = "m/s"
-    size, most, odds, anywhere, periodic = 1, 2e-3, -5.0, True, False
+    size = 1
+    most = 2e-3
+    odds = -5.0
 
     def columns(self, of: Intervals, late: Array) -> Array:
         """The drift, and the offset since the onset within the interval."""
-        out = _zeros(of, 1)
+        out = self._zeros(of)
         out[:, DRIFT] = 1.0
         out[:, OFFSET] = (of.length() * (1.0 - late))[:, None, None]
         return out

@@ -45,8 +45,10 @@ _KNOWN = 150.0  # variance of the motion over that of a pose up to which a wrong
 _PRIOR_DOF = 6.0  # weight of the claimed variances, in measured numbers
 _COMMON_DOF = 3.0  # the same of the claimed common errors
 _LEAST_DENSITY = 1e-9  # of random disturbances [rad/s^1.5, m/s^1.5]: without effect over a log
-_LEAST_COMMON, _MOST_COMMON = 1e-3, 1e3  # variance of common errors over that of the others
-_LARGEST_RAD, _LARGEST_LOG = 0.5, 1.0  # largest step of attitude and of the logarithm of inertia
+_LEAST_COMMON = 1e-3  # least variance of common errors over that of the others
+_MOST_COMMON = 1e3  # largest one
+_LARGEST_RAD = 0.5  # largest step of the attitude
+_LARGEST_LOG = 1.0  # largest step of the logarithm of inertia
 
 
 @value_class

@@ -18,17 +18,20 @@ from avsreplay.estimate.events.problem import Event, Fit, Levels, Problem
 from avsreplay.geometry import Array
 
 _LATE = (0.1, 0.3, 0.5, 0.7, 0.9)  # instants of an onset that are compared, as parts of an interval
-_QUIET, _DISTURBED = 0.1, 2.0  # factor on disturbances, and loss of log evidence that shows them
+_QUIET = 0.1  # factor on disturbances for the second search
+_DISTURBED = 2.0  # loss of log evidence by it from which random disturbances act
 _TRIED = 3  # kinds of which the best event is fitted
 _LEAST_GAIN = -4.0  # log odds at fixed noise from which an event is fitted
-_FIRST_CYCLES, _STEP_CYCLES = 0.75, 0.5  # of the frequencies that are compared, in a log
+_FIRST_CYCLES = 0.75  # in a log, of the lowest frequency that is compared
+_STEP_CYCLES = 0.5  # between two of them
 _MOST_FREQUENCIES = 40
 _FINER = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # cycles in a log by which a frequency is improved
 _INSTANTS = 10  # over which the odds of a kind are divided that acts over the whole log
 _MOST_EVENTS = 8
 _CERTAIN = 6.0  # log odds from which an event is kept without a fit of the set without it
 _MARGIN = 3.0  # log odds that an event must add: fits end within about this of their maximum
-_START_ROUNDS, _ROUNDS = 25, 8
+_START_ROUNDS = 25  # most improvements of the first fit
+_ROUNDS = 8  # of a further one, which begins at another fit
 _START_DENSITY = 0.1  # random torque of the start, by which the rate changes within a radian
 
 

@@ -25,7 +25,8 @@ from avsreplay.records import Belief, State
 from avsreplay.spool import Spool, SpoolFile
 
 _FEWEST = 4  # poses of a smoothed motion
-_MOST_SEARCHED, _MOST_KNOTS = 300, 800  # knots among which events are searched; of the motion
+_MOST_SEARCHED = 300  # knots among which events are searched
+_MOST_KNOTS = 800  # knots of the motion
 _NEAR_RAD = 1.0  # turn from a knot within which poses are averaged
 _GROSS = 40.0  # chi-square of a pose against the motion above which it is left out of an average
 _REFINED = 4  # rounds of the last fit
