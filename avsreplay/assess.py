@@ -52,7 +52,7 @@ from avsreplay.plan.flights import (
     flown_positions,
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import TargetGeometry, axis_blocked
+from avsreplay.plan.limits import Scene, TargetGeometry, axis_blocked
 from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.plan.supervisor import RULES, Action
 from avsreplay.plan.uncertainty import Disturbance, draws, wilson
@@ -391,15 +391,11 @@ def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
         sigma = float(position[0]), float(attitude[0])
     blocked = axis_blocked(scene, limits, setup.extent_m, sigma)
     if blocked is None:
-        if sigma is not None and limits.clearance_sigmas > 0.0:
-            p = setup.guidance.params
-            start = np.array(p.robot_position_m), np.array(p.robot_velocity_mps)
-            exact = replace(limits, clearance_sigmas=0.0)
-            if constrained(scene, *start, p, exact, belief.t_ns, setup.extent_m).found:
-                cause = f"the predicted error of {1e3 * sigma[0]:.3g} mm takes the room to approach"
-                change = "a longer observation would help, or a smaller limits.clearance_sigmas"
-                return f": {cause}", change
-        return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
+        if sigma is None or not _found_without_allowance(setup, scene, belief):
+            return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
+        cause = f"the predicted error of {1e3 * sigma[0]:.3g} mm takes the room to approach"
+        change = "a longer observation would help, or a smaller limits.clearance_sigmas"
+        return f": {cause}", change
     name, until_m, short_m = blocked
     if name != "body":
         cause = f"the {name} is violated by {short_m:.3g} m on the axis of the approach"
@@ -652,9 +648,19 @@ def _probability(good: Any) -> dict[str, Any]:
 
 def _planned(setup: Setup, belief: Belief) -> Plan:
     """A capture that is planned from the start of the robot, without constraints."""
-    p = setup.guidance.params
-    start = np.array(p.robot_position_m), np.array(p.robot_velocity_mps)
-    return rendezvous(setup.estimator.motion(belief), *start, p, belief.t_ns)
+    params = setup.guidance.params
+    return rendezvous(setup.estimator.motion(belief), *params.start, params, belief.t_ns)
+
+
+def _found_without_allowance(setup: Setup, scene: Scene, belief: Belief) -> bool:
+    """Whether a capture is found from there under the constraints without an allowance for the
+    predicted error of the grasp point.
+    """
+    limits, params = setup.guidance.limits, setup.guidance.params
+    if limits.clearance_sigmas <= 0.0:
+        return False
+    exact = replace(limits, clearance_sigmas=0.0)
+    return constrained(scene, *params.start, params, exact, belief.t_ns, setup.extent_m).found
 
 
 def _planned_s(setup: Setup, belief: Belief) -> float:

@@ -479,8 +479,7 @@ def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief
 
     def planned() -> float:
         motion = stages.estimator.motion(at_grasp(belief, stages.grasp_c))
-        start = np.array(params.robot_position_m), np.array(params.robot_velocity_mps)
-        made = rendezvous(motion, *start, params, t_ns)
+        made = rendezvous(motion, *params.start, params, t_ns)
         return made.t_go_s if made.found else params.horizon_s
 
     return PlannedTime(False, planned)

@@ -101,7 +101,7 @@ class Replanning:
     @property
     def start(self) -> tuple[Array, Array]:
         """Position and velocity (3,) of the robot at the instant of planning."""
-        return np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
+        return self.params.start
 
     @property
     def tolerance(self) -> Tolerance:

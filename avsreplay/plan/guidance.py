@@ -175,9 +175,10 @@ class Guidance:
         Args:
             t_ns: Instant of the first scan [ns].
         """
-        r0, v0 = np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
         return GuidanceState(
-            Segment(t_ns, r0, v0, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None)
+            Segment(
+                t_ns, *self.params.start, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None
+            )
         )
 
     def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:

@@ -316,23 +316,6 @@ def axis_blocked(
     return CONSTRAINTS[worst], last, float(-found[1:, worst].min())
 
 
-def corridor_margin(scene: Scene, limits: Limits, y: Array) -> tuple[Array, Array]:
-    """Return the margins inside the corridor [m]: to its side and to its end, each (n,).
-
-    Args:
-        scene: The target.
-        limits: Resolved limits; without a corridor no point is inside.
-        y: (n, 3) positions in {C} [m].
-    """
-    distance = np.linalg.norm(y, axis=1)
-    if scene.axis_c is None or limits.final_deg is None:
-        return np.full(len(y), -math.inf), np.full(len(y), -math.inf)
-    along = y @ scene.axis_c
-    across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
-    side = math.tan(math.radians(limits.final_deg)) * along + (limits.mouth_m or 0.0) - across
-    return side, (limits.final_range_m or 0.0) - distance
-
-
 def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
     """Return the smallest margin for a robot now [m or m/s]: negative if a constraint is violated,
     infinite without.

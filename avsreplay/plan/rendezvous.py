@@ -83,6 +83,11 @@ class PlanParams(Settings):
                 f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}"
             )
 
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """Position (3,) [m] and velocity (3,) [m/s] of the end-effector in {A} when planning."""
+        return np.array(self.robot_position_m), np.array(self.robot_velocity_mps)
+
 
 def finer(params: PlanParams, goal: Trajectory) -> PlanParams:
     """Return the parameters with a spacing of the samples that resolves the motion of a goal.
