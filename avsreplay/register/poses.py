@@ -12,7 +12,8 @@ from avsreplay.register.surface_index import kernel_module
 # Poses that differ by less are the same: rotation, and displacement of the middle of the model over
 # its extent. A larger value hides a second pose that explains a scan; a smaller one takes two
 # registrations that end beside each other for two poses.
-SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05
+SAME_RAD = np.radians(10.0)
+SAME_OF_EXTENT = 0.05
 # Share of these, within which two registrations have ended at one minimum: 2 deg, 0.01 extents.
 ONE_MINIMUM = 0.2
 

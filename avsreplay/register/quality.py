@@ -209,12 +209,9 @@ def grade(
     """
     if not all(map(math.isfinite, (*fit.T_ca.q.tolist(), *fit.T_ca.t.tolist()))):
         return not_measured(len(points), AlignStatus.FAILED)
+    faced = visibility.faced(index, points, fit.T_ca)
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    rule = _rule(index, visibility, points, fit, limits.gate_m, params)
-    rule["across"], rule["systematic"] = np.ascontiguousarray(across), systematic
-    rule["turn_rad"] = float(np.radians(accuracy[0]))
-    rule["move_m"] = accuracy[1] * index.extent_m
-    rule["numbers"] = normal_numbers(NUMBERS) if simulated else np.empty(0)
+    rule = _rule(index, params, limits.gate_m, accuracy, faced, across, systematic, simulated)
     found = PoseQuality(**index.grade(points, fit.T_ca, rule, fit.matches))
     step = found.overlap and found.statistic > UNCHANGED and not simulated
     if step and guess is not None and fit.T_ca.matrix.tobytes() == guess.matrix.tobytes():
@@ -346,19 +343,23 @@ def _message(settled: bool, size_1s: float) -> str:
 
 def _rule(
     index: SurfaceIndex,
-    visibility: Visibility,
-    points: NDArray[Any],
-    fit: Fit,
-    gate_m: float,
     params: RegisterParams,
+    gate_m: float,
+    accuracy: tuple[float, float],
+    faced: bool,
+    across: Array,
+    systematic: bool,
+    simulated: bool,
 ) -> GradeRule:
-    """The rule of a pose, without test of halves, systematic errors and simulated noise."""
+    """The rule by which the kernel grades a pose; ``faced``: the camera may be where the faces
+    look; ``across`` (k, 3) in {C}: directions of the test of halves; the others as of ``grade``.
+    """
     extent = index.extent_m
     return GradeRule(
         gate_m=min(gate_m, index.reach_m),
         patch_m=PATCH_OF_EXTENT * extent,
         least_patches=LEAST_PATCHES,
-        camera=visibility.faced(index, points, fit.T_ca),
+        camera=faced,
         tested=TESTED_POINTS,
         least_facing=LEAST_FACING,
         extent_m=extent,
@@ -367,14 +368,14 @@ def _rule(
         least_inliers=float(params.min_inliers),
         least_ratio=params.min_inlier_ratio,
         least_information=FREE_BELOW,
-        systematic=False,
-        turn_rad=0.0,
-        move_m=0.0,
-        across=np.empty((0, 3)),
+        systematic=systematic,
+        turn_rad=float(np.radians(accuracy[0])),
+        move_m=accuracy[1] * extent,
+        across=np.ascontiguousarray(across),
         beyond_m=WELL_OFF * gate_m,
         least_close=MANY_INLIERS,
         part=PART,
-        numbers=np.empty(0),
+        numbers=normal_numbers(NUMBERS) if simulated else np.empty(0),
         many=SIMULATED,
         least_share=SHARES[0],
         most_share=SHARES[1],

@@ -34,11 +34,11 @@ POINTS = 300  # points that are registered from displaced poses
 DIRECTIONS = 3  # weak directions, each both ways
 DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 # As ``comparison.SIGMAS``, for minima beside the pose, of which the guess excludes most. With that
-# value 2 of 26 right poses of scans that show 30 % of a target were not accepted.
+# value a right pose of a scan that shows 30 % of a target was not accepted.
 SIGMAS = 4.0
 LEAST_INLIERS = 6  # which determine a pose
-# a pose nearer to its guess, in gates, is not compared; usual rms radius over the extent
-UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25
+UNMOVED = 0.25  # a pose nearer to its guess, in gates, is not compared
+RADIUS_OF_EXTENT = 0.25  # usual rms radius of a scan over the extent
 
 
 @value_class
