@@ -57,7 +57,7 @@ def preflight(
     general += _meaning(source)
     if source.options.poses:
         return [*_poses(source, surface), *_grasp(surface, search), *general]
-    sizes = _contents(source, scans, surface, registrar, search)
+    sizes = _contents(source, scans, surface, registrar, search, follow=not followed)
     if followed:
         sizes = [each for each in sizes if each.about != "background"]
     model = None if surface is None else in_found_unit(surface, sizes, source.options)
@@ -136,9 +136,10 @@ def _contents(
     surface: Surface | None,
     registrar: Registrar | None,
     search: bool,
+    follow: bool,
 ) -> list[Advice]:
     """Scans that cannot be decoded, with the reason, and the size of those with at least ten
-    points.
+    points; with ``follow`` a target that moves is followed to the first scan.
     """
     broken, clouds = (
         [s for s in scans if s.status is ScanStatus.DAMAGED],
@@ -154,7 +155,9 @@ def _contents(
     found = (
         []
         if broken and len(broken) == len(scans)
-        else compare_sizes(finite, surface, registrar, source.options, follow_back)
+        else compare_sizes(
+            finite, surface, registrar, source.options, follow_back if follow else None
+        )
     )
     if not finite and (dropped := max((scan.dropped_points for scan in scans), default=0)):
         text = (

@@ -603,18 +603,27 @@ def test_scans_in_millimetres_are_named_with_the_option_and_the_crop_in_metres(s
     assert _found(both, "unit").option == "--model-unit mm --scan-unit mm"
 
 
-@pytest.mark.parametrize("approaches", [True, False])
-def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
-    """The target stands on a floor; in the first scan it has too few points for a group."""
+def _on_a_floor(distances, few, every):
+    """A model, its size [m], and scans of it on a floor at distances in units of that size; each
+    of the first ``few`` has one of ``every`` so many points of the target.
+    """
     surface, pose = boxes(), example_pose()
     size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     seen = pose.apply(view(surface, 600, pose.inverse().t)) - pose.t
     x, y = np.meshgrid(np.linspace(-6, 6, 40), np.linspace(-6, 6, 40))
     floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -2.0)], axis=1) * size
     clouds = []
-    for k in range(5):
-        at = np.array([(30.0 - 6.0 * k if approaches else 6.0) * size, 0.0, 0.0])
-        clouds.append(np.concatenate([seen[:: 120 if k == 0 else 1] + at, floor + at]))
+    for k, distance in enumerate(distances):
+        at = np.array([distance * size, 0.0, 0.0])
+        clouds.append(np.concatenate([seen[:: every if k < few else 1] + at, floor + at]))
+    return surface, size, clouds
+
+
+@pytest.mark.parametrize("approaches", [True, False])
+def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
+    """The target stands on a floor; in the first scan it has too few points for a group."""
+    sizes = [30.0 - 6.0 * k if approaches else 6.0 for k in range(5)]
+    surface, _, clouds = _on_a_floor(sizes, few=1, every=120)
     (advice,) = compare_sizes(clouds, surface, None, SourceOptions())
     assert advice.about == "background"
     wanted = ("--region",) if approaches else ("--crop-box", "--crop-range")
@@ -623,15 +632,8 @@ def test_no_crop_is_advised_that_loses_a_target_that_approaches(approaches):
 
 def test_the_region_begins_where_the_target_is_at_the_first_scan():
     """The target comes from 30 to 6 sizes over 41 scans; in the first one it has few points."""
-    surface, pose = boxes(), example_pose()
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    seen = pose.apply(view(surface, 600, pose.inverse().t)) - pose.t
-    x, y = np.meshgrid(np.linspace(-6, 6, 40), np.linspace(-6, 6, 40))
-    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -2.0)], axis=1) * size
-    clouds = []
-    for k in range(41):
-        at = np.array([(30.0 - 0.6 * k) * size, 0.0, 0.0])
-        clouds.append(np.concatenate([seen[:: 40 if k < 8 else 1] + at, floor + at]))
+    sizes = [30.0 - 0.6 * k for k in range(41)]
+    surface, size, clouds = _on_a_floor(sizes, few=8, every=40)
     advice = _found(preflight(Log(clouds), surface), "background")
     option, position = advice.option.split()
     assert option == "--region"
