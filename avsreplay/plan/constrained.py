@@ -339,12 +339,7 @@ def _best_path(
     found = _moved(plain, found)
     if case.space is None or not case.limits.abort:
         return found if best is None else min(best, found, key=_safest)
-    for trust in (TRUST, CAREFUL):
-        away = _refined(case, found, trust=trust)
-        best = min(filter(None, (best, away)), key=_safest, default=None)
-        if best is not None and best.short_m <= 0.0:
-            break
-    return best
+    return min(filter(None, (best, _refined(case, found))), key=_safest, default=None)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:

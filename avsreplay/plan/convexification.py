@@ -393,7 +393,7 @@ def withdrawn(
     """
     if case.space is None or case.coarse or not case.limits.abort:
         return Withdrawn()
-    below, tried = FAR * case.buffer_m, tried or Tried.first(case.reserve_m)
+    below, tried = case.space.enough_m, tried or Tried.first(case.reserve_m)
     found, tried, owner = sampled(case.space, path, tried, case.wait_s, since_s, improve, below)
     least = _accepted(case.space, found)
     short = max(least - found.margin_m, 0.0)
@@ -416,7 +416,7 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
     """
     if (space := case.stated) is None or away.tried is None:
         return away
-    if away.short_m > space.resolution_m:  # far from what is stated
+    if away.short_m > case.reserve_m:  # far from what is stated
         return away
     start = Tried(away.tried.share[:1], away.tried.d[:1], away.tried.reserve[:1])
     least = _accepted(space, sampled(space, path, start, case.wait_s)[0])
@@ -446,11 +446,11 @@ def _accepted(space: Space, found: Certificate) -> float:
 def _withdrawal_rows(
     case: Case, space: Space, end_s: float, found: Certificate, required: Array
 ) -> PointRows:
-    """Rows that keep withdrawals at the margins ``required`` (m,); of those from about the same instant and about the
-    same time after it the worst.
+    """Rows that keep withdrawals at the margins ``required`` (m,); of those from about the same
+    instant and about the same time after it the worst.
     """
     limits, length = case.limits, end_s - case.wait_s
-    near = np.flatnonzero(found.margins_m < np.maximum(FAR * case.buffer_m, required))
+    near = np.flatnonzero(found.margins_m < np.maximum(space.enough_m, required))
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
     after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
     late = np.round(after ** (1.0 / DENSER) * COMPARED)

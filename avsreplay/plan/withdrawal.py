@@ -269,7 +269,7 @@ class Space:
             Lower bounds (m,) over the ranges of start instants, the smallest margins (m,) found in
             the middle, and their times (m,).
         """
-        lower, upper, at = self.kernel(_last_s(m)).least(m.table, target_m).T
+        lower, upper, at = self.kernel(_last_s(m)).least(m.table, target_m).T.copy()
         return lower, upper, at
 
     def escapes(
@@ -399,23 +399,27 @@ def _chosen(
     (m, 3); where one does not reach the goal all directions are compared, with ``search``.
     """
     r, v = path.at(t)
-
-    def bounded(d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
-        m = _bounded(space.escapes(t, half, (r, v, u), d), path)
-        return m, *space.least(m, goal)
-
     unknown = np.isnan(d[:, 0])
     if unknown.any():
         d = d.copy()
         d[unknown] = space.directions(t[unknown], r[unknown], v[unknown], d[unknown])
-    found = bounded(d)
-    poor = found[2] < goal
-    if not search or not poor.any():
-        return found
-    other = d.copy()
-    other[poor] = space.directions(t[poor], r[poor], v[poor], d[poor])
-    again = bounded(other)
-    return bounded(np.where((again[2] > found[2])[:, None], other, d))
+
+    def bounded(k: NDArray[np.integer], d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
+        m = _bounded(space.escapes(t[k], half[k], (r[k], v[k], u[k]), d), path)
+        return m, *space.least(m, goal)
+
+    m, lower, upper, at = bounded(np.arange(len(t)), d)
+    poor = np.flatnonzero(upper < goal)
+    if not search or not len(poor):
+        return m, lower, upper, at
+    other = bounded(poor, space.directions(t[poor], r[poor], v[poor], d[poor]))
+    better = other[2] > upper[poor]
+    k = poor[better]
+    for values, found in zip((lower, upper, at), other[1:], strict=True):
+        values[k] = found[better]
+    order = np.r_[np.delete(np.arange(len(t)), k), k]
+    m = joined([m.of(order[: len(t) - len(k)]), other[0].of(better)]).of(np.argsort(order))
+    return m, lower, upper, at
 
 
 def coasting(space: Space, path: RobotPath, begin_s: float) -> Certificate:
