@@ -339,7 +339,9 @@ def _best_path(
     found = _moved(plain, found)
     if case.space is None or not case.limits.abort:
         return found if best is None else min(best, found, key=_safest)
-    return min(filter(None, (best, _refined(case, found))), key=_safest, default=None)
+    away = proven(case, found, withdrawn(case, found))
+    found = replace(found, escapes=away.escapes, short_m=away.short_m)
+    return min(filter(None, (best, found, _refined(case, found))), key=_safest)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:

@@ -122,7 +122,7 @@ class Case:
     @property
     def allowed_slack_m(self) -> float:
         """Slack of the programme up to which a path is checked [m]."""
-        return max(self.buffer_m, self.reserve_m)
+        return self.buffer_m if self.space is None else 2.0 * self.space.resolution_m
 
     @property
     def a_max(self) -> float:
