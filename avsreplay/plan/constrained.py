@@ -10,7 +10,9 @@ accepted only after the true constraints hold at sixteen instants of every inter
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 from operator import attrgetter
 
 import numpy as np
@@ -326,14 +328,10 @@ def _best_path(
         if other is not None and other.t_go_s >= case.earliest_s:
             return other
     plain = replace(case, limits=replace(case.limits, abort=False))
+    near = _near(case, free, drafts)
     found = _improved(plain, coarse, drafts, None)
-    if drafts and found is None:
-        near = sorted(
-            initial_references(case, free),
-            key=lambda reference: abs(reference.t - drafts[0].t_go_s),
-        )
-        for reference in near[:RETRIED]:
-            found = found or _converged(plain, reference)
+    for reference in near if found is None else ():
+        found = found or _converged(plain, reference)
     if found is None:
         return best
     found = _moved(plain, found)
@@ -341,7 +339,33 @@ def _best_path(
         return found if best is None else min(best, found, key=_safest)
     away = proven(case, found, withdrawn(case, found))
     found = replace(found, escapes=away.escapes, short_m=away.short_m)
-    return min(filter(None, (best, found, _refined(case, found))), key=_safest)
+    known = [path for path in (best, found) if path is not None]
+    for path in _withdrawing(case, found, drafts, near):
+        known += [] if path is None else [path]
+        if min(known, key=_safest).short_m <= case.reserve_m:
+            break
+    return min(known, key=_safest)
+
+
+def _near(case: Case, free: Plan, drafts: list[StepPath]) -> list[ReferencePath]:
+    """Return the initial paths whose end times are nearest to that of the earliest draft."""
+    if not drafts:
+        return []
+    references = initial_references(case, free)
+    references.sort(key=lambda reference: abs(reference.t - drafts[0].t_go_s))
+    return references[:RETRIED]
+
+
+def _withdrawing(
+    case: Case, found: StepPath, drafts: list[StepPath], near: list[ReferencePath]
+) -> Iterator[StepPath | None]:
+    """Search paths that keep the withdrawals: from the path that was found without them, then from
+    the drafts, then from initial paths.
+    """
+    for start, trust in product((found, *drafts[:IMPROVED]), (TRUST, CAREFUL)):
+        yield _refined(case, start, trust=trust)
+    for reference in near:
+        yield _converged(case, reference)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:

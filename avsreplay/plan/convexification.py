@@ -393,7 +393,7 @@ def withdrawn(
     """
     if case.space is None or case.coarse or not case.limits.abort:
         return Withdrawn()
-    below, tried = case.space.enough_m, tried or Tried.first(case.reserve_m)
+    below, tried = FAR * case.buffer_m, tried or Tried.first(case.reserve_m)
     found, tried, owner = sampled(case.space, path, tried, case.wait_s, since_s, improve, below)
     least = _accepted(case.space, found)
     short = max(least - found.margin_m, 0.0)
@@ -450,7 +450,9 @@ def _withdrawal_rows(
     instant and about the same time after it the worst.
     """
     limits, length = case.limits, end_s - case.wait_s
-    near = np.flatnonzero(found.margins_m < np.maximum(space.enough_m, required))
+    # what is missing is gained by moves of the path that also reduce larger margins
+    far = space.enough_m + 2.0 * float(np.maximum(required - found.margins_m, 0.0).max(initial=0.0))
+    near = np.flatnonzero(found.margins_m < required + far)
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
     after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
     late = np.round(after ** (1.0 / DENSER) * COMPARED)
