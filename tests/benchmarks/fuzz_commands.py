@@ -301,7 +301,7 @@ def build(folder: Path) -> None:
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
-    collect = run_command._collect
+    collect = run_command.collect
     with (
         contextlib.redirect_stdout(io.StringIO()) as out,
         contextlib.redirect_stderr(io.StringIO()),
@@ -315,10 +315,10 @@ def build(folder: Path) -> None:
         call("record", folder / "dense.toml", "-o", folder / "dense.mcap")
         with cached(folder / "cache"):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "result")
-        run_command._collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
+        run_command.collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
         with contextlib.suppress(click.Abort, KeyboardInterrupt):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "interrupted")
-        run_command._collect = collect
+        run_command.collect = collect
         call("sweep", folder / "campaign.toml", "-o", folder / "sweep", "--workers", "0")
     _files(folder)
 
