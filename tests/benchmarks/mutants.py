@@ -56,8 +56,8 @@ class Folder:
         self.map, self.verdicts = root / "map.npz", root / "verdicts.jsonl"
         self.probes = root / "probes"
 
-    def prepare(self) -> None:
-        """Copy the package once, and the tests as they are now."""
+    def prepare(self, renew: bool) -> None:
+        """Copy the package and the tests once; the tests as they are now, too, if ``renew``."""
         left_out = shutil.ignore_patterns(".git", "build", ".mypy_cache", "__pycache__", "shared")
         if not self.site.is_dir():
             shutil.copytree(ROOT / "avsreplay", self.site / "avsreplay", ignore=left_out)
@@ -67,7 +67,7 @@ class Folder:
             shutil.copytree(ROOT, self.checkout, ignore=left_out)
         (self.site / "sitecustomize.py").write_text(SITE, encoding="utf-8")
         shutil.copy(mutation.__file__, self.site)
-        for path in (ROOT / "tests").rglob("*"):
+        for path in (ROOT / "tests").rglob("*") if renew else ():
             other = self.checkout / path.relative_to(ROOT)
             if path.is_file() and "__pycache__" not in path.parts:
                 other.parent.mkdir(exist_ok=True, parents=True)
@@ -429,7 +429,7 @@ def main() -> int:
     )
     options = parser.parse_args()
     folder = Folder(options.folder.resolve())
-    folder.prepare()
+    folder.prepare(options.again)
     folder.enter()
     recorded(folder)
     return campaign(folder, options)
