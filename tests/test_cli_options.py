@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 from avsreplay.cli import options as shared
 from avsreplay.cli.options import read_options, source_options
-from avsreplay.cli.run import _collect
+from avsreplay.cli.run import collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 
@@ -97,14 +97,14 @@ def _interrupted(rows, kept):
 
 def test_an_interrupt_keeps_the_rows_so_far(make_rows):
     kept = []
-    assert _collect(_interrupted(make_rows(3), kept), kept)
+    assert collect(_interrupted(make_rows(3), kept), kept)
     assert [row.seq for row in kept] == [0, 1, 2]
-    assert not _collect((row for row in make_rows(2)), [])
+    assert not collect((row for row in make_rows(2)), [])
 
 
 def test_an_interrupt_before_the_first_row_ends_the_run():
     with pytest.raises(KeyboardInterrupt):
-        _collect(_interrupted([], []), [])
+        collect(_interrupted([], []), [])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")

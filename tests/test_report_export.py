@@ -23,7 +23,7 @@ from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
 from avsreplay.report import export, jsonl
 from avsreplay.report.export import (
-    FREQUENT,
+    FREQUENT_COLUMNS,
     columns_page,
     document_parts,
     row_poses,
@@ -161,9 +161,10 @@ def _rows_or_error(path: Path) -> list[Row] | str:
 
 def test_blocks_are_decoded_at_once_and_lines_counted_across_them(tmp_path, monkeypatch):
     text = (ROOT / "fixtures" / "tumble.rows.jsonl").read_bytes()
-    assert jsonl._checked_at_once(text, 35) == read_rows(ROOT / "fixtures" / "tumble.rows.jsonl")
-    monkeypatch.setattr(jsonl, "_BLOCK", 5000)  # about one row
-    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == jsonl._checked_at_once(text, 35)
+    one_by_one = [parse_row(json.loads(line), "") for line in text.splitlines()]
+    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == one_by_one
+    monkeypatch.setattr(jsonl, "_READ_BYTES", 5000)  # about one row
+    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == one_by_one
     lines = text.splitlines()
     lines[20] = lines[20].replace(b'"seq": 20', b'"seq": 19')
     (tmp_path / "a.jsonl").write_bytes(b"\n\n" + b"\n".join(lines))
@@ -277,7 +278,9 @@ def test_a_run_is_written_in_the_memory_of_some_of_its_rows(tmp_path, make_rows,
 def test_the_column_list_of_the_docs_is_current():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
     assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
-    assert {name for names in FREQUENT.values() for name in names} <= {c.name for c in columns()}
+    assert {name for names in FREQUENT_COLUMNS.values() for name in names} <= {
+        c.name for c in columns()
+    }
 
 
 def test_every_column_and_every_word_of_a_column_is_described():
