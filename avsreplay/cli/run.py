@@ -581,9 +581,10 @@ def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
 
 def _print(wanted: Wanted, done: _Finished) -> None:
     if wanted.as_json:
-        from avsreplay.report.export import dump_document
+        from avsreplay.report.export import document_parts
 
-        click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
+        for part in document_parts(done.rows, done.summary, done.record):
+            click.echo(part, nl=False)
         return
     from avsreplay.report.summary_tables import TABLES, print_screen, print_tables
     from avsreplay.report.table import make_console

@@ -295,7 +295,7 @@ def build(folder: Path) -> None:
         "scenario.toml": SCENARIO,
         "rules.toml": RULES,
         "robot.toml": ROBOT,
-        "task.toml": b"[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
+        "task.toml": "[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
         "dense.toml": SCENARIO.replace("[40, 40]", "[80, 80]"),
         "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml")),
     }
