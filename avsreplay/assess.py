@@ -247,6 +247,7 @@ def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessm
         "tolerance": CaptureError(*setup.limits.tolist()),
         "task": task.text,
         "basis": "flight over the log",
+        "asked": "grasp point" not in task.assumed,
     }
     if task.problem:
         return Assessment(

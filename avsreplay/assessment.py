@@ -63,6 +63,7 @@ class Assessment:
         change: what would change the answer, in words.
         task: the task in one line.
         in_fact: what happened; None where the true motion is not known.
+        asked: whether a grasp point was given, and is not the one that is assumed.
     """
 
     chance: Chance
@@ -78,6 +79,16 @@ class Assessment:
     change: str = ""
     task: str = ""
     in_fact: InFact | None = None
+    asked: bool = True
+
+    @property
+    def lowers_grade(self) -> bool:
+        """Whether a run with this assessment has a reason for concern beside the tracking.
+
+        A capture that is not assessed because the assumed grasp point cannot be used is none:
+        nobody asked for it.
+        """
+        return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 
     @property
     def succeeds(self) -> bool:
@@ -161,6 +172,7 @@ class Assessment:
             "tolerance": _errors_record(self.tolerance),
             "miss": _errors_record(self.miss),
             "task": self.task,
+            "asked": self.asked,
             "in_fact": None
             if fact is None
             else {
@@ -196,6 +208,7 @@ class Assessment:
             probability_95=None if interval is None else (float(interval[0]), float(interval[1])),
             tolerance=tolerance,
             miss=_errors_of(record["miss"]),
+            asked=bool(record.get("asked", True)),
             in_fact=None
             if fact is None
             else InFact(

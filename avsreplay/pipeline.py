@@ -77,11 +77,13 @@ class Measurement:
         guess: start, truth, given, predicted, last, acquired; measured: pose of the log.
         instants: (6, 6) mean instant for each direction [s] (``Registrar.instants``); None for the
             scan's instant.
+        weighed: the pose with the covariance that the estimate uses; None before it is examined.
     """
 
     alignment: Alignment
     guess: str
     instants: Array | None = None
+    weighed: Alignment | None = None
 
 
 @value_class
@@ -325,15 +327,15 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     tracked = _tracked(stages, state, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted, tracked)
     track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
-    prior, innovation, examined = _examined(stages, state, scan, predicted, measurement, repeated)
+    measurement = _weighed(stages, state, measurement)
+    prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
     lost = tracked is None and _prediction_lost(stages, scan, predicted)
     if acquired is None and examined.admission is not Admission.ADMITTED and lost:
         points = _deskewed(stages, state, scan, predicted)
         near = stages.estimator.frame.state_out(predicted.belief.x, scan.t_ns).T_ac
         measurement = _acquire(stages, state, scan, points, "acquired", near)
-        prior, innovation, examined = _examined(
-            stages, state, scan, predicted, measurement, repeated
-        )
+        measurement = _weighed(stages, state, measurement)
+        prior, innovation, examined = _examined(stages, scan, predicted, measurement, repeated)
     track, finding = stages.estimator.step(
         track, prior, innovation, examined.admission, state.monitors.convergence.converged
     )
@@ -457,15 +459,18 @@ def _seen(
     if before is None or not measurement.alignment.measured:
         return None
     prior = stages.estimator.predict(before, scan.t_ns)
-    alignment = _weighed(stages, state, measurement.alignment)
+    alignment = measurement.weighed or measurement.alignment
     return prior, stages.estimator.innovate(prior, alignment)
 
 
-def _weighed(stages: Stages, state: PipelineState, alignment: Alignment) -> Alignment:
-    """The pose with the covariance that the tracker finds instead of the claimed one."""
-    if stages.tracker is None:
-        return alignment
-    return stages.tracker.weighed(state.following.kinematics, alignment)
+def _weighed(stages: Stages, state: PipelineState, measurement: Measurement) -> Measurement:
+    """The measurement with the covariance that the estimate uses: while the target is driven that
+    of the tracker, because the noise of the free motion is adapted to its own innovations.
+    """
+    weighed = measurement.alignment
+    if stages.tracker is not None and state.following.driven:
+        weighed = stages.tracker.weighed(state.following.kinematics, weighed)
+    return replace(measurement, weighed=weighed)
 
 
 def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
@@ -653,7 +658,6 @@ def _measurement(
 
 def _examined(
     stages: Stages,
-    state: PipelineState,
     scan: Scan,
     predicted: Prediction,
     measurement: Measurement,
@@ -665,9 +669,7 @@ def _examined(
     if scan.times_s is not None and measurement.instants is not None:
         instants = stages.estimator.frame.instants_into(measurement.instants)
         predicted = with_scan_duration(predicted, instants, scan.times_s)
-    alignment = measurement.alignment
-    if state.following.driven:  # the noise of the free motion is adapted to its own innovations
-        alignment = _weighed(stages, state, alignment)
+    alignment = measurement.weighed or measurement.alignment
     innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
     return (
         predicted,

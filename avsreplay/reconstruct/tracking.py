@@ -18,7 +18,7 @@ from avsreplay.estimate.chart import Chart, to_errors
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.reference import reference_fit
+from avsreplay.estimate.reference import free_fit
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.registration import (
     Match,
@@ -112,7 +112,7 @@ def free_motion(t_ns: Sequence[int], poses: Sequence[Pose], extent: float) -> Fr
     """
     if len(poses) < MOTION_POSES or np.diff(t_ns).min() <= 0:
         return None
-    fitted = reference_fit(t_ns, poses, None, extent).fitted
+    fitted = free_fit(t_ns, poses, None, extent)
     agrees = np.asarray(fitted.weights > 0.5)
     if agrees.mean() < MOTION_SHARE:
         return None

@@ -67,7 +67,8 @@ class RunVerdict:
     """The verdict on one run.
 
     Attributes:
-        grade: the worse one of tracking and capture; a capture that is not likely is a CHECK.
+        grade: the worse one of tracking and capture; a capture that is not likely is a CHECK,
+            one that is not assessed because nobody gave a grasp point is not.
         tracking: the worst grade of all reasons.
         reasons: the reasons about the tracking, worst first.
         capture: the assessment of the capture; None where there is none.
@@ -162,7 +163,7 @@ def verdict_of(
         outside.append(Concern(worst if advice["grade"] == "fail" else Grade.CHECK, advice["text"]))
     reasons = sorted((*outside, *judged), key=lambda reason: reason.grade is not Grade.FAIL)
     tracking, capture = reasons[0].grade if reasons else Grade.PASS, summary.assessment
-    bad = capture is not None and not capture.succeeds
+    bad = capture is not None and capture.lowers_grade
     return RunVerdict(
         grade=Grade.CHECK if bad and tracking is Grade.PASS else tracking,
         tracking=tracking,
