@@ -375,6 +375,23 @@ def test_a_prediction_that_leaves_no_room_to_approach_is_named(cli, fixtures_fol
 
 
 @pytest.mark.slow
+@pytest.mark.slow  # it plans
+def test_without_plans_poses_are_the_same_and_no_capture_is_assessed(cli, fixtures_folder):
+    log, soon = fixtures_folder / "tumble.mcap", ("--set", "convergence.criterion=covariance")
+    planned, unplanned = (
+        json.loads(cli("run", log, "--json", *soon, "--set", f"plan.enabled={value}").out)
+        for value in ("true", "false")
+    )
+    same = ("gamma", "x_m", "y_m", "z_m", "pos_err_m", "rot_err_deg", "nis")
+    for one, other in zip(planned["rows"], unplanned["rows"], strict=True):
+        assert [one[name] for name in same] == [other[name] for name in same]
+        assert other["capture_time_s"] is None
+    assert any(row["capture_time_s"] is not None for row in planned["rows"])
+    assessment = unplanned["summary"]["assessment"]
+    assert assessment["chance"] == "not assessed"
+    assert "plan.enabled" in assessment["limit"]
+
+
 def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
     early = "limits.clearance_sigmas=1", "task.position_m=0.05"  # a capture is planned in 12 s

@@ -41,6 +41,11 @@ RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in 
 class PlanParams(Settings):
     """Capability of the robot, and how it plans."""
 
+    enabled: bool = setting(
+        True,
+        "Plan and fly an approach. Without it no capture is assessed, and a run under constraints"
+        " takes about half of the time.",
+    )
     a_max_mps2: float = setting(
         0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0
     )
