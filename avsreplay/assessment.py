@@ -15,7 +15,8 @@ from typing import Any
 from avsreplay.errors import value_class
 from avsreplay.outcome import CaptureError
 
-LIKELY, POSSIBLE = 0.9, 0.5  # least probabilities of a capture that is called likely, possible
+LIKELY_PROBABILITY = 0.9  # least probability of a capture that is called likely
+POSSIBLE_PROBABILITY = 0.5  # least probability of a capture that is called possible
 
 
 class Chance(Enum):
@@ -223,9 +224,9 @@ class Assessment:
 
 def chance_of(probability: float) -> Chance:
     """Return how likely a capture is, in one word, from its probability."""
-    if probability >= LIKELY:
+    if probability >= LIKELY_PROBABILITY:
         return Chance.LIKELY
-    return Chance.POSSIBLE if probability >= POSSIBLE else Chance.UNLIKELY
+    return Chance.POSSIBLE if probability >= POSSIBLE_PROBABILITY else Chance.UNLIKELY
 
 
 def errors_text(errors: CaptureError) -> str:

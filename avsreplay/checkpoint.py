@@ -35,13 +35,13 @@ from avsreplay.binary_files import parse_npy, read_limited, read_members
 from avsreplay.errors import UnreadableInput
 from avsreplay.read_budget import BadFile, ReadBudget
 
-VERSION = 2  # of the format of the document; a file of another version is not read
+CHECKPOINT_VERSION = 2  # of the format of the document; a file of another version is not read
 TRANSIENT = {"transient": True}
 """Metadata of a field that is not stored: the continued run begins with its default."""
 
 _PACKAGE = __name__.partition(".")[0]
 _HINT = "start the run anew with --overwrite"
-_MOST_BYTES = 16 << 30
+_MAX_CHECKPOINT_BYTES = 16 << 30
 _DOCUMENT = "state.json"
 _ATOMS = (str, bool, int, type(None))
 _CONTAINERS: dict[str, Callable[[Iterable[Any]], Any]] = {
@@ -85,7 +85,7 @@ def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
         UnreadableInput: the file is missing, damaged, of another version, or contains what a
             checkpoint never contains.
     """
-    data = read_limited(path, _MOST_BYTES, _HINT)
+    data = read_limited(path, _MAX_CHECKPOINT_BYTES, _HINT)
     try:
         return _Reader(data, named, like).value()
     except (BadFile, ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
@@ -106,7 +106,7 @@ class _Packer:
 
     def packed(self, value: Any) -> bytes:
         root = self._child(value)
-        document = {"version": VERSION, "root": root, "nodes": self._nodes}
+        document = {"version": CHECKPOINT_VERSION, "root": root, "nodes": self._nodes}
         text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
         out = io.BytesIO()
         numbers = {
@@ -215,7 +215,10 @@ class _Reader:
         if _DOCUMENT not in members:
             raise BadFile("it has no document")
         document = json.loads(members.pop(_DOCUMENT).tobytes(), parse_constant=_no_number)
-        if document.keys() != {"version", "root", "nodes"} or document["version"] != VERSION:
+        if (
+            document.keys() != {"version", "root", "nodes"}
+            or document["version"] != CHECKPOINT_VERSION
+        ):
             raise BadFile("it has another version")
         self._arrays = {
             kind: array.view("?") if kind == "b1" else array for kind, array in members.items()

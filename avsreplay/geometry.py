@@ -39,7 +39,8 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
     return array
 
 
-IDENTITY_QUAT, _CONJUGATE = frozen([0.0, 0.0, 0.0, 1.0]), frozen([-1.0, -1.0, -1.0, 1.0])
+IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
+_CONJUGATE = frozen([-1.0, -1.0, -1.0, 1.0])
 
 
 def skew(v: ArrayLike) -> Array:

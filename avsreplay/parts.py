@@ -103,7 +103,9 @@ def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
 
 BACKENDS = Parts("avsreplay.backends", "registration back end", "--backend")
 FAULTS = Parts("avsreplay.faults", "kind of fault", "kind")
-OWN, PRINTED = "own", "paper"  # the estimators that are no plug-ins
+# the estimators that are no plug-ins
+OWN = "own"
+PRINTED = "paper"
 ESTIMATORS = Parts(
     "avsreplay.estimators",
     "estimator",

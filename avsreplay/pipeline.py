@@ -61,11 +61,12 @@ from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import Effort, effort_for, shown
 from avsreplay.tracker import Kinematics, Tracker
 
-_NAMED = 3  # poses that explain one scan, or are equal, and are named
-MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
+_LISTED_POSES = 3  # poses that explain one scan, or are equal, and are named
+MAX_POSITION_3S_OF_REACH = 0.25
+MAX_ATTITUDE_3S_RAD = np.radians(15.0)
 # Scans in a row that the estimate of the free body uses, after which the target counts as free
 # again. With fewer it is left and returned to more often.
-FREE_AGAIN = 10
+FREE_AGAIN_SCANS = 10
 
 
 @value_class
@@ -438,7 +439,7 @@ def _followed_on(
     contradicted = confirmed and finding in (Finding.UNEXPLAINED, Finding.OPEN)
     unexplained = contradicted and finding is Finding.UNEXPLAINED
     used = 0 if contradicted else before.used + finding.used
-    driven = unexplained or (before.driven and used < FREE_AGAIN)
+    driven = unexplained or (before.driven and used < FREE_AGAIN_SCANS)
     shown = None
     if driven and kinematics is not None:
         known = kinematics.t_ns == scan.t_ns or tracker.predicted(kinematics, scan.t_ns) is not None
@@ -604,14 +605,14 @@ def _acquire(
         one = frame.register(points, best, scan.seq, False, effort, None)
         found = replace(one, message=one.message or _equal_words(found))
     elif found.members and not found.message:
-        options = _options(found.members[:_NAMED])
+        options = _options(found.members[:_LISTED_POSES])
         found = replace(found, message=f"{len(found.members)} poses explain the scan: {options}")
     return _measurement(stages, scan, points, found, origin)
 
 
 def _equal_words(found: Alignment) -> str:
     """That the pose is one of several that a symmetry of the model makes equal."""
-    others = _options(found.members[1 : _NAMED + 1])
+    others = _options(found.members[1 : _LISTED_POSES + 1])
     return (
         f"one of {len(found.members)} poses that the symmetry of the model makes equal"
         f" ({found.free_directions}); the others: {others}"

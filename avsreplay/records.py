@@ -28,6 +28,8 @@ from avsreplay.geometry import (
     rotate,
 )
 
+NS_PER_S = 1_000_000_000
+MAX_STAMP_S = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
     "rate": slice(3, 6),  # w_b [rad/s]

@@ -42,7 +42,7 @@ from avsreplay.report.view import (
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.settings import dump
-from avsreplay.spool import Spool, SpoolFile, write_npz
+from avsreplay.spool import LARGEST_STORED, Spool, SpoolFile, write_npz
 from avsreplay.tables import PoseTable, column_of
 from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
@@ -63,7 +63,7 @@ OWN = frozenset(
         CHECKPOINT,
     }
 )
-_MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
+_MAX_BELIEF_BYTES = 1 << 30
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
 _DRIVEN = (
@@ -182,7 +182,7 @@ def read_beliefs(path: Path) -> BeliefTable:
         UnreadableInput: the file is missing or not as a run writes it.
     """
     hint = "name a directory written by run -o"
-    arrays = read_npz(path, _SHAPES, limit=_MOST_BELIEF_BYTES, hint=hint, optional=_DRIVEN)
+    arrays = read_npz(path, _SHAPES, limit=_MAX_BELIEF_BYTES, hint=hint, optional=_DRIVEN)
     found = BeliefTable(arrays)
     try:
         found.check()
@@ -197,7 +197,7 @@ def _defect(belief: Belief) -> str:
     numbers = np.concatenate([mean_vector(x), P.ravel()])
     if isinstance(belief, DrivenBelief):
         numbers = np.concatenate([numbers, belief.u, belief.P_u.ravel(), belief.cross.ravel()])
-    if not (np.isfinite(numbers).all() and np.abs(numbers).max() < _LARGEST):
+    if not (np.isfinite(numbers).all() and np.abs(numbers).max() < LARGEST_STORED):
         return "is not finite"
     if any(abs(np.linalg.norm(q) - 1.0) > 1e-6 for q in (x.q_ab, x.q_bc)):
         return "has a quaternion that is not of unit length"

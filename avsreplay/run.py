@@ -41,13 +41,9 @@ from avsreplay.toml_document import own_settings
 if TYPE_CHECKING:
     from avsreplay.reconstruct.model import Reconstruction
 
-RECONSTRUCTED, MOST_LOSSES = (
-    Path("auto"),
-    100,
-)  # a model built from the log; losses listed one by one in run.json
-
-
-_EQUAL_DEG = 3.0  # an error below this is not that of another one of equal poses
+RECONSTRUCTED = Path("auto")  # a model built from the log
+MAX_LISTED_LOSSES = 100  # in run.json
+_EQUAL_POSE_DEG = 3.0  # an error below this is not that of another one of equal poses
 
 
 @value_class
@@ -430,7 +426,7 @@ class Run:
             "clock": settings.dump(self.source.clock),
             "clouds": self.source.meaning.record(),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
-            "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
+            "losses": {"count": len(losses), "first": settings.dump(losses[:MAX_LISTED_LOSSES])},
             "selection": settings.dump(self.job.options),
             "robot": self.config.robot_line,
             "approach": settings.dump(self.approach),
@@ -505,7 +501,7 @@ class Run:
         if truth is None:
             return
         found, best = outcome.alignment.T_ac, truth
-        if pose_error(found, truth).angle_deg > _EQUAL_DEG:
+        if pose_error(found, truth).angle_deg > _EQUAL_POSE_DEG:
             images = self.registrar.images(truth)
             best = min(images, key=lambda pose: pose_error(found, pose).angle_deg)
         self._image = truth.inverse() @ best

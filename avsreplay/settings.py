@@ -23,7 +23,7 @@ from avsreplay.parts import Parts
 
 S = TypeVar("S", bound="Settings")
 
-LARGEST = 1e100  # of every setting: squares and products of two settings remain finite
+LARGEST_NUMBER = 1e100  # of every setting: squares and products of two settings remain finite
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,8 +111,8 @@ class Setting:
                 each = "each value " if several else ""
                 shown = list(value) if several else value
                 allowed = self.range or "finite"
-                if LARGEST < abs(number) < math.inf:
-                    allowed = f"at most {LARGEST:g} in magnitude"
+                if LARGEST_NUMBER < abs(number) < math.inf:
+                    allowed = f"at most {LARGEST_NUMBER:g} in magnitude"
                 raise SettingError(name, f"{name} is {shown}, {each}must be {allowed}{unit}")
 
     def _allows(self, number: float) -> bool:
@@ -122,7 +122,7 @@ class Setting:
             and (self.below is None or number < self.below)
             and (self.high is None or number <= self.high)
         )
-        return inside and (abs(number) <= LARGEST or (self.infinite and math.isinf(number)))
+        return inside and (abs(number) <= LARGEST_NUMBER or (self.infinite and math.isinf(number)))
 
 
 class SettingError(ValueError):

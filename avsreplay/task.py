@@ -27,14 +27,16 @@ from avsreplay.settings import SettingError, Settings, given, is_unit, setting
 Closest = Callable[[Array], tuple[Array, Array]]
 """Points (n, 3) in {C} -> closest points of the surface (n, 3) and signed distances (n,)."""
 
-PATCHES = 3  # grasp points that are proposed
+PROPOSED_PATCHES = 3  # grasp points that are proposed
 _LINE_POINTS = 801  # points of the straight approach at which the distance to the body is taken
-_PAST = 1.2  # length of a corridor over the distance at which the clearance begins
-_LEAST_CORRIDOR = 0.06  # shorter ones are not needed, over the target's extent
-_WIDEST = 0.04  # largest half opening that is assumed for a gripper, over the target's extent
+_CORRIDOR_RATIO = 1.2  # length of a corridor over the distance at which the clearance begins
+_LEAST_CORRIDOR_OF_EXTENT = 0.06  # shorter ones are not needed, over the target's extent
+# largest half opening that is assumed for a gripper, over the target's extent
+_MAX_OPENING_OF_EXTENT = 0.04
 _FLAT_COS = math.cos(math.radians(8.0))  # faces of a patch have normals within this angle
-_FLAT_OFFSET = 0.003  # and lie within this distance of its plane, over the target's extent
-_SEEDS = 24  # largest faces from which patches are grown
+# and lie within this distance of its plane, over the target's extent
+_FLAT_OFFSET_OF_EXTENT = 0.003
+_SEED_FACES = 24  # largest faces from which patches are grown
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +277,7 @@ def task_of(
     half, mouth, begin, problem = _access(
         point, out, surface, closest, params.opening_m, tolerance.position_m, clearance, extent
     )
-    corridor = _PAST * begin
+    corridor = _CORRIDOR_RATIO * begin
     return Task(
         point,
         out,
@@ -284,7 +286,7 @@ def task_of(
         radius,
         mouth,
         math.inf if params.deadline_s is None else params.deadline_s,
-        corridor if corridor > _LEAST_CORRIDOR * extent else 0.0,
+        corridor if corridor > _LEAST_CORRIDOR_OF_EXTENT * extent else 0.0,
         _assumed(params, supervisor, robot),
         problem,
     )
@@ -330,7 +332,7 @@ def _access(
     along = np.linspace(0.0, extent, _LINE_POINTS)
     foot, gap = closest(point + along[:, None] * axis)
     off = float(np.linalg.norm(foot[0] - point))
-    allowed = _WIDEST * extent if opening_m is None else 0.5 * opening_m
+    allowed = _MAX_OPENING_OF_EXTENT * extent if opening_m is None else 0.5 * opening_m
     if not len(surface.faces):
         problem = (
             f"the grasp point is {off:.3g} m from the nearest point of the model"
@@ -374,7 +376,7 @@ def patches(surface: Surface, closest: Closest) -> tuple[Patch, ...]:
             x, y, z = (round(float(v), 5) for v in point)
             axis = (float(normal[0]), float(normal[1]), float(normal[2]))
             out.append(Patch(f"flat-{len(out) + 1}", (x, y, z), axis, area))
-        if len(out) == PATCHES:
+        if len(out) == PROPOSED_PATCHES:
             break
     return tuple(out)
 
@@ -386,12 +388,16 @@ def _flat(surface: Surface) -> Iterator[tuple[Array, Array, float]]:
     doubled = np.linalg.norm(cross, axis=1)
     normals, areas = cross / np.maximum(doubled, 1e-300)[:, None], 0.5 * doubled
     middles, free = corners.mean(axis=1), areas > 0.0
-    for seed in np.argsort(-areas, kind="stable")[:_SEEDS]:
+    for seed in np.argsort(-areas, kind="stable")[:_SEED_FACES]:
         if not free[seed]:
             continue
         normal = normals[seed]
         level = np.abs((corners - corners[seed, 0]) @ normal).max(axis=1)
-        flat = (normals @ normal > _FLAT_COS) & (level < _FLAT_OFFSET * surface.extent) & free
+        flat = (
+            (normals @ normal > _FLAT_COS)
+            & (level < _FLAT_OFFSET_OF_EXTENT * surface.extent)
+            & free
+        )
         weights = areas[flat]
         centre = weights @ middles[flat] / weights.sum()
         listed = np.flatnonzero(flat)

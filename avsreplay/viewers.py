@@ -32,10 +32,9 @@ from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
-SHOWN_POINTS = (
-    2000  # most points of a scan that a viewer gets; the log of the scans has all of them
-)
-RESIDUAL_REACH = 0.05  # largest residual that is shown, over the model's extent
+# most points of a scan that a viewer gets; the log of the scans has all of them
+MAX_SHOWN_POINTS = 2000
+MAX_RESIDUAL_OF_EXTENT = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _IN_MESSAGES = {
@@ -77,9 +76,9 @@ def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
         scan: one of its scans.
     """
     source, pose = scan.outcome.scan, scan.outcome.pose
-    cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=SHOWN_POINTS)
+    cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=MAX_SHOWN_POINTS)
     distances = run.registrar.distance(
-        cloud.points, pose, RESIDUAL_REACH * run.registrar.index.extent_m
+        cloud.points, pose, MAX_RESIDUAL_OF_EXTENT * run.registrar.index.extent_m
     )
     return CloudView(cloud.seq, cloud.points, np.asarray(distances, np.float32), cloud.intensity)
 
@@ -213,7 +212,9 @@ class RerunStream:
         rr, row, outcome = self._rr, scan.row, scan.outcome
         rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
         cloud = shown_cloud(self._run, scan)
-        share = np.asarray(cloud.residual_m) / (RESIDUAL_REACH * self._run.registrar.index.extent_m)
+        share = np.asarray(cloud.residual_m) / (
+            MAX_RESIDUAL_OF_EXTENT * self._run.registrar.index.extent_m
+        )
         rr.log("camera/scan", rr.Points3D(cloud.points, colors=_colours(share)))
         self._place("camera/estimate", outcome.pose)
         if scan.truth.pose is not None:

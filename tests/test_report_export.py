@@ -162,7 +162,7 @@ def _rows_or_error(path: Path) -> list[Row] | str:
 def test_blocks_are_decoded_at_once_and_lines_counted_across_them(tmp_path, monkeypatch):
     text = (ROOT / "fixtures" / "tumble.rows.jsonl").read_bytes()
     assert jsonl._checked_at_once(text, 35) == read_rows(ROOT / "fixtures" / "tumble.rows.jsonl")
-    monkeypatch.setattr(jsonl, "_BLOCK", 5000)  # about one row
+    monkeypatch.setattr(jsonl, "_READ_BYTES", 5000)  # about one row
     assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == jsonl._checked_at_once(text, 35)
     lines = text.splitlines()
     lines[20] = lines[20].replace(b'"seq": 20', b'"seq": 19')

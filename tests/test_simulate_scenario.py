@@ -20,7 +20,7 @@ from avsreplay.simulate import faults as kinds
 from avsreplay.simulate.faults import InjectedFault, active
 from avsreplay.simulate.recorded_faults import disturbed
 from avsreplay.simulate.scenario import StartParams, belief, load_scenario, scenario_of
-from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.simulation import SIMULATED_EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
 
 CAMPAIGN_KINDS = {  # what docs/results.md has figures of
@@ -102,7 +102,7 @@ def test_builtin_scans_have_about_4000_points():
 def test_scans_come_at_their_instants_with_their_truth(plain):
     simulation = simulate(scenario(), SURFACE)
     assert [s.seq for s in plain] == list(range(12))
-    assert [s.t_ns - EPOCH_NS for s in plain] == [500_000_000 * k for k in range(12)]
+    assert [s.t_ns - SIMULATED_EPOCH_NS for s in plain] == [500_000_000 * k for k in range(12)]
     for scan in plain:
         assert scan.t_ns == scan.log_ns
         assert scan.points.dtype == np.float32
@@ -295,7 +295,7 @@ def test_a_motion_that_needs_too_many_steps_is_one_line():
 
 
 def test_a_motion_that_becomes_too_fast_is_one_line(monkeypatch):
-    monkeypatch.setattr("avsreplay.simulate.motion.MOST_STEPS", 200)
+    monkeypatch.setattr("avsreplay.simulate.motion.MAX_INTEGRATION_STEPS", 200)
     found = scenario()
     motion = replace(found.params.motion, torque_std_radps2=100.0, disturbance_step_s=0.1)
     with pytest.raises(UsageError, match="steps"):

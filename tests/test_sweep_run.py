@@ -323,7 +323,7 @@ def test_a_dry_run_only_prints_the_plan(campaign, tmp_path):
 @pytest.mark.slow
 def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
     assert isinstance(CliRunner().invoke(sweep_command, [str(campaign)]).exception, UsageError)
-    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "CONNECT_S", 1)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "CONNECT_TIMEOUT_S", 1)
     done = sweep(campaign, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
     assert isinstance(done.exception, UnreadableInput)
     assert "does not answer" in str(done.exception)
@@ -414,7 +414,7 @@ def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkey
     """Batches of 2 runs and of 1 scan give the same values."""
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "BATCH", 2)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "RUN_BATCH", 2)
     monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "SCAN_BATCH", 1)
     assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
     for name in ("results.parquet", "scans.parquet"):

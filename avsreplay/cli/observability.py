@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from avsreplay.run import ReplayedScan, Run
     from avsreplay.score import Reference
 
-WIDTH = 100
+OBSERVABILITY_WIDTH_CHARACTERS = 100
 HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
 
 EPILOG = """\b
@@ -188,7 +188,7 @@ def _print(found: dict[str, Any]) -> None:
         (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name])))
         for line in found["lines"]
     )
-    console = make_console(plain_width=WIDTH)
+    console = make_console(plain_width=OBSERVABILITY_WIDTH_CHARACTERS)
     note = (
         "ogm_rank and ogm_log10_cond of 'run' are along the motion fitted to the poses up to that"
         " scan"

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from avsreplay.replan import Replanning
     from avsreplay.saved_result import Saved
 
-PLAN, LIMITS = "avsreplay.plan.rendezvous:PlanParams", "avsreplay.plan.limits:Limits"
+PLAN = "avsreplay.plan.rendezvous:PlanParams"
+LIMITS = "avsreplay.plan.limits:Limits"
 # settings changed one at a time where no plan is found, with the factors of their values, and later
 # instants, in seconds
 CHANGES = (

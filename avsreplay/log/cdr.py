@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage
-from avsreplay.records import Label, State
+from avsreplay.records import NS_PER_S, Label, State
 
-_U32, _STAMP = struct.Struct("<I"), struct.Struct("<iI")
+_U32 = struct.Struct("<I")
+_STAMP = struct.Struct("<iI")
 _CDR_LITTLE = {
     0x0001: "<",
     0x0000: ">",
@@ -122,7 +123,7 @@ class Cursor:
     def stamp(self) -> int:
         """Return the next time [ns]."""
         seconds = self.u32() if self.ros1 else self.i32()
-        return seconds * 1_000_000_000 + self.u32()
+        return seconds * NS_PER_S + self.u32()
 
     def header(self) -> tuple[int, str]:
         """Return stamp [ns] and frame of the next std_msgs Header."""
@@ -202,7 +203,7 @@ class Packer:
 
     def header(self, t_ns: int, frame: str) -> Packer:
         """Append a std_msgs Header. Raises ValueError if ``t_ns`` does not fit a ROS 2 time."""
-        seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
+        seconds, nanoseconds = divmod(t_ns, NS_PER_S)
         if not -(2**31) <= seconds < 2**31:
             raise ValueError(f"stamp {t_ns} ns does not fit a ROS 2 time")
         self._align(4)

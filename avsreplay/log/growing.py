@@ -19,15 +19,15 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log.bytes_io import shown
-from avsreplay.log.mcap_format import DATA_END, MAGIC
+from avsreplay.log.mcap_format import MAGIC, Opcode
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.source import Source
 from avsreplay.records import Scan, Truth
 
 _POLL_S = 0.05
-_PER_OPENING = 2.0  # seconds between two openings, per second that an opening takes
-_BLOCK = 1 << 16
+_OPENING_DURATIONS = 2.0  # seconds between two openings, per second that an opening takes
+_COPIED_BYTES = 1 << 16  # most bytes of a stream that are read at once
 _NO_POINTS = np.zeros((0, 3), np.float32)
 
 
@@ -161,7 +161,7 @@ class GrowingLog:
                     if self.finished:
                         raise
                 finally:
-                    self._pause_s = max(_POLL_S, _PER_OPENING * (time.monotonic() - begun))
+                    self._pause_s = max(_POLL_S, _OPENING_DURATIONS * (time.monotonic() - begun))
             self._stop.wait(self._pause_s)
 
     def stop(self) -> None:
@@ -179,7 +179,7 @@ class GrowingLog:
                 file.seek(self._at)
                 head = file.read(9)
                 end = self._at + 9 + int.from_bytes(head[1:], "little")
-                if head[0] == DATA_END:  # the summary follows; a stream is read to its end
+                if head[0] == Opcode.DATA_END:  # the summary follows; a stream is read to its end
                     ending = ending or (not self._fed and self._closed(size))
                     break
                 if end > size:
@@ -201,7 +201,7 @@ class GrowingLog:
         read = getattr(feed, "read1", feed.read)
         try:
             with copy:
-                while block := read(_BLOCK):
+                while block := read(_COPIED_BYTES):
                     copy.write(block)
         except OSError as error:  # the stream cannot be read, or the disk is full
             self._broken = error

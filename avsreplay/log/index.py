@@ -19,10 +19,9 @@ from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.point_cloud2 import Layout
 from avsreplay.log.raw_cloud import RawCloud
+from avsreplay.records import MAX_STAMP_S, NS_PER_S
 
-MAX_NS = (
-    2**31 - 2
-) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
+MAX_NS = MAX_STAMP_S * NS_PER_S  # a later time is cut to this
 CLOUD_TYPES = tuple(LAYOUTS)
 POSE_NAMES = (
     "geometry_msgs/msg/PoseStamped",
@@ -32,7 +31,7 @@ POSE_NAMES = (
 )
 """Types that hold one stamped pose."""
 _COMPRESSIONS = ("", "zstd", "lz4", "bz2")
-_KEPT = 2  # decompressed chunks held in memory
+_CACHED_CHUNKS = 2  # decompressed chunks held in memory
 _INDEXED = (*CLOUD_TYPES, *POSE_NAMES, *IMAGE_TYPES, CAMERA_INFO)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
@@ -213,7 +212,7 @@ class ChunkStore:
         Raises BadMessage if the file has changed since it was indexed.
         """
         if number not in self._cache:
-            if len(self._cache) >= _KEPT:
+            if len(self._cache) >= _CACHED_CHUNKS:
                 self._cache.pop(next(iter(self._cache)))
             packed = self._file.read(self._offset[number], self._packed[number])
             self._cache[number] = inflate(

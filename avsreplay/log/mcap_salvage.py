@@ -61,7 +61,8 @@ class ChannelTable:
             self._table.declare(channel.topic, channel.type, channel.encoding)
 
 
-_POSE, _ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+_POSE = "geometry_msgs/msg/PoseStamped"
+_ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def guess_channel(number: int, payload: memoryview, library: str) -> Channel | None:
@@ -103,7 +104,7 @@ _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
 def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
     """Return whether a plausible chunk record begins at ``at`` and ends before ``stop``."""
     try:
-        mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX), stop - at)
+        mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX_BYTES), stop - at)
     except BadMessage:
         return False
     return True
@@ -122,7 +123,7 @@ def begins_record(file: ByteFile, at: int) -> bool:
 def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
     """Return whether a record with a private opcode is a chunk except for its first byte."""
     try:
-        mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX - 1), end - at)
+        mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX_BYTES - 1), end - at)
     except BadMessage:
         return False
     return True

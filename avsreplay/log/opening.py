@@ -267,7 +267,8 @@ def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
             )
 
 
-_STORAGE, BAG_METADATA = (".mcap", ".db3"), "metadata.yaml"
+_STORAGE = (".mcap", ".db3")
+BAG_METADATA = "metadata.yaml"
 _NUMBERED = re.compile(r"_\d+(?=\.)")  # of the parts of a bag: drive_0.mcap, drive_1.mcap
 _LISTED = re.compile(
     r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE

@@ -35,7 +35,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
-_MAX_HEADER = 1 << 16
+_MAX_PLY_HEADER_BYTES = 1 << 16
 _VALUE_BYTES = 8  # memory of a value
 
 
@@ -116,7 +116,7 @@ def read_ply(data: bytes, budget: ReadBudget | None = None) -> Ply:
 
 
 def _header(data: bytes) -> tuple[str | None, list[_Element], int]:
-    end = data.find(b"end_header", 0, _MAX_HEADER)
+    end = data.find(b"end_header", 0, _MAX_PLY_HEADER_BYTES)
     if not data.startswith(b"ply") or end < 0:
         raise BadFile("no PLY header")
     line_end = data.find(b"\n", end)

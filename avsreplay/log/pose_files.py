@@ -22,9 +22,9 @@ from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import MeasuredPose, Pose, matrix, normalise
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.pose_messages import pose_of_numbers
+from avsreplay.records import MAX_STAMP_S, NS_PER_S
 
-_MAX_BYTES = 256 << 20
-_MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
+_MAX_POSE_FILE_BYTES = 256 << 20
 _MAX_METRES = 1e9
 
 
@@ -48,9 +48,7 @@ def seconds_to_ns(text: str) -> int | None:
     """
     try:
         value = Decimal(text)
-        return (
-            int((value * 1_000_000_000).to_integral_value()) if abs(value) < _MAX_SECONDS else None
-        )
+        return int((value * NS_PER_S).to_integral_value()) if abs(value) < MAX_STAMP_S else None
     except (InvalidOperation, ValueError):
         return None
 
@@ -61,7 +59,7 @@ def _whole_ns(word: str) -> int:
     Raises ValueError where it is none, or is beyond what 64 bits can hold.
     """
     t_ns = int(word)
-    if abs(t_ns) >= _MAX_SECONDS * 1_000_000_000:
+    if abs(t_ns) >= MAX_STAMP_S * NS_PER_S:
         raise ValueError
     return t_ns
 
@@ -70,7 +68,7 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     """Yield (file and line, words, whether "," or ";" separates them) of each line that is not
     empty or a comment.
     """
-    raw = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True)
+    raw = read_limited(path, _MAX_POSE_FILE_BYTES, "name a file of poses", pipe=True)
     code = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     text = raw.decode(code, "backslashreplace")
     for number, line in enumerate(text.splitlines(), 1):

@@ -31,14 +31,15 @@ from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS
 from avsreplay.records import Label, LogHeader, Scan, State
 
-CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = (
-    "/points",
-    "/truth/pose",
-    "/truth/body",
-    "/faults",
-)
+CLOUD_TOPIC = "/points"
+TRUTH_TOPIC = "/truth/pose"
+BODY_TOPIC = "/truth/body"
+FAULT_TOPIC = "/faults"
 CAMERA_TOPIC = "/camera/pose"
-CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"
+CAMERA_FRAME = "camera"
+TARGET_FRAME = "target"
+BODY_FRAME = "target_body"
+ROOT_FRAME = "map"
 LIBRARY = "avsreplay"
 _TYPES = {
     CLOUD_TOPIC: "sensor_msgs/msg/PointCloud2",

@@ -15,19 +15,18 @@ from avsreplay.records import Scan
 from avsreplay.register.sampling import at_instant
 from avsreplay.register.surface_index import kernel_module
 
-SAMPLE = 24  # most scans from which extent and position of the camera are determined
-NEIGHBOURS = 12  # nearest points from which a normal is estimated
-ISOLATED = (
-    4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
-)
+SURVEYED_SCANS = 24  # most scans from which extent and position of the camera are determined
+NORMAL_NEIGHBOURS = 12  # nearest points from which a normal is estimated
+# a point is isolated if its fourth neighbour is farther than this many times the median
+ISOLATED_DISTANCE_RATIO = 4.0
 # points closer than this many times the typical distance of the fourth neighbour belong together
-LINK = 2.0
-SMALL_GROUP = 0.02  # a group with a smaller share of the points does not count for the extent
+LINK_DISTANCE_RATIO = 2.0
+SMALL_GROUP_SHARE = 0.02  # a group with a smaller share of the points does not count for the extent
 SIDES = np.array(
     [0.61, 0.53, 0.59]
 )  # the two sides of a thin wall have normals of opposite sign along this direction
 # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
-FAR_OF_EXTENT = 0.6
+ORIGIN_DISTANCE_OF_EXTENT = 0.6
 
 
 @value_class
@@ -85,7 +84,7 @@ class Twist:
 
 
 def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: int) -> Survey:
-    """Read all scans once; at most SAMPLE of them are in memory at a time.
+    """Read all scans once; at most SURVEYED_SCANS of them are in memory at a time.
 
     Args:
         scans: gives the scans of the log from its begin each time it is called.
@@ -101,7 +100,7 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
             continue
         if len(usable) % stride == 0:
             kept.append(scan)
-        if len(kept) > SAMPLE:
+        if len(kept) > SURVEYED_SCANS:
             kept, stride = kept[::2], 2 * stride
         usable.append(offered - 1)
     chosen = tuple(usable[:: max(1, -(-len(usable) // n_scans))])
@@ -181,24 +180,24 @@ def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
 
 
 def _connected(points: Array) -> Array:
-    """The points without isolated ones: the fourth neighbour is farther away than ISOLATED
-    times the median.
+    """The points without isolated ones: the fourth neighbour is farther away than
+    ISOLATED_DISTANCE_RATIO times the median.
     """
     distance = spacings(point_tree(points), points)
-    return np.asarray(points[distance < ISOLATED * np.median(distance)])
+    return np.asarray(points[distance < ISOLATED_DISTANCE_RATIO * np.median(distance)])
 
 
 def extent_of(points: Array) -> float:
     """Return the diagonal [m] of the box around a target, from one scan of it that may contain
     scattered outliers.
 
-    Points are grouped where they lie closer together than LINK times the typical spacing; groups of
-    less than SMALL_GROUP of all points are left out. A box around all points would grow to the
-    range limits of the scanner.
+    Points are grouped where they lie closer together than LINK_DISTANCE_RATIO times the typical
+    spacing; groups of less than SMALL_GROUP_SHARE of all points are left out. A box around all
+    points would grow to the range limits of the scanner.
     """
     tree = point_tree(points)
-    group = tree.groups(LINK * max(float(np.median(spacings(tree, points))), 1e-9))
-    large = np.bincount(group)[group] >= SMALL_GROUP * len(points)
+    group = tree.groups(LINK_DISTANCE_RATIO * max(float(np.median(spacings(tree, points))), 1e-9))
+    large = np.bincount(group)[group] >= SMALL_GROUP_SHARE * len(points)
     return geometry.bounding_diagonal(points[large] if large.any() else points)
 
 
@@ -214,7 +213,7 @@ def _camera(clouds: Sequence[Array]) -> Array:
     """
     extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
-    if np.median(distances) > FAR_OF_EXTENT * np.median(extents):
+    if np.median(distances) > ORIGIN_DISTANCE_OF_EXTENT * np.median(extents):
         return np.zeros(3)
     scatter, sides = np.zeros((3, 3)), []
     for points, extent in zip(clouds, extents, strict=True):
@@ -278,7 +277,7 @@ def normals_of(points: Array, full: Array, camera: Array) -> Array:
     points of the whole scan.
     """
     full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
-    normals = point_tree(full).planes(full, full, points, points, NEIGHBOURS)[0]
+    normals = point_tree(full).planes(full, full, points, points, NORMAL_NEIGHBOURS)[0]
     away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
     normals[away] *= -1.0
     return np.asarray(normals)

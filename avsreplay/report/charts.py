@@ -52,8 +52,8 @@ _DIRECT = (
     *("nees", "ogm_log10_cond", "ogm_log10_cond_scaled", "ogm_rank"),
     *("r_pos_m", "r_rot_deg", "capture_time_s", "earliest_capture_s", "plan_miss_m"),
 )
-_WINDOW = 10
-WIDE = 20.0  # largest over typical value from which an axis is logarithmic
+_SPREAD_PLANS = 10
+LOGARITHMIC_RATIO = 20.0  # largest over typical value from which an axis is logarithmic
 KINDS = {  # colour and pattern of each place
     "flagged": (
         *(
@@ -80,7 +80,8 @@ KINDS = {  # colour and pattern of each place
     ),
 }
 FIRST = ("position", "nis", "capture")  # charts that stand beside the states; others are folded
-SAME = 1e-3  # largest difference of two lines, over the range of the first, that are drawn as one
+# largest difference of two lines, over the range of the first, that are drawn as one
+SAME_LINE_DIFFERENCE = 1e-3
 _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
@@ -120,7 +121,9 @@ def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     for k, value in enumerate(capture_s):
         if np.isfinite(value):
             recent = (
-                recent if recent and recent[-1] == value else [*recent, float(value)][-_WINDOW:]
+                recent
+                if recent and recent[-1] == value
+                else [*recent, float(value)][-_SPREAD_PLANS:]
             )
             low[k], high[k] = min(recent), max(recent)
     return low, high
@@ -236,7 +239,7 @@ def _equal(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
     if first.shape != second.shape or not known.any() or (known != np.isfinite(second)).any():
         return False
     span = float(np.ptp(first[known]))
-    return float(np.abs(first - second)[known].max()) <= SAME * span
+    return float(np.abs(first - second)[known].max()) <= SAME_LINE_DIFFERENCE * span
 
 
 def flight_charts(columns: Columns) -> list[Chart]:
@@ -276,7 +279,7 @@ def _scaled(chart: Chart, columns: Columns, used: NDArray[np.bool_] | None = Non
     ]
     typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)
     if chart["log"] is None:
-        chart = chart | {"log": 0.0 < WIDE * typical < largest}
+        chart = chart | {"log": 0.0 < LOGARITHMIC_RATIO * typical < largest}
     if chart["unit"] != "m" or chart["key"] == "arm" or typical >= 1.0:
         return chart
     levels = [level | {"y": 1000.0 * level["y"]} for level in chart["levels"]]

@@ -72,9 +72,13 @@ _COUNTS = {
     "losses",
     "ogm_rank",
 }
-_MENTIONED = 0.1  # relative change of a main metric without an interval that the sentence mentions
+# relative change of a main metric without an interval that the sentence mentions
+_MENTIONED_CHANGE = 0.1
 _MARKS = {"better": "good", "worse": "bad"}
-_BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
+_MAX_BLOCKS = 10  # of scans in a row, from which the interval of one log follows
+_LEAST_BLOCK_SCANS = 5
+_LEAST_BLOCKS = 5
+_LEAST_PAIRED_RUNS = 5
 
 
 def _scanwise(
@@ -187,7 +191,7 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     """
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
     apart = [named for base, other in pairs if (named := different_logs(base.header, other.header))]
-    paired = not apart or len(pairs) >= _LEAST_RUNS
+    paired = not apart or len(pairs) >= _LEAST_PAIRED_RUNS
     changes = tuple(
         change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None
     )
@@ -268,7 +272,7 @@ def _interval(
     name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]], differences: Sequence[float]
 ) -> tuple[float, float] | None:
     """95 % interval of the mean difference; None with too few pairs of runs or of scans."""
-    if len(pairs) >= _LEAST_RUNS:
+    if len(pairs) >= _LEAST_PAIRED_RUNS:
         return interval_of_mean(np.array(differences))
     if len(pairs) > 1 or not (name in _ROOTS or name in _MEANS):
         return None
@@ -294,7 +298,7 @@ def _blocks(
         stamps.append(np.array(column_of(run.rows, "t_ns"))[known])
         found.append(figures[known])
     shared, *places = np.intersect1d(stamps[0], stamps[1], return_indices=True)
-    count = min(_BLOCKS, len(shared) // _IN_BLOCK)
+    count = min(_MAX_BLOCKS, len(shared) // _LEAST_BLOCK_SCANS)
     if count < _LEAST_BLOCKS:
         return None
     parts = [np.array_split(figures[at], count) for figures, at in zip(found, places, strict=True)]
@@ -341,7 +345,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
 
 def _mentioned(change: Change) -> bool:
     base, other = change.base or 0.0, change.other or 0.0
-    return abs(other - base) > _MENTIONED * abs(base)
+    return abs(other - base) > _MENTIONED_CHANGE * abs(base)
 
 
 def _said(change: Change) -> str:

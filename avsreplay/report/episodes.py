@@ -24,7 +24,7 @@ from avsreplay.errors import value_class
 from avsreplay.records import Label
 from avsreplay.report.summary_parts import median
 
-GAP = 1.5
+GAP_STEPS = 1.5  # least gap between two scans, in median intervals
 
 
 class Mark(NamedTuple):
@@ -147,13 +147,13 @@ class Coast:
 
 
 def gaps(t_ns: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the instants [ns] before and after every interval longer than ``GAP`` times the median
-    interval.
+    """Return the instants [ns] before and after every interval longer than ``GAP_STEPS`` times the
+    median interval.
     """
     steps = [b - a for a, b in pairwise(t_ns) if b > a]
     if not steps:
         return []
-    limit = GAP * median(steps)
+    limit = GAP_STEPS * median(steps)
     return [(a, b) for a, b in pairwise(t_ns) if b - a > limit]
 
 

@@ -20,6 +20,7 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Array, Pose
+from avsreplay.records import NS_PER_S
 from avsreplay.report.jsonl import plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
@@ -55,7 +56,7 @@ def row_poses(
 def stamp_text(t_ns: int) -> str:
     """Return a time stamp [ns] as seconds with nine decimals, exactly."""
     sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
-    return f"{sign}{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
+    return f"{sign}{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}"
 
 
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:

@@ -21,7 +21,7 @@ from avsreplay.tables import column_of
 
 # changes of the velocity from which a motion is not called free: a free target is pushed, or
 # manoeuvres, once or twice in a log; one that is towed, on a cable or in strong drag changes always
-_NOT_FREE = 3
+_LEAST_DRIVEN_CHANGES = 3
 
 
 @value_class(eq=True)
@@ -158,7 +158,7 @@ def events(
     if manoeuvres:
         clearest = max(manoeuvres, key=lambda m: m.significance)
         count = "" if len(manoeuvres) == 1 else f" {times(len(manoeuvres))}, most significantly"
-        often = len(manoeuvres) >= _NOT_FREE
+        often = len(manoeuvres) >= _LEAST_DRIVEN_CHANGES
         whose = "the target does not move freely: its" if often else "the target's"
         yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:

@@ -31,11 +31,14 @@ from avsreplay.report.table import (
     scan_table,
     state_cell,
 )
-from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
+from avsreplay.report.verdict import LEAST_SHARE_INSIDE, Grade, RunVerdict
 from avsreplay.rows import Row
 
-SCREEN_ROWS, SCREEN_MOMENTS = 10, 3  # scans and worst moments on the first screen
-SCREEN_LINES, LEAST_ROWS = 23, 3  # lines of the first screen beside the prompt; fewest scans
+# The first screen.
+SCREEN_ROWS = 10  # scans
+SCREEN_MOMENTS = 3  # worst moments
+SCREEN_LINES = 23  # lines beside the prompt
+LEAST_SCREEN_ROWS = 3  # fewest scans
 TABLE_LINES = 6  # of the table over time beside its scans: title, heads, rule, note, empty line
 TABLES = (  # names of the tables of a run
     *("verdict", "moments", "capture", "scans", "curves"),
@@ -64,7 +67,7 @@ def print_screen(console: Console, rows: Sequence[Row], verdict: RunVerdict) -> 
         line = f"{span} s: {m.what}; {m.cause}"
         print_line(console, textwrap.shorten(line, console.width, placeholder=" ..."))
     if rows:
-        shown = min(max(left, LEAST_ROWS), SCREEN_ROWS)
+        shown = min(max(left, LEAST_SCREEN_ROWS), SCREEN_ROWS)
         print_table(console, over_time_table(rows, shown), tight=True)
 
 
@@ -243,7 +246,9 @@ def consistency_table(summary: Summary) -> Table:
             str(expected),
             f"{scale * share.median:.2f}",
             f"{scale * share.low:.2f} to {scale * share.high:.2f}",
-            TableCell(f"{100.0 * share.inside:.1f}", "warn" if share.inside < INSIDE_LEAST else ""),
+            TableCell(
+                f"{100.0 * share.inside:.1f}", "warn" if share.inside < LEAST_SHARE_INSIDE else ""
+            ),
         )
         for name, expected, share, scale in listed
         if share is not None

@@ -23,10 +23,8 @@ from avsreplay.errors import printable, value_class
 from avsreplay.rows import Column, Row, columns
 from avsreplay.tables import column_of
 
-PLAIN_WIDTH, _WRAPPED = (
-    80,
-    12,
-)  # the latter: least width of a column of wrapped text, with its margin
+PLAIN_WIDTH_CHARACTERS = 80
+_WRAPPED_CHARACTERS = 12  # least width of a column of wrapped text, with its margin
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
@@ -87,7 +85,10 @@ def as_cell(cell: str | TableCell) -> TableCell:
 
 
 def make_console(
-    stream: IO[str] | None = None, *, width: int | None = None, plain_width: int = PLAIN_WIDTH
+    stream: IO[str] | None = None,
+    *,
+    width: int | None = None,
+    plain_width: int = PLAIN_WIDTH_CHARACTERS,
 ) -> Console:
     """Return a console that interprets no markup.
 
@@ -139,7 +140,7 @@ def _least_width(table: Table, gap: int) -> int:
         table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True
     )
     return sum(
-        _WRAPPED
+        _WRAPPED_CHARACTERS
         if gap > 1 and table.letter(k) == "l"
         else gap + max(map(cell_len, "\n".join(texts).split("\n")))
         for k, texts in enumerate(columns_of_text)
@@ -222,7 +223,7 @@ def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
     return min(max(least, wanted), 8)
 
 
-FEW = 24
+SHOWN_ROWS = 24  # rows of a table that are shown without being asked for
 _HEADS = {  # a line end stands where the heading may break
     "seq": "scan",
     "t_s": "time",
@@ -272,13 +273,13 @@ def choose_rows(
     With neither flag: every k-th row so that about 24 are left, the last one, and those at which
         gamma changes.
     """
-    if show_all or (every is None and len(rows) <= FEW):
+    if show_all or (every is None and len(rows) <= SHOWN_ROWS):
         return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
     if every is not None:
         return list(rows[:: max(every, 1)]), f"every {_ordinal(max(every, 1))} of {len(rows)} scans"
-    step = -(-len(rows) // FEW)
+    step = -(-len(rows) // SHOWN_ROWS)
     turns = {k for k, (a, b) in enumerate(pairwise(column_of(rows, "gamma")), 1) if a != b}
-    turns = turns if len(turns) <= FEW else set()
+    turns = turns if len(turns) <= SHOWN_ROWS else set()
     kept = sorted(set(range(0, len(rows), step)) | {len(rows) - 1} | turns)
     words = f"every {_ordinal(step)} of {len(rows)} scans" + (
         " and where gamma changes" if turns else ""
@@ -391,9 +392,9 @@ def _fit(widths: dict[str, int], width: int) -> list[str]:
     return [name for name in widths if name in kept]
 
 
-LEAST_WIDTH = 100
-_BLOCKS = "▁▂▃▄▅▆▇█"
-_LABEL = 32
+LEAST_WIDTH_CHARACTERS = 100
+_SPARK_BLOCKS = "▁▂▃▄▅▆▇█"
+_LABEL_CHARACTERS = 32
 
 
 def spark(values: Sequence[float | None], width: int) -> str:
@@ -403,7 +404,8 @@ def spark(values: Sequence[float | None], width: int) -> str:
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)
     return "".join(
-        _BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " " for p in parts
+        _SPARK_BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " "
+        for p in parts
     )
 
 
@@ -414,9 +416,9 @@ def _parts(count: int, width: int) -> list[tuple[int, int]]:
 
 def print_sparks(console: Console, rows: Sequence[Row]) -> None:
     """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
-    if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
+    if not console.is_terminal or console.width < LEAST_WIDTH_CHARACTERS or ascii_only(console):
         return
-    width = console.width - _LABEL
+    width = console.width - _LABEL_CHARACTERS
     shown = (
         ("position error", "mm", "pos_err_m", 1000.0),
         ("attitude error", "deg", "rot_err_deg", 1.0),
@@ -425,8 +427,10 @@ def print_sparks(console: Console, rows: Sequence[Row]) -> None:
         values = [None if v is None else scale * v for v in column_of(rows, wanted)]
         if known := [v for v in values if v is not None]:
             label = f"{name} to {max(known):.3g} {unit}"
-            console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
+            console.print(
+                Text(f"{label:{_LABEL_CHARACTERS}}").append(spark(values, width), style="#0072B2")
+            )
     gammas = column_of(rows, "gamma")
     flags = "".join("✗" if 0 in gammas[a:b] else "·" for a, b in _parts(len(rows), width))
-    console.print(Text(f"{'flagged':{_LABEL}}").append(flags, style="#D55E00"))
+    console.print(Text(f"{'flagged':{_LABEL_CHARACTERS}}").append(flags, style="#D55E00"))
     console.print()

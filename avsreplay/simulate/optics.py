@@ -25,8 +25,8 @@ from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 
-REFLECTANCE = 0.5  # diffuse reflectance where no material is given
-_RING = 6  # rays of a beam around its centre
+DEFAULT_REFLECTANCE = 0.5  # diffuse reflectance where no material is given
+_BEAM_RING_RAYS = 6  # rays of a beam around its centre
 Corners = tuple[float, float, float, float, float, float]
 
 
@@ -48,7 +48,7 @@ class Material(Settings):
         "The faces of this group (g), object (o) or material (usemtl) of an OBJ model; empty: of"
         " any.",
     )
-    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+    reflectance: float = setting(DEFAULT_REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
     specular: float = setting(
         0.0, "Strength of the specular lobe in units of a white diffuse surface.", low=0.0
     )
@@ -134,7 +134,7 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     optics = FaceOptics(
-        np.full(count, REFLECTANCE),
+        np.full(count, DEFAULT_REFLECTANCE),
         zero.copy(),
         np.full(count, 0.1),
         zero.copy(),
@@ -256,8 +256,8 @@ def beam(directions: Array, divergence_rad: float) -> Array:
     side /= np.linalg.norm(side, axis=1)[:, None]
     other = np.cross(directions, side)
     rays = [directions]
-    for k in range(_RING):
-        angle = 2.0 * math.pi * k / _RING
+    for k in range(_BEAM_RING_RAYS):
+        angle = 2.0 * math.pi * k / _BEAM_RING_RAYS
         ray = directions + math.tan(ring) * (math.cos(angle) * side + math.sin(angle) * other)
         rays.append(ray / np.linalg.norm(ray, axis=1)[:, None])
     return np.stack(rays)

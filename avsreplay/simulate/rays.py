@@ -93,7 +93,7 @@ def _steps(n: int) -> list[float]:
     return [(2 * k + 1) / n - 1.0 for k in range(n)]
 
 
-CHUNK = 1 << 20  # ray-triangle pairs held at once by the exact search
+CHUNK_PAIRS = 1 << 20  # ray-triangle pairs held at once by the exact search
 Hits = NDArray[np.int64]
 Search = Callable[[Array, Array], Hits]
 
@@ -188,7 +188,7 @@ def _exact(corners: Array) -> Search:
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
     def search(origins: Array, directions: Array) -> Hits:
-        rows = max(1, CHUNK // max(1, len(a)))
+        rows = max(1, CHUNK_PAIRS // max(1, len(a)))
         parts = [
             _nearest(
                 origins[k : k + rows, None] if len(origins) > 1 else origins[None],

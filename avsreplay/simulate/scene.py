@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.records import Label, Surface
+from avsreplay.records import NS_PER_S, Label, Surface
 from avsreplay.settings import Settings, is_unit, setting
-from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
+from avsreplay.simulate.optics import DEFAULT_REFLECTANCE, FaceOptics, Material, face_optics
 from avsreplay.simulate.rays import Engine, RayCaster
 from avsreplay.simulate.target import adapter, box
 
-NS = 1_000_000_000
-_STATIONS = 64  # points of the sum along a ray through a plume
-_NEAREST_M = 0.1  # distance from the nozzle below which the density of the particles is constant
+_PLUME_STATIONS = 64  # points of the sum along a ray through a plume
+# distance from the nozzle below which the density of the particles is constant
+_NOZZLE_DISTANCE_M = 0.1
 Triple = tuple[float, float, float]
 
 
@@ -72,7 +72,7 @@ class Presence(Settings):
         if self.duration_s is None:
             return None
         start, end = (
-            epoch_ns + round(t * NS) for t in (self.start_s, self.start_s + self.duration_s)
+            epoch_ns + round(t * NS_PER_S) for t in (self.start_s, self.start_s + self.duration_s)
         )
         return Label(self.name, start, end, self.harmful)
 
@@ -114,7 +114,7 @@ class SceneObject(Presence):
     rate_radps: Triple = setting(
         (0.0, 0.0, 0.0), "Constant angular rate in the axes of {A}.", unit="rad/s"
     )
-    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+    reflectance: float = setting(DEFAULT_REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
 
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion, or the name is empty."""
@@ -162,7 +162,7 @@ class Plume(Presence):
         low=0.0,
     )
     reflectance: float = setting(
-        REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0
+        DEFAULT_REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0
     )
 
     def check(self) -> None:
@@ -180,11 +180,14 @@ class Plume(Presence):
             rng: draws the particles.
         """
         depth_at_hit = rng.exponential(size=len(rays))
-        spacing, axis = ends_m / _STATIONS, np.array(self.direction) / math.hypot(*self.direction)
+        spacing, axis = (
+            ends_m / _PLUME_STATIONS,
+            np.array(self.direction) / math.hypot(*self.direction),
+        )
         depth, found = np.zeros(len(rays)), np.full(len(rays), np.inf)
-        for k in range(_STATIONS):  # the midpoint rule
+        for k in range(_PLUME_STATIONS):  # the midpoint rule
             there = (k + 0.5) * spacing[:, None] * rays - np.array(self.nozzle_m)
-            away = np.maximum(np.linalg.norm(there, axis=1), _NEAREST_M)
+            away = np.maximum(np.linalg.norm(there, axis=1), _NOZZLE_DISTANCE_M)
             angle = np.arccos(np.clip(there @ axis / away, -1.0, 1.0))
             spread = np.exp(-np.square(angle / math.radians(self.half_angle_deg)))
             added = self.particles_per_metre * spread / np.square(away) * spacing

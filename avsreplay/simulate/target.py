@@ -36,7 +36,8 @@ class Shape(Enum):
 
 
 FROM_MESH = "from the mesh, of uniform density"
-LEAST_THICKNESS = 1e-9  # least distance of an inertia ratio from -1 and 1, which no body reaches
+# least distance of an inertia ratio from -1 and 1, which no body reaches
+LEAST_INERTIA_MARGIN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,7 @@ def body(params: TargetParams, surface: Surface) -> Body:
             thickness.
     """
     found = _stated_or_computed(params, surface)
-    if np.abs(found.sigma).max() > 1.0 - LEAST_THICKNESS:
+    if np.abs(found.sigma).max() > 1.0 - LEAST_INERTIA_MARGIN:
         moments = ", ".join(f"{m:.4g}" for m in found.moments)
         what = (
             f"the body has no thickness: of its principal moments {moments} m2 one is the sum of"

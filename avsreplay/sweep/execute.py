@@ -44,7 +44,7 @@ from avsreplay.sweep.page import build_sweep_page
 from avsreplay.sweep.statistics import episode_lines
 from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
 
-BATCH = 5_000  # runs held in memory while results.parquet is written
+RUN_BATCH = 5_000  # runs held in memory while results.parquet is written
 SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written
 _FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
 
@@ -175,9 +175,9 @@ def _word(name: str) -> str:
     return "".join(c if c.isalnum() or c == "_" else "_" for c in name).strip("_")
 
 
-IN_FLIGHT = 4  # tasks per worker thread that run or wait; limits the tasks at the scheduler
-CONNECT_S = 10  # time limit for the answer of a scheduler [s]
-LOOK_EVERY = 64  # completions between two queries for the number of workers
+TASKS_PER_THREAD = 4  # tasks per worker thread that run or wait; limits the tasks at the scheduler
+CONNECT_TIMEOUT_S = 10  # time limit for the answer of a scheduler [s]
+WORKER_QUERY_PERIOD = 64  # completions between two queries for the number of workers
 
 
 class Identified(Protocol):
@@ -243,7 +243,7 @@ def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any
     dask = _distributed()
     if scheduler is not None:
         try:
-            with dask.Client(scheduler, timeout=CONNECT_S) as client:
+            with dask.Client(scheduler, timeout=CONNECT_TIMEOUT_S) as client:
                 yield client
         except (OSError, ValueError) as error:
             what = f"the scheduler does not answer: {str(error).splitlines()[0]}"
@@ -289,10 +289,10 @@ def _on(client: Any, tasks: Iterator[T], work: Callable[[T], RunResult]) -> Iter
     on another one.
     """
     running = _distributed().as_completed()
-    held, count, limit = 0, 0, IN_FLIGHT
+    held, count, limit = 0, 0, TASKS_PER_THREAD
     while True:
-        if count % LOOK_EVERY == 0:
-            limit = IN_FLIGHT * max(1, sum(client.nthreads().values()))
+        if count % WORKER_QUERY_PERIOD == 0:
+            limit = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
         while held < limit and (task := next(tasks, None)) is not None:
             running.add(client.submit(work, task, key=f"run-{task.id}", pure=False))
             held += 1
@@ -422,7 +422,7 @@ def _write_runs(
         return (*place, *(_plain(found.get(name), only[name]) for name in columns))
 
     runs = (row(*found) for found in _finished(plan, journal))
-    write_batches(path, schema, iter(lambda: list(islice(runs, BATCH)), []))
+    write_batches(path, schema, iter(lambda: list(islice(runs, RUN_BATCH)), []))
 
 
 def _plain(value: Any, kind: str) -> Any:

@@ -29,7 +29,7 @@ from avsreplay.job_file import read_job
 from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
-FORMAT = 4  # format of a run's result; a result with another format is computed again
+RESULT_FORMAT = 4  # format of a run's result; a result with another format is computed again
 _NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
 
 
@@ -122,7 +122,7 @@ class Expansion:
         named = _models_of(scenario, home)
         inputs = [self._inputs.get(path, "") for path in (log, model or named[0], *named[1:])]
         content = [
-            FORMAT,
+            RESULT_FORMAT,
             avsreplay.__version__,
             scenario,
             inputs,

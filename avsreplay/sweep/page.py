@@ -19,11 +19,18 @@ from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, Wor
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its
 # own
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
-_LEFT, _WIDTH, _ROW, _HEAD = 12, 460, 44, 52  # fits a telephone without scrolling
-_LABEL = 62  # characters of the name of a combination over its line
+# The chart fits a telephone without scrolling.
+_CHART_LEFT_PX = 12
+_CHART_WIDTH_PX = 460
+_CHART_ROW_PX = 44
+_CHART_HEAD_PX = 52
+_NAME_CHARACTERS = 62  # of the name of a combination over its line
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
-_FALSE_MIN = 1e-4  # left end of the ROC's logarithmic axis
-_X0, _Y0, _SIZE = 60, 20, 380
+_LEAST_FALSE_RATE = 1e-4  # left end of the ROC's logarithmic axis
+# The square of the ROC.
+_ROC_LEFT_PX = 60
+_ROC_TOP_PX = 20
+_ROC_SIZE_PX = 380
 _KIND_HEADS = (
     *(
         "fault",
@@ -241,18 +248,18 @@ def _spans(title: str, entries: Sequence[tuple[str, Quantiles | None]]) -> Marku
     least = min([0.0, *(q.q05 for _, q in known)])
     ticks = round_ticks(least, max(max(q.q95, q.median_high or q.q95) for _, q in known))
     low, high = ticks[0], ticks[-1]
-    scale = (_WIDTH - _LEFT - 30) / (high - low or 1.0)
+    scale = (_CHART_WIDTH_PX - _CHART_LEFT_PX - 30) / (high - low or 1.0)
 
     def x(value: float) -> str:
-        return f"{_LEFT + (value - low) * scale:.1f}"
+        return f"{_CHART_LEFT_PX + (value - low) * scale:.1f}"
 
     lines = [
         {
-            "label": textwrap.shorten(name, _LABEL, placeholder=" ..."),
+            "label": textwrap.shorten(name, _NAME_CHARACTERS, placeholder=" ..."),
             "title": (
                 f"{name}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count} runs"
             ),
-            "y": _HEAD + _ROW * (k + 1) - 10,
+            "y": _CHART_HEAD_PX + _CHART_ROW_PX * (k + 1) - 10,
             "x": {
                 **{name: x(getattr(q, name)) for name in ("q05", "q95", "median")},
                 "median_low": x(q.median if q.median_low is None else q.median_low),
@@ -264,13 +271,13 @@ def _spans(title: str, entries: Sequence[tuple[str, Quantiles | None]]) -> Marku
     return render(
         "spans.svg",
         title=title,
-        width=_WIDTH,
-        height=_HEAD + _ROW * len(known) + 8,
+        width=_CHART_WIDTH_PX,
+        height=_CHART_HEAD_PX + _CHART_ROW_PX * len(known) + 8,
         title_y=18,
-        head_y=_HEAD - 12,
-        label_x=_LEFT - 8,
+        head_y=_CHART_HEAD_PX - 12,
+        label_x=_CHART_LEFT_PX - 8,
         ticks=[(x(v), f"{v:.6g}") for v in ticks],
-        top=_HEAD - 6,
+        top=_CHART_HEAD_PX - 6,
         lines=lines,
     )
 
@@ -289,7 +296,14 @@ def _roc(detector: Detector) -> Markup:
         rule = [f"{v:.1f}" for v in _place(detector.false.share, detector.detected.share)]
     ticks = [(f"{_place(v, 0.0)[0]:.1f}", f"{100 * v:g} %") for v in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
     return render(
-        "roc.svg", x0=_X0, y0=_Y0, size=_SIZE, width=_WIDTH, ticks=ticks, curves=curves, rule=rule
+        "roc.svg",
+        x0=_ROC_LEFT_PX,
+        y0=_ROC_TOP_PX,
+        size=_ROC_SIZE_PX,
+        width=_CHART_WIDTH_PX,
+        ticks=ticks,
+        curves=curves,
+        rule=rule,
     )
 
 
@@ -299,8 +313,10 @@ def _points(curve: Roc) -> str:
 
 
 def _place(false: float, detected: float) -> tuple[float, float]:
-    along = math.log10(max(false, _FALSE_MIN) / _FALSE_MIN) / -math.log10(_FALSE_MIN)
-    return _X0 + _SIZE * along, _Y0 + _SIZE * (1.0 - detected)
+    along = math.log10(max(false, _LEAST_FALSE_RATE) / _LEAST_FALSE_RATE) / -math.log10(
+        _LEAST_FALSE_RATE
+    )
+    return _ROC_LEFT_PX + _ROC_SIZE_PX * along, _ROC_TOP_PX + _ROC_SIZE_PX * (1.0 - detected)
 
 
 def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from avsreplay import settings
 from avsreplay.report.episodes import Episode, Peak
 
-LEVEL = 0.95  # confidence level of every interval
+CONFIDENCE_LEVEL = 0.95  # confidence level of every interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,9 @@ def quantiles(values: Sequence[float]) -> Quantiles | None:
 
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     q05, median, q95 = (float(np.quantile(ordered, q)) for q in (0.05, 0.5, 0.95))
-    interval: Any = quantile_test(ordered, p=0.5).confidence_interval(confidence_level=LEVEL)
+    interval: Any = quantile_test(ordered, p=0.5).confidence_interval(
+        confidence_level=CONFIDENCE_LEVEL
+    )
     low, high = (float(b) if math.isfinite(b) else None for b in (interval.low, interval.high))
     whole = low is not None and high is not None
     return Quantiles(len(values), q05, median, q95, low if whole else None, high if whole else None)
@@ -91,7 +93,7 @@ def rate(successes: int, count: int) -> Rate | None:
         return Rate(successes, 1, float(successes), None, None)
     from scipy.stats import binomtest
 
-    interval = binomtest(successes, count).proportion_ci(LEVEL, method="wilson")
+    interval = binomtest(successes, count).proportion_ci(CONFIDENCE_LEVEL, method="wilson")
     return Rate(successes, count, successes / count, float(interval.low), float(interval.high))
 
 
@@ -113,7 +115,7 @@ def consistency(nees: Sequence[float], dof: int) -> RunConsistency | None:
     from scipy.stats import chi2
 
     n = len(nees)
-    low, high = (float(bound) / (dof * n) for bound in chi2.interval(LEVEL, dof * n))
+    low, high = (float(bound) / (dof * n) for bound in chi2.interval(CONFIDENCE_LEVEL, dof * n))
     return RunConsistency(n, math.fsum(nees) / (dof * n), low, high, float(np.median(nees)) / dof)
 
 

@@ -39,7 +39,7 @@ SCORES = {
     "nis": "nis",
 }  # score: its column
 FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
-WORST = 5  # number of runs that are listed
+LISTED_RUNS = 5  # number of runs that are listed
 _ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
 _BAD = ("crashed", "failed", "lossy")  # worst status first
 
@@ -137,7 +137,7 @@ class CampaignFold:
         run = WorstRun(result.id, point.cell, point.repeat, point.seed, result.status, reason)
         if reason:
             heapq.heappush(self._worst, ((*badness, -point.index), run))
-            if len(self._worst) > WORST:
+            if len(self._worst) > LISTED_RUNS:
                 heapq.heappop(self._worst)
 
     def result(self, detector: Detector | None) -> SweepSummary:

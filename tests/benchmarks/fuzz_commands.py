@@ -289,7 +289,7 @@ def build(folder: Path) -> None:
     scenario.MAX_SCANS = (
         2000  # more are refused as those above the limit are, not recorded for hours
     )
-    log.GrowingLog, log._POLL_S, log._PER_OPENING = WrittenLog, 0.0, 0.0
+    log.GrowingLog, log._POLL_S, log._OPENING_DURATIONS = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {
         "scenario.toml": SCENARIO,

@@ -322,7 +322,7 @@ def _mend(out: bytearray) -> None:
     while at + 49 <= len(out):
         opcode, length = struct.unpack_from("<BQ", out, at)
         if (
-            opcode == mcap.CHUNK
+            opcode == mcap.Opcode.CHUNK
             and length > 40
             and at + 9 + length <= len(out)
             and out[at + 37 : at + 41] == bytes(4)
@@ -330,7 +330,7 @@ def _mend(out: bytearray) -> None:
             data = bytes(out[at + 49 : at + 9 + length])
             struct.pack_into("<QI", out, at + 25, len(data), zlib.crc32(data))
             struct.pack_into("<Q", out, at + 41, len(data))
-        if opcode == mcap.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
+        if opcode == mcap.Opcode.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
             struct.pack_into(
                 "<I", out, at + 5 + length, zlib.crc32(bytes(out[at + 9 : at + 5 + length]))
             )
