@@ -129,7 +129,7 @@ def _exact(value: Value[T], text: str, **more: Any) -> T:
     return column(value, text, **more)
 
 
-_XYZ = ("x", "y", "z")
+_VECTOR_AXES = ("x", "y", "z")
 _XYZW = ("x", "y", "z", "w")
 _ENTRIES = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))  # the six entries of a symmetric matrix
 
@@ -139,7 +139,7 @@ def _block(
     make: Callable[[Value[float | None], str], float | None],
     text: str,
     first: str = "",
-    names: Sequence[str] = _XYZ,
+    names: Sequence[str] = _VECTOR_AXES,
 ) -> list[float | None]:
     """Declare the columns of one vector.
 
@@ -1074,7 +1074,7 @@ class Row:
             score: its comparison with the ground truth.
         """
         return cls(
-            *[value(outcome, score) for value in _VALUES]
+            *[value(outcome, score) for value in _COLUMN_VALUES]
         )  # by place: 150 names take as long as the values
 
     def rescored(self, score: Score) -> Row:
@@ -1091,7 +1091,7 @@ class Row:
         return dataclasses.replace(self, **values)
 
 
-_VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
+_COLUMN_VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 
 
 def columns() -> tuple[Column, ...]:

@@ -187,7 +187,7 @@ def test_without_a_summary_nothing_is_lost(whole: dict[str, Path], tmp_path: Pat
     data = whole["zstd"].read_bytes()
     footer = struct.pack("<BQQQI", mcap.Opcode.FOOTER, 20, 0, 0, 0)
     (tmp_path / "x.mcap").write_bytes(
-        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MAGIC
+        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MCAP_MAGIC
     )
     found, losses = read(tmp_path / "x.mcap")
     assert len(found) == len(CLOUDS)
@@ -381,7 +381,7 @@ def test_the_work_for_hostile_bytes_grows_with_their_number(tmp_path: Path, what
         .integers(0, 256, 4096, dtype=np.uint8)
         .tobytes(),
     }
-    assert_linear(tmp_path / "x.mcap", mcap.MAGIC, pieces[what])
+    assert_linear(tmp_path / "x.mcap", mcap.MCAP_MAGIC, pieces[what])
 
 
 @pytest.mark.parametrize("what", ["chunk marks", "bad chunks", "noise"])

@@ -11,7 +11,7 @@ import pytest
 
 from avsreplay.geometry import Pose
 from avsreplay.monitor.fault_detection import (
-    RULES,
+    SCAN_AND_MOTION_RULES,
     FaultDetector,
     FaultParams,
     Policy,
@@ -154,7 +154,7 @@ def test_the_reason_is_that_which_decided(innovation, finding, reason) -> None:
 
 
 def test_every_reason_has_a_rule_and_the_last_rule_always_holds() -> None:
-    assert {rule.reason for rule in RULES} == set(Reason)
+    assert {rule.reason for rule in SCAN_AND_MOTION_RULES} == set(Reason)
     never = FaultDetector(FaultParams(policy=Policy.ALL), 8.0)
     open_ = judged(never, ScanStatus.OK, GOOD, FAR, finding=Finding.OPEN)
     assert open_.reason is Reason.DOUBTFUL

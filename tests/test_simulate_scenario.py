@@ -15,7 +15,7 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.parts import FAULTS
 from avsreplay.records import ScanStatus
-from avsreplay.report.charts import KINDS
+from avsreplay.report.charts import PLACE_STYLES
 from avsreplay.simulate import faults as kinds
 from avsreplay.simulate.faults import InjectedFault, active
 from avsreplay.simulate.recorded_faults import disturbed
@@ -395,7 +395,7 @@ def test_every_kind_is_registered_under_its_name_and_has_a_colour():
         if issubclass(each, kinds.Fault) and each is not kinds.Fault
     }
     assert own == {name: FAULTS.load(name) for name in FAULTS.names()}
-    assert set(KINDS["injected"]) == set(FAULTS.names())
+    assert set(PLACE_STYLES["injected"]) == set(FAULTS.names())
 
 
 @pytest.mark.parametrize("kind", FAULTS.names())

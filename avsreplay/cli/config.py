@@ -338,7 +338,7 @@ or the log's own `[run]` table. `avsreplay config` prints the effective configur
 `avsreplay config --markdown` makes this page from the declarations in the code.
 """
 
-FREQUENT = {
+FREQUENT_OPTIONS = {
     "topic": "choose the clouds of a bag with several",
     "model": "replay against this CAD file",
     "model_unit": "state the unit of the model",
@@ -434,7 +434,8 @@ def reference_page() -> str:
     found = {entry.key: entry for _, _, owner in SECTIONS[:2] for entry in _entries(owner)}
     lines = ["| to | setting | default |", "|---|---|---|"]
     lines += [
-        f"| {purpose} | `{key}` | {_default(found[key])} |" for key, purpose in FREQUENT.items()
+        f"| {purpose} | `{key}` | {_default(found[key])} |"
+        for key, purpose in FREQUENT_OPTIONS.items()
     ]
     introduction = INTRODUCTION.replace("{frequent}", "\n".join(lines))
     return "\n".join([introduction, *_page()]).rstrip("\n") + "\n"

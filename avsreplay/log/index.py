@@ -30,7 +30,7 @@ POSE_NAMES = (
     "geometry_msgs/msg/TransformStamped",
 )
 """Types that hold one stamped pose."""
-_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
+_MCAP_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
 _CACHED_CHUNKS = 2  # decompressed chunks held in memory
 _INDEXED = (*CLOUD_TYPES, *POSE_NAMES, *IMAGE_TYPES, CAMERA_INFO)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
@@ -176,7 +176,7 @@ class ChunkStore:
 
     def compressions(self) -> Counter[str]:
         """Return the number of chunks of each compression."""
-        return Counter(_COMPRESSIONS[k] or "uncompressed" for k in self._compression)
+        return Counter(_MCAP_COMPRESSIONS[k] or "uncompressed" for k in self._compression)
 
     def check(self, at: int, head: ChunkHead) -> bytes:
         """Return the decompressed chunk at offset ``at``.
@@ -197,7 +197,7 @@ class ChunkStore:
         values = (
             at + head.data_at,
             head.data_size,
-            _COMPRESSIONS.index(head.compression),
+            _MCAP_COMPRESSIONS.index(head.compression),
             head.size,
         )
         for column, value in zip(
@@ -216,7 +216,7 @@ class ChunkStore:
                 self._cache.pop(next(iter(self._cache)))
             packed = self._file.read(self._offset[number], self._packed[number])
             self._cache[number] = inflate(
-                packed, _COMPRESSIONS[self._compression[number]], self._size[number]
+                packed, _MCAP_COMPRESSIONS[self._compression[number]], self._size[number]
             )
         return self._cache[number]
 

@@ -321,7 +321,7 @@ MOTION_RULES = (
 """The rules on a scan that none of the others has rejected, with what the estimate and the tracker
 have found; the last one holds always."""
 
-RULES = (*SCAN_RULES, *MOTION_RULES)
+SCAN_AND_MOTION_RULES = (*SCAN_RULES, *MOTION_RULES)
 """All rules in their order; the first that holds decides on gamma and gives the reason."""
 
 

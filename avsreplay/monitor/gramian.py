@@ -22,7 +22,7 @@ from avsreplay.geometry import Array, frozen
 from avsreplay.monitor import _root
 from avsreplay.records import BLOCKS
 
-_WORDS: Mapping[str, str] = {
+_BLOCK_WORDS: Mapping[str, str] = {
     "attitude": "attitude of the principal axes",
     "rate": "angular rate",
     "position": "centre of mass",
@@ -211,6 +211,7 @@ def _text_of(share: Array, own: int, blocks: Mapping[str, slice]) -> str:
         )
         held = float(np.sum(share[blocks[name]]))
         texts.append(
-            f"{_WORDS.get(name, name)} {axes}" + ("" if len(together) == 1 else f" ({held:.0%})")
+            f"{_BLOCK_WORDS.get(name, name)} {axes}"
+            + ("" if len(together) == 1 else f" ({held:.0%})")
         )
     return " with ".join(texts)

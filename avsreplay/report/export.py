@@ -27,13 +27,13 @@ from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Column, Row, columns, field_types
 from avsreplay.settings import dump
 
-FORMAT = "avsreplay-run/1"
+EXPORT_FORMAT = "avsreplay-run/1"
 
 StampedPose = tuple[int, Pose]
 """(t_ns, T_ac): a time and the pose of {C} in {A} at that time."""
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet evaluates text that begins so
-_COLUMNS = {
+_FILE_COLUMNS = {
     "estimate": (("qx", "qy", "qz", "qw"), ("x_m", "y_m", "z_m")),
     "registration": (("reg_qx", "reg_qy", "reg_qz", "reg_qw"), ("reg_x_m", "reg_y_m", "reg_z_m")),
 }
@@ -41,7 +41,7 @@ _COLUMNS = {
 
 def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | None:
     """Return the estimated or the registered pose of a row, None where there is none."""
-    attitude, position = _COLUMNS[which]
+    attitude, position = _FILE_COLUMNS[which]
     q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
     return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
 
@@ -146,7 +146,7 @@ def run_document(
     """
     names = [f.name for f in dataclasses.fields(Row)]
     return {
-        "format": FORMAT,
+        "format": EXPORT_FORMAT,
         "verdict": verdict_of(rows, summary, header).record(),
         "header": _strict(dump(dict(header or {}))),
         "summary": summary_record(summary),
@@ -192,7 +192,7 @@ def write_layout(path: str | Path) -> None:
         )
 
 
-_HEAD = """# What do the columns of a row mean?
+_PAGE_HEAD = """# What do the columns of a row mean?
 
 Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. These are the columns that
 people use; all follow by subject.
@@ -207,7 +207,7 @@ schema of a row.
 `python -m avsreplay.report.export` makes this page, with `--schema` the schema.
 """
 
-FREQUENT = {
+FREQUENT_COLUMNS = {
     "which scan": ("seq", "t_s"),
     "was it used, and why not": ("gamma", "reason", "status", "message"),
     "pose of the target": ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
@@ -225,9 +225,10 @@ def columns_page() -> str:
     """Return the text of docs/columns.md."""
     lines = ["| question | columns |", "|---|---|"]
     lines += [
-        f"| {what} | {', '.join(f'`{n}`' for n in names)} |" for what, names in FREQUENT.items()
+        f"| {what} | {', '.join(f'`{n}`' for n in names)} |"
+        for what, names in FREQUENT_COLUMNS.items()
     ]
-    parts = [_HEAD.replace("{frequent}", "\n".join(lines))]
+    parts = [_PAGE_HEAD.replace("{frequent}", "\n".join(lines))]
     words: list[str] = []
     for each in columns():
         if each.section is not None:

@@ -27,10 +27,10 @@ from avsreplay.rows import Row, field_types
 from avsreplay.settings import LARGEST_NUMBER
 from avsreplay.tables import RowTable
 
-_NAMES = tuple(f.name for f in dataclasses.fields(Row))
-_VALUES = attrgetter(*_NAMES)
+_ROW_COLUMNS = tuple(f.name for f in dataclasses.fields(Row))
+_ROW_VALUES = attrgetter(*_ROW_COLUMNS)
 _ENCODE = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
-_PLAIN = (float, str, int, bool, type(None))  # types of values that JSON has
+_PLAIN_TYPES = (float, str, int, bool, type(None))  # types of values that JSON has
 _MAX_LINE_BYTES = 1 << 20
 _MAX_ROWS_BYTES = 2 << 30
 _MAX_NAME_CHARACTERS = 100
@@ -43,18 +43,18 @@ def plain(value: Any) -> Any:
     """Return a value that JSON has: numpy scalars as those of Python, floats that are not finite as
     None.
     """
-    if type(value) not in _PLAIN and hasattr(value, "item"):
+    if type(value) not in _PLAIN_TYPES and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def dump_row(row: Row) -> str:
     """Return a row as one line of JSON, without the line end."""
-    values = _VALUES(row)
+    values = _ROW_VALUES(row)
     try:
-        return _ENCODE(dict(zip(_NAMES, values, strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, values, strict=True)))
     except (TypeError, ValueError):  # a numpy scalar, or a float that is not finite
-        return _ENCODE(dict(zip(_NAMES, map(plain, values), strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, map(plain, values), strict=True)))
 
 
 class RowWriter:

@@ -291,14 +291,14 @@ def event_table(header: Mapping[str, Any] | None) -> Table:
     record = (header or {}).get("smoothed")
     found = record.get("events") if isinstance(record, dict) else None
     lines = tuple(
-        (*(_figure(each.get(name), places) for name, places in _TIMES), *_told(each))
+        (*(_figure(each.get(name), places) for name, places in _ONSET_COLUMNS), *_told(each))
         for each in (found if isinstance(found, list) else ())
         if isinstance(each, dict)
     )
     return Table("Events by all poses of the log", heads, lines)
 
 
-_TIMES = (("onset_s", 2), ("onset_1s_s", 2))
+_ONSET_COLUMNS = (("onset_s", 2), ("onset_1s_s", 2))
 
 
 def _told(event: Mapping[str, Any]) -> tuple[str, str, str]:

@@ -37,7 +37,7 @@ from avsreplay.rows import Row
 from avsreplay.run import Job, Listener, ReplayedScan, Run
 from avsreplay.saved_result import of_run
 from avsreplay.simulate.scenario import scenario_of
-from avsreplay.sweep.campaign import SCORES, RunResult
+from avsreplay.sweep.campaign import RECORDED_SCORES, RunResult
 from avsreplay.sweep.expansion import Expansion, Point, Task
 from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
 from avsreplay.sweep.page import build_sweep_page
@@ -133,7 +133,7 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
     alpha = None
     if row.innov_m is not None and row.innov_deg is not None:
         alpha = float(np.hypot(row.innov_m, length_m * np.radians(row.innov_deg)))
-    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in SCORES)
+    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in RECORDED_SCORES)
     return (row.seq, row.fault, harmful, row.gamma, *scores)
 
 

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import output_path
-from avsreplay.result_dir import OWN
+from avsreplay.result_dir import OWN_FILES
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 
 
@@ -145,7 +145,7 @@ class Journal:
         self._stream: BinaryIO | None = None
         self._lock: BinaryIO | None = None
         self._guarded(self._read)
-        foreign = [name for name in (*RESULTS, *sorted(OWN)) if (folder / name).exists()]
+        foreign = [name for name in (*RESULTS, *sorted(OWN_FILES)) if (folder / name).exists()]
         if foreign and not self.path.exists():
             hint = "name another directory; it is left alone"
             raise UsageError(

@@ -13,8 +13,8 @@ from markupsafe import Markup
 from avsreplay.report.episodes import Peak
 from avsreplay.report.page import Part, Section, build_html, render
 from avsreplay.report.table import Table
-from avsreplay.sweep.statistics import NONE, FaultKind, Quantiles, Rate, Roc, Typical
-from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, WorstRun
+from avsreplay.sweep.statistics import NO_HYPOTHESIS, FaultKind, Quantiles, Rate, Roc, Typical
+from avsreplay.sweep.summary import CAMPAIGN_METRICS, Cell, Detector, SweepSummary, WorstRun
 
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its
 # own
@@ -25,7 +25,7 @@ _CHART_WIDTH_PX = 460
 _CHART_ROW_PX = 44
 _CHART_HEAD_PX = 52
 _NAME_CHARACTERS = 62  # of the name of a combination over its line
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
+_TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
 _LEAST_FALSE_RATE = 1e-4  # left end of the ROC's logarithmic axis
 # The square of the ROC.
 _ROC_LEFT_PX = 60
@@ -65,7 +65,7 @@ def build_sweep_page(summary: SweepSummary) -> str:
     cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
     figures = [
         _spans(title, [(_named(n, c), c.metrics.get(name)) for n, c in cells])
-        for name, title in HEADLINES.items()
+        for name, title in CAMPAIGN_METRICS.items()
     ]
     parts: list[Part] = [
         combination_table(cells),
@@ -158,7 +158,7 @@ def cell_table(number: int, cell: Cell) -> Table:
             points = (f"{v:.3g}" for v in (found.q05, found.median, found.q95))
             rows.append(
                 (
-                    HEADLINES[name],
+                    CAMPAIGN_METRICS[name],
                     str(found.count),
                     *points,
                     _interval(found.median_low, found.median_high, ".3g"),
@@ -235,7 +235,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     """
     span = high - low or abs(high) or 1.0
     power = 10.0 ** math.floor(math.log10(span / 5.0))
-    step = next(s * power for s in _STEPS if s * power >= span / 5.0)
+    step = next(s * power for s in _TICK_STEPS if s * power >= span / 5.0)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     return [float(f"{k * step:.12g}") for k in range(first, max(last, first + 1) + 1)]
 
@@ -329,7 +329,7 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
         "By kind of fault: times in s, errors in mm and deg; ~: usable by its label; none:"
         " outside every window"
     )
-    injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)
+    injected = any(cell.kinds.keys() - {NO_HYPOTHESIS} for _, cell in cells)
     return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else (), wide=True)
 
 
@@ -346,14 +346,14 @@ def columns_of(table: Table, kept: Sequence[int]) -> Table:
 
 def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:
     names = {name for _, cell in cells for name in cell.kinds}
-    for name in sorted(names, key=lambda name: (name != NONE, name)):
+    for name in sorted(names, key=lambda name: (name != NO_HYPOTHESIS, name)):
         for number, cell in cells:
             if name in cell.kinds:
                 yield _kind_row(name, number, cell.kinds[name])
 
 
 def _kind_row(name: str, number: int, kind: FaultKind) -> tuple[str, ...]:
-    harmless = name != NONE and not kind.harmful
+    harmless = name != NO_HYPOTHESIS and not kind.harmful
     return (
         f"{name} ~" if harmless else name,
         str(number),

@@ -194,12 +194,17 @@ def _floats(values: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-NONE = "none"
-_PLAIN = tuple(f.name for f in dataclasses.fields(Episode) if not f.name.startswith("peak_"))
+NO_HYPOTHESIS = "none"
+_PLAIN_FIGURES = tuple(
+    f.name for f in dataclasses.fields(Episode) if not f.name.startswith("peak_")
+)
 _PEAKS = ("flagged", "used", "after")
-_ERRORS = tuple(f.name for f in dataclasses.fields(Peak))
-EPISODE_COLUMNS = (*_PLAIN, *(f"peak_{when}.{error}" for when in _PEAKS for error in _ERRORS))
-_TIMES = ("delay_s", "delay_scans", "recover_s", "recover_scans")
+_ERROR_FIGURES = tuple(f.name for f in dataclasses.fields(Peak))
+EPISODE_COLUMNS = (
+    *_PLAIN_FIGURES,
+    *(f"peak_{when}.{error}" for when in _PEAKS for error in _ERROR_FIGURES),
+)
+_TIME_FIGURES = ("delay_s", "delay_scans", "recover_s", "recover_scans")
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +266,7 @@ class _Windows:
         self.harmful = False
         self.strengths, self.lengths = set[float](), set[float]()
         self.scans = self.flagged = self.episodes = self.detected = self.lost = 0
-        self.times: dict[str, list[float]] = {name: [] for name in _TIMES}
+        self.times: dict[str, list[float]] = {name: [] for name in _TIME_FIGURES}
         self.peaks: dict[str, float] = {}
 
     def add(self, window: Mapping[str, Any]) -> None:
@@ -278,17 +283,17 @@ class _Windows:
         self.take_peaks(window)
 
     def take_peaks(self, found: Mapping[str, Any], prefix: str = "") -> None:
-        for name in (f"peak_{when}.{error}" for when in _PEAKS for error in _ERRORS):
+        for name in (f"peak_{when}.{error}" for when in _PEAKS for error in _ERROR_FIGURES):
             value = found.get(prefix + name)
             if value is not None:
                 self.peaks[name] = max(value, self.peaks.get(name, value))
 
     def result(self) -> FaultKind:
         delay_s, delay_scans, recovery_s, recovery_scans = (
-            typical(self.times[name]) for name in _TIMES
+            typical(self.times[name]) for name in _TIME_FIGURES
         )
         flagged, used, after = (
-            Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERRORS)) for when in _PEAKS
+            Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERROR_FIGURES)) for when in _PEAKS
         )
         return FaultKind(
             harmful=self.harmful,
@@ -326,7 +331,7 @@ class FaultKinds:
             window = dict(zip(EPISODE_COLUMNS, line, strict=True))
             self._kinds.setdefault(window["kind"], _Windows()).add(window)
         if metrics.get("faults.known"):
-            none = self._kinds.setdefault(NONE, _Windows())
+            none = self._kinds.setdefault(NO_HYPOTHESIS, _Windows())
             none.scans += metrics["faults.unlabelled"]
             none.flagged += metrics["faults.false_alarms"]
             none.take_peaks(metrics, "faults.")
