@@ -41,11 +41,6 @@ RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in 
 class PlanParams(Settings):
     """Capability of the robot, and how it plans."""
 
-    enabled: bool = setting(
-        True,
-        "Plan and fly an approach. Without it no capture is assessed, and a run under constraints"
-        " takes about half of the time.",
-    )
     a_max_mps2: float = setting(
         0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0
     )
@@ -79,6 +74,11 @@ class PlanParams(Settings):
     )
     robot_velocity_mps: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Velocity of the end-effector in {A} when planning.", unit="m/s"
+    )
+    enabled: bool = setting(
+        True,
+        "Plan and fly an approach. Without it no capture is assessed, and a run under constraints"
+        " takes about half of the time.",
     )
 
     def check(self) -> None:
