@@ -425,7 +425,7 @@ def test_a_kind_of_another_package_needs_no_change_here(plain, monkeypatch):
             halved = replace(shot.returns, ranges=0.5 * shot.returns.ranges)
             return replace(shot, returns=halved)
 
-    monkeypatch.setitem(FAULTS._built_in, "shrunk", Shrunk)
+    monkeypatch.setitem(FAULTS.built_in, "shrunk", Shrunk)
     found = scans(fault("shrunk"))
     assert_allclose(found[4].points, 0.5 * plain[4].points, rtol=1e-6)
     assert found[4].fault == "shrunk"

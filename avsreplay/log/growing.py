@@ -138,7 +138,7 @@ class GrowingLog:
         """
         before = self._at
         while True:
-            grown = self._advance()
+            grown = self.advance()
             if self.finished or (grown and self._at > before):
                 begun = time.monotonic()
                 try:
@@ -168,7 +168,7 @@ class GrowingLog:
         """Wait for no more data; what is complete is still read."""
         self._stop.set()
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         """Step over the records that are complete by now; return whether there were any."""
         ending, start = self._stop.is_set(), self._at
         size = self.path.stat().st_size

@@ -9,11 +9,11 @@ docs/rows.schema.json with ``--schema``, from the declaration of ``Row``.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from avsreplay.rows import Column, Row, columns, field_types
 from avsreplay.settings import dump
 
 EXPORT_FORMAT = "avsreplay-run/1"
+GROUP_ROWS = 4096  # rows of a group of a Parquet file, which are in memory at once
 
 StampedPose = tuple[int, Pose]
 """(t_ns, T_ac): a time and the pose of {C} in {A} at that time."""
@@ -133,25 +134,41 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
             for c in columns()
         ]
     )
-    table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
-    with output_path(path) as part:
-        pq.write_table(pa.table(table, schema=schema), part)
+    with output_path(path) as part, pq.ParquetWriter(part, schema) as writer:
+        left = iter(rows)
+        while group := list(islice(left, GROUP_ROWS)):
+            table = {name: [plain(getattr(row, name)) for row in group] for name in types}
+            writer.write_table(pa.table(table, schema=schema))
 
 
-def run_document(
+def document_parts(
     rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return a run as plain JSON values, with the keys ``format``, ``verdict``, ``header``,
-    ``summary`` and ``rows``; NaN becomes null.
+) -> Iterator[str]:
+    """Yield the parts of a JSON document of a run, with one line per row and a line end at its end.
+
+    Args:
+        rows: one per scan.
+        summary: the summary of these rows.
+        header: the content of ``run.json``.
+
+    Yields:
+        Text; all parts together are one document with the keys ``format``, ``verdict``, ``header``,
+        ``summary`` and ``rows``, in which NaN is null.
     """
-    names = [f.name for f in dataclasses.fields(Row)]
-    return {
+    whole = {
         "format": EXPORT_FORMAT,
         "verdict": verdict_of(rows, summary, header).record(),
         "header": _strict(dump(dict(header or {}))),
         "summary": summary_record(summary),
-        "rows": [{name: plain(getattr(row, name)) for name in names} for row in rows],
     }
+    head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
+    yield f'{head[:-2]},\n "rows": [\n'
+    names, end = list(field_types()), ""
+    for row in rows:
+        values = {name: plain(getattr(row, name)) for name in names}
+        yield end + json.dumps(values, ensure_ascii=False, allow_nan=False)
+        end = ",\n"
+    yield "\n ]\n}\n"
 
 
 def summary_record(summary: Summary) -> dict[str, Any]:
@@ -160,18 +177,6 @@ def summary_record(summary: Summary) -> dict[str, Any]:
     record["faults"]["false_alarm_rate"] = summary.faults.false_alarm_rate
     record["faults"]["longest_recovery_s"] = summary.faults.longest_recovery_s
     return record
-
-
-def dump_document(
-    rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
-) -> str:
-    """The document as text with one line per row, ending in a line end."""
-    whole = run_document(rows, summary, header)
-    lines = ",\n".join(
-        json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows")
-    )
-    head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
-    return f'{head[:-2]},\n "rows": [\n{lines}\n ]\n}}\n'
 
 
 def _strict(value: Any) -> Any:

@@ -215,7 +215,7 @@ def run_tasks(
     if workers == 0 and scheduler is None:
         yield from _here(tasks, work)
         return
-    with _client(workers, scheduler, dashboard) as client:
+    with connected(workers, scheduler, dashboard) as client:
         yield from _on(client, iter(tasks), work)
 
 
@@ -235,11 +235,21 @@ def _here(tasks: Iterable[T], work: Callable[[T], RunResult]) -> Iterator[RunRes
         for task in tasks:
             future = pool.submit(work, task)
             error = future.exception()
-            yield future.result() if error is None else _crashed(task.id, error)
+            yield future.result() if error is None else crashed(task.id, error)
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+def connected(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+    """Connect to a Dask scheduler, or start one with workers on this machine, as a context.
+
+    Args:
+        workers: number of worker processes, where one is started.
+        scheduler: address of a running scheduler; None starts one.
+        dashboard: address of the dashboard of one that is started.
+
+    Raises:
+        UnreadableInput: the scheduler does not answer.
+    """
     dask = _distributed()
     if scheduler is not None:
         try:
@@ -307,12 +317,16 @@ def _collected(future: Any) -> RunResult:
     if future.status == "finished":
         outcome: RunResult = future.result()
         return outcome
-    return _crashed(str(future.key).removeprefix("run-"), future.exception())
+    return crashed(str(future.key).removeprefix("run-"), future.exception())
 
 
-def _crashed(task_id: str, error: BaseException | None) -> RunResult:
-    """The result of a run that raised: kind and first line of the error, without addresses
-    that differ between runs.
+def crashed(task_id: str, error: BaseException | None) -> RunResult:
+    """Return the result of a run that raised: kind and first line of the error, without addresses,
+    which differ between runs.
+
+    Args:
+        task_id: the run.
+        error: what it raised.
     """
     if type(error).__name__ == "KilledWorker":
         return RunResult(task_id, "crashed", "the worker process died repeatedly")

@@ -120,7 +120,7 @@ class SweepSummary:
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON; a number that is not finite is null."""
-        plain: dict[str, Any] = _finite(settings.dump(self))
+        plain: dict[str, Any] = without_infinities(settings.dump(self))
         return plain
 
 
@@ -258,9 +258,14 @@ def _score(name: str, value: float | None) -> float | None:
     return 1.0 - value if value is not None and name == "outlier_ratio" else value
 
 
-def _finite(value: Any) -> Any:
+def without_infinities(value: Any) -> Any:
+    """Return a JSON value with null in place of every number that is not finite.
+
+    Args:
+        value: a number, a text, None, or lists and tables of these.
+    """
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: without_infinities(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return [without_infinities(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
