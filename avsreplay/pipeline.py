@@ -494,7 +494,13 @@ def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief
 def fold(
     stages: Stages, state: PipelineState, scans: Iterable[Scan]
 ) -> Iterator[tuple[PipelineState, Outcome]]:
-    """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log."""
+    """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log.
+
+    Args:
+        stages: the stages.
+        state: the state before the first scan.
+        scans: the scans in order.
+    """
     for scan in scans:
         state, outcome = step(stages, state, scan)
         yield state, outcome
@@ -720,6 +726,12 @@ def target_scene(
 ) -> Scene:
     """Return the predicted target after a belief about the grasp point, as the planner uses it:
     estimate and forecast, never the truth.
+
+    Args:
+        estimator: predicts the motion.
+        belief: the estimate.
+        target: geometry of the target about the grasp point.
+        forecast: predicts the belief at a later instant.
     """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
@@ -744,7 +756,16 @@ def planner_input(
     converged: bool,
     forecast: Forecaster,
 ) -> PlannerInput:
-    """Return the input of guidance after a scan."""
+    """Return the input of guidance after a scan.
+
+    Args:
+        estimator: predicts the motion.
+        belief: the estimate after the scan.
+        target: geometry of the target about the grasp point.
+        gamma: 1 for a healthy scan, 0 for a faulty one.
+        converged: whether the estimate has converged.
+        forecast: predicts the belief at a later instant.
+    """
     return PlannerInput(
         belief.t_ns, gamma, converged, target_scene(estimator, belief, target, forecast), forecast
     )

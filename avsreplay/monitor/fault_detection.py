@@ -99,13 +99,24 @@ class FaultParams(Settings):
 
 
 def weighted_norm(seen: Innovation, length_m: float) -> float:
-    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle."""
+    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle.
+
+    Args:
+        seen: the innovation.
+        length_m: the length L [m] that weighs the rotation.
+    """
     return math.hypot(seen.distance_m, length_m * seen.angle_rad)
 
 
 def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: float) -> float:
     """The limit on |alpha|_W [m]: ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that
     is more.
+
+    Args:
+        seen: the innovation with its covariance.
+        alpha_max_m: the fixed limit [m].
+        length_m: the length L [m] that weighs the rotation.
+        sigmas: predicted 1 sigma that are allowed.
     """
     variances = np.diagonal(seen.S)
     predicted = math.sqrt(

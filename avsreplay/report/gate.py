@@ -112,6 +112,9 @@ class RuleOutcome:
 def load_rules(path: str | Path) -> tuple[GateRule, ...]:
     """Read the rules of a TOML file.
 
+    Args:
+        path: the file.
+
     Raises:
         UnreadableInput: the file cannot be read.
         UsageError: it is not valid; the message names the line.
@@ -195,7 +198,11 @@ def _broken(rule: GateRule, value: float, reference: float | None) -> Iterator[s
 
 
 def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
-    """Raise CheckFailed with the first broken rule, if there is one."""
+    """Raise CheckFailed with the first broken rule, if there is one.
+
+    Args:
+        outcomes: the outcomes of all rules.
+    """
     broken = [o for o in outcomes if not o.ok]
     if broken:
         o = broken[0]
