@@ -370,7 +370,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     )
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, seen, planned)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
-    if guidance.captured_ns is None:
+    if stages.guidance.params.enabled and guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
         aim = at_grasp(belief, stages.grasp_c)
         known = planner_input(

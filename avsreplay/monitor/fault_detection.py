@@ -96,13 +96,6 @@ class FaultParams(Settings):
         " above this value.",
         above=0.0,
     )
-    min_inlier_ratio: float = setting(
-        0.3,
-        "Smallest ratio of inliers to points of a healthy scan. A larger value rejects more scans"
-        " with background or clutter.",
-        low=0.0,
-        high=1.0,
-    )
 
 
 def weighted_norm(seen: Innovation, length_m: float) -> float:
@@ -233,8 +226,8 @@ def _not_converged(scan: ScanEvidence) -> bool:
 
 
 def _few_inliers(scan: ScanEvidence) -> bool:
-    p, found = scan.limits, scan.alignment
-    return found is None or found.inliers < p.min_inliers or found.inlier_ratio < p.min_inlier_ratio
+    found = scan.alignment
+    return found is None or found.inliers < scan.limits.min_inliers
 
 
 def _halves_differ(scan: ScanEvidence) -> bool:

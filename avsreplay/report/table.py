@@ -248,7 +248,7 @@ def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
     return min(max(least, wanted), 8)
 
 
-SHOWN_ROWS = 24  # rows of a table that are shown without being asked for
+SHOWN_ROWS = 24  # rows of a table that are shown unless more are requested
 _HEADS = {  # a line end stands where the heading may break
     "seq": "scan",
     "t_s": "time",
