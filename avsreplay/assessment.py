@@ -15,7 +15,8 @@ from typing import Any
 from avsreplay.errors import value_class
 from avsreplay.outcome import CaptureError
 
-LIKELY, POSSIBLE = 0.9, 0.5  # least probabilities of a capture that is called likely, possible
+LIKELY_PROBABILITY = 0.9  # least probability of a capture that is called likely
+POSSIBLE_PROBABILITY = 0.5  # least probability of a capture that is called possible
 
 
 class Chance(Enum):
@@ -63,6 +64,7 @@ class Assessment:
         change: what would change the answer, in words.
         task: the task in one line.
         in_fact: what happened; None where the true motion is not known.
+        asked: whether a grasp point was given, and is not the one that is assumed.
     """
 
     chance: Chance
@@ -78,6 +80,16 @@ class Assessment:
     change: str = ""
     task: str = ""
     in_fact: InFact | None = None
+    asked: bool = True
+
+    @property
+    def lowers_grade(self) -> bool:
+        """Whether a run with this assessment has a reason for concern beside the tracking.
+
+        A capture that is not assessed, because the assumed grasp point cannot be used or plans are
+        switched off, is none.
+        """
+        return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 
     @property
     def succeeds(self) -> bool:
@@ -161,6 +173,7 @@ class Assessment:
             "tolerance": _errors_record(self.tolerance),
             "miss": _errors_record(self.miss),
             "task": self.task,
+            "asked": self.asked,
             "in_fact": None
             if fact is None
             else {
@@ -196,6 +209,7 @@ class Assessment:
             probability_95=None if interval is None else (float(interval[0]), float(interval[1])),
             tolerance=tolerance,
             miss=_errors_of(record["miss"]),
+            asked=bool(record.get("asked", True)),
             in_fact=None
             if fact is None
             else InFact(
@@ -210,9 +224,9 @@ class Assessment:
 
 def chance_of(probability: float) -> Chance:
     """Return how likely a capture is, in one word, from its probability."""
-    if probability >= LIKELY:
+    if probability >= LIKELY_PROBABILITY:
         return Chance.LIKELY
-    return Chance.POSSIBLE if probability >= POSSIBLE else Chance.UNLIKELY
+    return Chance.POSSIBLE if probability >= POSSIBLE_PROBABILITY else Chance.UNLIKELY
 
 
 def errors_text(errors: CaptureError) -> str:

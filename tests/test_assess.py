@@ -15,6 +15,7 @@ from avsreplay.build import target_geometry
 from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.geometry import exp, matrix
+from avsreplay.log import SourceOptions
 from avsreplay.outcome import CaptureError
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.robot import Limits, RobotParams
@@ -24,6 +25,7 @@ from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import print_screen
 from avsreplay.report.table import make_console
 from avsreplay.report.verdict import verdict_of
+from avsreplay.run import Job, Run
 from avsreplay.simulate.target import Shape, builtin_surface
 from avsreplay.task import TaskParams, patches, task_of
 
@@ -211,6 +213,30 @@ def test_a_run_without_a_capture_is_no_pass(fixtures_folder, more, chance, code)
     returned, verdict = _run(fixtures_folder, *more)
     assert (verdict["capture"]["chance"], returned) == (chance, code)
     assert verdict["grade"] != "PASS"
+
+
+@pytest.mark.parametrize(("point", "grade"), [(None, "PASS"), ("[0.0,0.0,0.1]", "CHECK")])
+def test_only_a_given_grasp_point_lowers_the_grade(tmp_path, point, grade):
+    """Poses of a body whose origin nobody can grasp: the tracking passes all the same."""
+    rng = np.random.Generator(np.random.PCG64(4))
+    lines = [
+        [1.0 + 0.5 * k, *(0.004 * rng.normal(size=3) + (0, 0, 5)), *exp(0.05 * k * np.ones(3))]
+        for k in range(24)
+    ]
+    log = tmp_path / "log.tum"
+    log.write_text("\n".join(" ".join(map(str, line)) for line in lines))
+    words = ["register.backend=poses", *([f"task.grasp_m={point}"] if point else [])]
+    words += ["task.position_m=0.2", "task.angle_deg=20.0", "task.speed_mps=0.1"]
+    options = SourceOptions(extent_m=2.0)
+    with Run(Job(source=log, options=options, assignments=tuple(words), prefetch=0)) as run:
+        rows = list(run.rows())
+        summary = run.summary()
+    verdict = verdict_of(rows, summary)
+    assert verdict.capture is not None
+    assert verdict.capture.chance is Chance.NOT_ASSESSED
+    assert (verdict.grade.value, verdict.tracking.value) == (grade, "PASS")
+    again = Assessment.of_record(verdict.capture.record())
+    assert again == verdict.capture
 
 
 @pytest.mark.parametrize("columns", [80, 160])

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tumbling
+from state_errors import permute_covariance
 
 from avsreplay import geometry
 from avsreplay.estimate.chart import (
     AXIS_PERMUTATIONS,
     body_parameters,
     permute_axes,
-    permute_covariance,
 )
 from avsreplay.records import Belief
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tumbling
+from state_errors import boxminus, permute_covariance
 
 from avsreplay import geometry
 from avsreplay.estimate import dynamics
@@ -17,13 +18,12 @@ from avsreplay.estimate.chart import (
     nees,
     nees_by_block,
     permute_axes,
-    permute_covariance,
     separated,
     to_chart,
     to_errors,
     to_state,
 )
-from avsreplay.estimate.error_state import DMU, DQ, boxminus, boxplus, semidefinite
+from avsreplay.estimate.error_state import DMU, DQ, boxplus, semidefinite
 from avsreplay.records import BLOCKS, Belief, State
 
 EACH = pytest.mark.parametrize("naming", AXIS_PERMUTATIONS, ids=lambda n: "".join(map(str, n.perm)))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tumbling
+from state_errors import boxminus
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
@@ -16,7 +17,7 @@ from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.disturbance_schedule import no_worse_than_pose
 from avsreplay.estimate.driven import DrivenBelief, driven_forecast, driven_moments, propagated
 from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state
-from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import (
     chart_update,

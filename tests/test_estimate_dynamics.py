@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import tumbling
 from scipy.integrate import solve_ivp
+from state_errors import boxminus
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import _motion, dynamics
 from avsreplay.estimate.dynamics import rotation_history, rotation_path
-from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.records import Belief, State
 
 CALM = (0.0, 0.0, 0.0)

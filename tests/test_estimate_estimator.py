@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import tumbling
 from scipy.stats import chi2
+from state_errors import boxminus
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, noise, noise_levels
 from avsreplay.estimate.chart import nees
-from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.measurement import (
     constrained_update,
     gain,

@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tumbling
+from state_errors import boxminus
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.chart import Chart, body_parameters, to_chart
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.mixture import Component, mixture_forecast
 from avsreplay.estimate.params import Start

@@ -13,19 +13,19 @@ import pytest
 import tumbling
 from click.testing import CliRunner
 from scipy.stats import chi2, f, wishart
+from state_errors import boxminus, permute_covariance
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion, measurement
 from avsreplay.estimate.chart import (
     AXIS_PERMUTATIONS,
     permute_axes,
-    permute_covariance,
     to_chart,
     to_errors,
     to_state,
 )
 from avsreplay.estimate.dynamics import grasp_jacobian, sigma3, sigma_join
-from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.measurement import (
     BLOCKS_OF,
     chart_update,

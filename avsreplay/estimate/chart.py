@@ -33,8 +33,8 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
-from avsreplay.estimate.dynamics import sigma3, sigma_join
-from avsreplay.estimate.error_state import DIM, DMU, DQ, SIGMA, VARRHO, W
+from avsreplay.estimate.dynamics import sigma3
+from avsreplay.estimate.error_state import DMU, SIGMA, VARRHO
 from avsreplay.geometry import Array
 from avsreplay.outcome import BodyParameters
 from avsreplay.records import BLOCKS, Belief, State
@@ -217,16 +217,6 @@ def permute_axes(x: State, permutation: AxisPermutation) -> State:
     q_an = geometry.multiply(x.q_ab, permutation.q_bn)
     q_nc = geometry.multiply(geometry.conjugate(permutation.q_bn), x.q_bc)
     return State(q_an, R_nb @ x.w_b, x.r_a, x.v_a, sigma, R_nb @ x.c_b, q_nc)
-
-
-def permute_covariance(P: Array, x: State, permutation: AxisPermutation) -> Array:
-    """P (20, 20) about ``x``, as a covariance about ``permute_axes(x, permutation)``."""
-    J = np.eye(DIM)
-    for block in (DQ, W, VARRHO, DMU):
-        J[block, block] = permutation.R_bn.T
-    J[SIGMA, SIGMA] = permutation.parity * sigma_join(x.sigma)[list(permutation.perm[:2])]
-    out: Array = J @ P @ J.T
-    return out
 
 
 def nearest_permutation(estimate: Belief, truth: State) -> tuple[State, float]:

@@ -104,19 +104,9 @@ def find_drift(
     if not frame.u.any() or (known is not None and best.log_odds < _FOUND):
         return None
     if known is None:
-        if poor_fit(frame, factors, levels) or _odds(best, frame, free) < _FOUND:
-            return None
-        nearer = yield from fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
-        free = min(free, nearer, key=lambda f: f.cost)
-        yield _size(free)
-        if (
-            _odds(best, frame, free) < _FOUND
-            or best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT
-        ):
-            return None
-        constant = yield from _constant(frame, free, levels, best, widths)
-        if not constant or not (
-            yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))
+        nearer = fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
+        if poor_fit(frame, factors, levels) or not (
+            yield from _shown(frame, free, nearer, best, params, levels, widths)
         ):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
@@ -132,6 +122,41 @@ def find_drift(
     both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
     likely = tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT)
     return DriftFound(likely, best.width * widths, within.spread_s)
+
+
+def _shown(
+    frame: DrivenFit,
+    free: DrivenFit,
+    nearer: Parts[DrivenFit],
+    best: _Found,
+    params: EstimatorParams,
+    levels: NoiseLevels,
+    widths: Array,
+) -> Parts[bool]:
+    """Whether the poses show a drift better than free motion, a change of the velocities, and
+    random disturbances do.
+
+    Args:
+        frame: fit with the drift.
+        free: fit of free motion.
+        nearer: the fit of free motion that begins at ``frame``, which may be the better one.
+        best: the drift.
+        params: settings.
+        levels: noise levels.
+        widths: (6,) prior 1 sigma of the drift.
+    """
+    if _odds(best, frame, free) < _FOUND:
+        return False
+    other = yield from nearer
+    free = min(free, other, key=lambda f: f.cost)
+    yield _size(free)
+    if _odds(best, frame, free) < _FOUND:
+        return False
+    if best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT:
+        return False
+    if not (yield from _constant(frame, free, levels, best, widths)):
+        return False
+    return (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0)))
 
 
 @value_class

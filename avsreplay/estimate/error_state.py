@@ -87,22 +87,6 @@ def boxplus(x: State, d: Array) -> State:
     )
 
 
-def boxminus(a: State, b: State) -> Array:
-    """The error d (20,) with ``boxplus(b, d)`` equal to a: a (-) b."""
-    d = np.empty(DIM)
-    d[DQ] = _vector(hamilton(conjugate_quad(b.q_ab), a.q_ab.tolist()))
-    d[DMU] = _vector(hamilton(a.q_bc.tolist(), conjugate_quad(b.q_bc)))
-    d[W], d[RHO], d[VEL] = a.w_b - b.w_b, a.r_a - b.r_a, a.v_a - b.v_a
-    d[SIGMA], d[VARRHO] = a.sigma - b.sigma, a.c_b - b.c_b
-    return d
-
-
-def _vector(q: Quad) -> tuple[float, float, float]:
-    """Vector part of q or -q, whichever has w >= 0."""
-    x, y, z, w = q
-    return (x, y, z) if w >= 0.0 else (-x, -y, -z)
-
-
 def _unit(q: Quad) -> Array:
     x, y, z, w = q
     n = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)

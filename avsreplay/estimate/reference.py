@@ -1,10 +1,8 @@
-"""A reference for logs without ground truth: one batch fit over all poses of a log, as a
-function of time.
-"""
+"""One free motion through all poses of a log, and the motion of a fit at any instant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +11,10 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
 from avsreplay.estimate.chart import Chart, to_chart, to_state
-from avsreplay.estimate.dynamics import pose_rows, propagate_state, rotation_path, translated
+from avsreplay.estimate.dynamics import pose_rows, propagate_state
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
+from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Track
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array, Pose
@@ -26,30 +24,17 @@ _FEWEST = 4
 _FIRST_TURN = np.pi  # the window starts at half a turn and doubles
 
 
-@value_class
-class Reference:
-    """The motion with the maximum likelihood over all poses.
-
-    Attributes:
-        fitted: the fit with its residuals.
-        epoch_ns, end_ns: instants of the first and the last pose.
-        at: instant [ns] between these -> state.
-    """
-
-    fitted: BatchFit
-    epoch_ns: int
-    end_ns: int
-    at: Callable[[int], State]
-
-
-def reference_fit(
+def free_fit(
     t_ns: Sequence[int],
     poses: Sequence[Pose],
     covariances: Sequence[Array] | None,
     extent_m: float,
     params: EstimatorParams | None = None,
-) -> Reference:
-    """Fit all poses T_ac of a log, in time order.
+) -> BatchFit:
+    """Fit one free motion to all poses T_ac of a log, in time order.
+
+    The smoothing pass finds events and random disturbances between the poses; this fit assumes
+    that there are none, and its residuals show whether that is so.
 
     Args:
         t_ns: instants, ascending [ns].
@@ -59,6 +44,9 @@ def reference_fit(
         extent_m: bounding diagonal of the target [m].
         params: the estimator's; None is the default. The axes of an orbit are those at the first
             pose.
+
+    Returns:
+        The fit, whose state is that at the first pose.
 
     Raises:
         UsageError: fewer than four poses.
@@ -70,14 +58,9 @@ def reference_fit(
         PoseFix(t, pose, C, orbit=orbit) for t, pose, C in zip(t_ns, poses, given, strict=True)
     )
     if len(fixes) < _FEWEST:
-        hint = "a reference needs four healthy poses at least"
-        raise UsageError(
-            f"only {len(fixes)} poses to fit a reference to", where="--reference fit", hint=hint
-        )
-    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), settings)
-    first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
-    arc = None if fixes[0].orbit is None else fixes[0].orbit.at(first_ns)
-    return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns, arc))
+        hint = "a free motion needs four healthy poses at least"
+        raise UsageError(f"only {len(fixes)} poses to fit a motion to", hint=hint)
+    return _grown(poses_of(fixes), to_chart(rough_state(fixes)), settings)
 
 
 @value_class
@@ -177,20 +160,3 @@ def _windows(poses: Poses, start: Chart) -> list[int]:
             counts.append(count)
         span *= 2.0
     return counts
-
-
-def _motion(x: State, first_ns: int, last_ns: int, arc: OrbitArc | None) -> Callable[[int], State]:
-    path = rotation_path(x)
-
-    def at(t_ns: int) -> State:
-        """The state at an instant within the poses' span."""
-        h = (t_ns - first_ns) * 1e-9
-        if not 0 <= t_ns - first_ns <= last_ns - first_ns:
-            raise ValueError(
-                f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}"
-            )
-        q, w = path.at(np.array([h]))
-        centre, velocity = translated(x, np.array([h]), arc)
-        return State(q[0], w[0], centre[0], velocity[0], x.sigma, x.c_b, x.q_bc)
-
-    return at

@@ -346,16 +346,6 @@ Numpy lower_inverse_of(const Matrix<-1, -1>& L) {
   return out;
 }
 
-Numpy lower_divided(const Matrix<-1, -1>& L, const Vector<-1>& y) {
-  const size_t n = L.shape(0);
-  if (L.shape(1) != n || y.shape(0) != n) throw std::invalid_argument("sizes of L and y differ");
-  double* to;
-  Numpy out = array({n}, &to);
-  std::copy(y.data(), y.data() + n, to);
-  lower_divide(L.data(), n, to);
-  return out;
-}
-
 using Flat = Vector<CHART>;
 
 Chart chart(const Flat& from) {
@@ -830,7 +820,6 @@ NB_MODULE(_motion, m) {
   m.def("mixed", &mixed_of, nb::arg("M"), nb::arg("white"), nb::arg("size"), nb::arg("factors"), nb::arg("kinds"));
   m.def("impulse_odds", &impulse_odds_of, nb::arg("A"), nb::arg("b"), nb::arg("variances"));
   m.def("lower_inverse", &lower_inverse_of, nb::arg("L"));
-  m.def("lower_divided", &lower_divided, nb::arg("L"), nb::arg("y"));
   m.def("chart", &chart_from, nb::arg("x"));
   m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));

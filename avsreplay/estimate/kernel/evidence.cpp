@@ -135,13 +135,6 @@ void lower_inverse(const double* L, size_t n, double* out) {
   }
 }
 
-void lower_divide(const double* L, size_t n, double* y) {
-  for (size_t r = 0; r < n; ++r) {
-    for (size_t i = 0; i < r; ++i) y[r] -= L[n * r + i] * y[i];
-    y[r] /= L[n * r + r];
-  }
-}
-
 void after_change(const double* late, const double impulse[6][3], double instant, size_t m, double* out) {
   for (size_t i = 0; i < m; ++i, late += 12, out += 6) {
     double s[3] = {};

@@ -24,9 +24,6 @@ void impulse_odds(double* A, std::vector<double> b, const double* variances, siz
 // The inverse (n, n) of a lower triangular L (n, n).
 void lower_inverse(const double* L, size_t n, double* out);
 
-// y := L^-1 y.
-void lower_divide(const double* L, size_t n, double* y);
-
 // Derivatives (m, 6) of m white data by a change of (rate, velocity) at an instant, from those by the errors of attitude,
 // rate, position and velocity at the start (m, 12); a unit of the rate then equals the errors `impulse` of attitude and
 // rate at the start.
