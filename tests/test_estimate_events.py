@@ -194,6 +194,7 @@ def test_without_an_event_none_is_found_and_the_claims_hold(case):
         fixes, states, _, _ = _scene(seed, **case)
         found = smoothed(fixes, PARAMS)
         assert found.events == ()
+        assert all(names for _, names in found.rivals)  # another set than the best one
         squares += [_squares(found.beliefs[k], states[k]) for k in range(0, len(fixes), 20)]
         if "random" in case:
             assert 0.4 < found.torque / case["random"][0] < 2.0
