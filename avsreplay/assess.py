@@ -59,10 +59,11 @@ from avsreplay.plan.uncertainty import Disturbance, draws, wilson
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 from avsreplay.task import Task
 
-FLIGHTS = 16  # simulated flights where the log ends before the capture
-DRAWS = 128  # targets drawn for a flight that ended
-NOISES = 50  # last measured poses whose noise is that of the simulated ones
-_EXPLAINED = 0.2  # least share of the variance of an error by which one quantity is named
+SIMULATED_FLIGHTS = 16  # simulated flights where the log ends before the capture
+DRAWN_TARGETS = 128  # targets drawn for a flight that ended
+NOISE_SCANS = 50  # last measured poses whose noise is that of the simulated ones
+# least share of the variance of an error by which one quantity is named
+_LEAST_VARIANCE_SHARE = 0.2
 _WHY = {rule.name: rule.why for rule in RULES}
 _AXES = "xyz"
 _COORDINATES = (
@@ -138,7 +139,7 @@ class FlightLog:
         self.gammas.append(gamma)
         self.stamps.append(belief.t_ns)
         if noise is not None and gamma:
-            self.noises = [*self.noises[-NOISES + 1 :], np.diagonal(noise).copy()]
+            self.noises = [*self.noises[-NOISE_SCANS + 1 :], np.diagonal(noise).copy()]
         if self.ended or guidance is None:
             return
         self.state, self.belief, self.converged = guidance, belief, converged
@@ -198,7 +199,7 @@ class Setup:
     since_ns: int
     thrust_noise_mps2: float = 0.0
     noise: tuple[float, float] | None = None
-    flights: int = FLIGHTS
+    flights: int = SIMULATED_FLIGHTS
     seed: int = 0
     advice: str = ""
     contact: Contact | None = field(init=False)
@@ -249,6 +250,9 @@ def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessm
         "basis": "flight over the log",
         "asked": "grasp point" not in task.assumed,
     }
+    if not setup.guidance.params.enabled:
+        known |= {"asked": False, "limit": "no plans are made (plan.enabled = false)"}
+        return Assessment(chance=Chance.NOT_ASSESSED, **known)
     if task.problem:
         return Assessment(
             chance=Chance.NOT_ASSESSED, limit=task.problem, change=setup.advice, **known
@@ -273,7 +277,7 @@ def _closed(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any
     end_ns = state.segment.end_ns
     leg = next((leg for leg in reversed(log.legs) if leg.belief.t_ns <= end_ns), log.legs[0])
     belief, after = leg.belief, np.array([(end_ns - leg.belief.t_ns) * 1e-9])
-    steps, drawn = drawn_beliefs(belief, DRAWS, setup.rng(1))
+    steps, drawn = drawn_beliefs(belief, DRAWN_TARGETS, setup.rng(1))
     aimed = setup.estimator.attitude(belief)(after)[0]
     r, v = state.segment.at(end_ns)
     since_s = np.array([0.0, max((end_ns - state.segment.t_ns) * 1e-9, 1e-9)])
@@ -554,8 +558,8 @@ def drawn_beliefs(
 
 
 def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None:
-    """Return for each of ``DRAWS`` targets (n,) whether the flown path touches it; None where
-    contact is not checked.
+    """Return for each of ``DRAWN_TARGETS`` targets (n,) whether the flown path touches it; None
+    where contact is not checked.
 
     A draw has the same share of the pose error at all scans. Parts of the path that are farther
     from the centre of mass than the target reaches cannot touch it.
@@ -564,8 +568,8 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
     if contact is None:
         return None
     if not log.legs:  # the robot has not left its start
-        return np.zeros(DRAWS, dtype=bool)
-    z = setup.rng(4).standard_normal((DRAWS, 6))
+        return np.zeros(DRAWN_TARGETS, dtype=bool)
+    z = setup.rng(4).standard_normal((DRAWN_TARGETS, 6))
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
     parts: list[Array] = []
     stamps = [leg.belief.t_ns for leg in log.legs]
@@ -580,7 +584,7 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
             continue
         parts.append(_seen_by_draws(setup, leg.belief, times, r - rho, z))
     if not parts:
-        return np.zeros(DRAWS, dtype=bool)
+        return np.zeros(DRAWN_TARGETS, dtype=bool)
     return contact.touched(np.concatenate(parts, axis=1))
 
 
@@ -679,8 +683,8 @@ def _predicted(setup: Setup, belief: Belief, after_s: float) -> tuple[int, float
         [found.pos_1s_m[-1], found.vel_1s_mps[-1], math.degrees(float(found.rot_1s_rad[-1]))]
     )
     worst = int(np.argmax(sizes / setup.limits))
-    steps, drawn = drawn_beliefs(belief, DRAWS, setup.rng(5))
-    at, errors = np.array([after_s]), np.empty((DRAWS, 7))
+    steps, drawn = drawn_beliefs(belief, DRAWN_TARGETS, setup.rng(5))
+    at, errors = np.array([after_s]), np.empty((DRAWN_TARGETS, 7))
     (rho, rate), q = setup.estimator.motion(belief)(at), setup.estimator.attitude(belief)(at)[0]
     for k, each in enumerate(drawn):
         (r, v), own = setup.estimator.motion(each)(at), setup.estimator.attitude(each)(at)[0]
@@ -716,7 +720,7 @@ def _cause(steps: Array, errors: Array, worst: int, pushed: Array | None = None)
             grouped = name in ("errors of the thrust", "the inertia")
             shares[name] = share + (shares.get(name, 0.0) if grouped else 0.0)
     best = max(shares, key=lambda name: shares[name], default="")
-    if not best or shares[best] < _EXPLAINED:
+    if not best or shares[best] < _LEAST_VARIANCE_SHARE:
         return f"the {_QUANTITIES[worst]} error when the gripper closes"
     return best
 

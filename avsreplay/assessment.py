@@ -15,7 +15,8 @@ from typing import Any
 from avsreplay.errors import value_class
 from avsreplay.outcome import CaptureError
 
-LIKELY, POSSIBLE = 0.9, 0.5  # least probabilities of a capture that is called likely, possible
+LIKELY_PROBABILITY = 0.9  # least probability of a capture that is called likely
+POSSIBLE_PROBABILITY = 0.5  # least probability of a capture that is called possible
 
 
 class Chance(Enum):
@@ -83,10 +84,10 @@ class Assessment:
 
     @property
     def lowers_grade(self) -> bool:
-        """Whether a run with this assessment has a reason for concern beside the tracking.
+        """Whether the assessment is a reason for concern beside the tracking.
 
-        A capture that is not assessed because the assumed grasp point cannot be used is none:
-        nobody asked for it.
+        A capture that is not assessed, because the assumed grasp point cannot be used or plans are
+        switched off, is none.
         """
         return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 
@@ -223,9 +224,9 @@ class Assessment:
 
 def chance_of(probability: float) -> Chance:
     """Return how likely a capture is, in one word, from its probability."""
-    if probability >= LIKELY:
+    if probability >= LIKELY_PROBABILITY:
         return Chance.LIKELY
-    return Chance.POSSIBLE if probability >= POSSIBLE else Chance.UNLIKELY
+    return Chance.POSSIBLE if probability >= POSSIBLE_PROBABILITY else Chance.UNLIKELY
 
 
 def errors_text(errors: CaptureError) -> str:

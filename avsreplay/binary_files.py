@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.read_budget import BadFile, ReadBudget, check_declared
-from avsreplay.spool import BLOCK_BYTES, Spool, SpoolFile
+from avsreplay.spool import SPOOL_BLOCK_BYTES, Spool, SpoolFile
 
-_MAX_NPY_HEADER = 4096
+_MAX_NPY_HEADER_BYTES = 4096
 _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
@@ -110,7 +110,7 @@ class _NpyHeader:
 def _npy_header(data: bytes) -> _NpyHeader:
     start = 12 if data[6:7] in (b"\x02", b"\x03") else 10
     size = int.from_bytes(data[8:start], "little")
-    if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
+    if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER_BYTES or len(data) < start + size:
         raise BadFile("not a valid npy file")
     header = _NPY_HEADER.fullmatch(data[start : start + size].decode("latin-1").strip())
     if header is None or not _NPY_TYPE.fullmatch(header["descr"]):
@@ -217,7 +217,7 @@ def _regular_size(path: Path, limit: int, hint: str) -> int:
 
 def _read_array(member: IO[bytes], size: int, name: str, out: Spool) -> None:
     """Append the records of a member of an archive, which declares a size [bytes]."""
-    head = member.read(_MAX_NPY_HEADER + 12)
+    head = member.read(_MAX_NPY_HEADER_BYTES + 12)
     header = _npy_header(head)
     same_kind = header.dtype.kind == out.dtype.kind
     ordered = header.order == "C" or len(header.shape) == 1
@@ -234,9 +234,9 @@ def _read_array(member: IO[bytes], size: int, name: str, out: Spool) -> None:
         out.extend(numbers.astype(out.dtype))
         left, data = left - whole, data[whole:]
         if left:
-            more = member.read(BLOCK_BYTES)
+            more = member.read(SPOOL_BLOCK_BYTES)
             if not more:
                 raise BadFile(f"the array '{name}' is shorter than it declares")
             data += more
-    while member.read(BLOCK_BYTES):  # the checksum is compared at the end
+    while member.read(SPOOL_BLOCK_BYTES):  # the checksum is compared at the end
         pass

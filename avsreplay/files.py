@@ -24,13 +24,18 @@ from typing import IO
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.locks import PART, check_alone, lock
 
-STDOUT, _NAME_BYTES = Path("-"), 255
-_CLEANED, _COUNTER = set[Path](), itertools.count()
+STDOUT = Path("-")
+_MAX_NAME_BYTES = 255  # of the name of a file, the limit of common file systems
+_CLEANED = set[Path]()
+_COUNTER = itertools.count()
 
 
 def is_stream(path: Path) -> bool:
     """Return whether an output is written directly: ``-``, a device or a FIFO, also behind a
     symbolic link.
+
+    Args:
+        path: the output.
     """
     if path == STDOUT:
         return True
@@ -78,10 +83,12 @@ def check_output(
         raise UsageError("is not the name of an output", where=repr(str(path)), hint="name a file")
     if str(path).encode("utf-8", "replace") != name:
         raise UsageError("is not a UTF-8 name", where=ascii(str(path)), hint="name another output")
-    if len(os.fsencode(path.name)) > _NAME_BYTES:
+    if len(os.fsencode(path.name)) > _MAX_NAME_BYTES:
         where = f"{path.name[:40]}..."
         raise UsageError(
-            f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output"
+            f"the name is longer than {_MAX_NAME_BYTES} bytes",
+            where=where,
+            hint="name another output",
         )
     try:
         if (

@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 
-PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
+# least share of the edges of a closed part that two opposite half-edges form
+PAIRED_EDGE_SHARE = 0.95
 # least volume of a part with an inside, times six, in units of its area to the power of 3/2
-LEAST_VOLUME = 1e-9
-LEAST_PART = (
-    1e-3  # least area of an open part over that of the mesh; smaller parts are remains of meshing
-)
+LEAST_VOLUME_RATIO = 1e-9
+# least area of an open part over that of the mesh; smaller parts are remains of meshing
+LEAST_PART_AREA_SHARE = 1e-3
 # area of a circle as long as the open edges of a part, over its area; parts below it have no inner
 # side
-OPENING = 0.01
-MERGED_OF_EXTENT = (
-    1e-6  # vertices on the same point of a grid this fine are one: exports round 0 to 1e-17
-)
-_DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
+OPENING_AREA_SHARE = 0.01
+# vertices on the same point of a grid this fine are one: exports round 0 to 1e-17
+MERGED_OF_EXTENT = 1e-6
+_CORNER_DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
 
 Faces = NDArray[np.int32]
 
@@ -146,7 +145,7 @@ def _reversed(vertices: Array, faces: Faces) -> tuple[NDArray[np.bool_], NDArray
     parts = _parts(_edges(_corners(vertices, faces)))
     wound = np.where(parts.reversed[:, None], faces[:, ::-1], faces)
     volume, area = _volumes(vertices, wound, parts.of)
-    closed = parts.closed & (np.abs(volume) > LEAST_VOLUME * area**1.5)
+    closed = parts.closed & (np.abs(volume) > LEAST_VOLUME_RATIO * area**1.5)
     inside_out = np.full(len(volume), bool(volume[closed].sum() < 0.0)) & closed
     wound = np.where(inside_out[parts.of, None], wound[:, ::-1], wound)
     volume = np.where(inside_out, -volume, volume)
@@ -193,7 +192,7 @@ def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArra
     volume, whole = (
         float(each[0]) for each in _volumes(vertices, faces, np.zeros(len(faces), np.int64))
     )
-    flat = abs(volume) <= LEAST_VOLUME * whole**1.5
+    flat = abs(volume) <= LEAST_VOLUME_RATIO * whole**1.5
     first = distinct_rows(
         np.column_stack([either, np.zeros_like(turned) if flat else turned]).astype(np.float64)
     )[0]
@@ -203,8 +202,9 @@ def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArra
         return first, np.full(len(first), -1)
     parts = _parts(edges)
     area = _volumes(vertices, few, parts.of)[1]
-    opened = (area > LEAST_PART * area.sum()) & (
-        flat | (_openings(vertices, few, corners[first], paired, parts.of) > OPENING * area)
+    opened = (area > LEAST_PART_AREA_SHARE * area.sum()) & (
+        flat
+        | (_openings(vertices, few, corners[first], paired, parts.of) > OPENING_AREA_SHARE * area)
     )
     return first, np.where(opened[parts.of], parts.of, -1)
 
@@ -225,7 +225,7 @@ def _openings(
     length = np.linalg.norm(
         vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1
     )
-    loop = _components(int(corners.max()) + 1, start, end)[start]
+    loop = components(int(corners.max()) + 1, start, end)[start]
     key, number = np.unique(np.column_stack([of[face], loop]), axis=0, return_inverse=True)
     around = np.bincount(number.ravel(), length, len(key))
     return np.asarray(
@@ -313,9 +313,9 @@ def _parts(edges: _Edges) -> _Parts:
     a, b = edges.pairs.T // 3
     same = edges.sign[edges.pairs[:, 0]] == edges.sign[edges.pairs[:, 1]]
     if not same.any():
-        of, reversed_ = _components(m, a, b), np.zeros(m, bool)
+        of, reversed_ = components(m, a, b), np.zeros(m, bool)
     else:
-        nodes = _components(
+        nodes = components(
             2 * m, np.append(a, a + m), np.append(b + same * m, b + ~same * m)
         ).reshape(2, m)
         _, of = np.unique(nodes.min(axis=0), return_inverse=True)
@@ -325,14 +325,19 @@ def _parts(edges: _Edges) -> _Parts:
     sign = np.where(np.repeat(reversed_, 3), -edges.sign, edges.sign)
     _, group = np.unique(edges.number * (of.max() + 1) + np.repeat(of, 3), return_inverse=True)
     paired = np.bincount(group, sign)[group] == 0.0
-    return _Parts(of, reversed_, _share(paired, of) >= PAIRED_EDGES)
+    return _Parts(of, reversed_, _share(paired, of) >= PAIRED_EDGE_SHARE)
 
 
-def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of the connected component of each node, in the order of the first nodes; edges from
-    ``a`` to ``b``.
+def components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number (nodes,) of the connected component of each node, in the order of the first
+    nodes.
 
     Each node is linked to one of a lower number in its component until all are linked to the first.
+
+    Args:
+        nodes: number of nodes.
+        a: nodes (n,) where the edges begin.
+        b: nodes (n,) where they end.
     """
     first = np.arange(nodes)
     while len(a):
@@ -377,10 +382,10 @@ def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
     if not len(others):
         return False
     points, corners = vertices[np.unique(part)], vertices[others]
-    outermost = np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))
+    outermost = np.unique(np.argmax(points @ _CORNER_DIRECTIONS.T, axis=0))
     a, b, c = (vertices[part[:, k]] for k in range(3))
     largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable")[
-        : len(_DIRECTIONS)
+        : len(_CORNER_DIRECTIONS)
     ]
     tested = np.concatenate([((a + b + c) / 3.0)[largest], points[outermost]])
     return all(_solid_angle(corners - p) > 2.0 * np.pi for p in tested)

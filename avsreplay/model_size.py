@@ -27,23 +27,27 @@ from avsreplay.register.sampling import diameter, part_of_size
 from avsreplay.register.size import MOST_OF_MODEL
 
 # diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
-_LEAST = 0.25
-_WHOLE = 1.1  # no scan of the target alone is larger than this
-_FEW = 0.02  # share of background below which it does not explain too large a scan
-_MOST_BACKGROUND = 0.5  # share of background from which on scans are rejected for too few inliers
-_LEFT_OVER = (
-    2.0  # below this ratio, background explains too large a scan better than feet (3.28) do
-)
+_LEAST_SIZE_RATIO = 0.25
+_MAX_TARGET_RATIO = 1.1  # no scan of the target alone is larger than this
+# share of background below which it does not explain too large a scan
+_LEAST_BACKGROUND_SHARE = 0.02
+# share of background from which on scans are rejected for too few inliers
+_MAX_BACKGROUND_SHARE = 0.5
+# below this ratio, background explains too large a scan better than feet (3.28) do
+_BACKGROUND_RATIO = 2.0
 # below this ratio, a model in feet explains the sizes as well as a view from a narrow side
-_FEET = 0.36
+_FEET_RATIO = 0.36
 _LARGEST_TARGET_M = 500.0
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
-_SEARCHED, _SEARCHED_SCANS = 20_000, 3  # points of a scan in which the model is searched, and scans
+_SEARCHED_POINTS = 20_000  # points of a scan in which the model is searched
+_SEARCHED_SCANS = 3
 # factor of a unit from which on a scan that seems to show the target only may show its surroundings
-_SCENE = 0.11
-_LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
+_SCENE_FACTOR = 0.11
+# largest scan over the target in it, where the unit of the model is unknown
+_MAX_SCENE_RATIO = 300.0
 _GAPS = 0.2, 0.3  # gaps within and around a target of unknown unit, over its diameter
-_MARGIN = 0.25  # space around the target in a suggested crop, over the model's diameter
+# space around the target in a suggested crop, over the model's diameter
+_CROP_MARGIN_OF_DIAMETER = 0.25
 _UNITS = {
     0.001: "millimetres",
     1.0: "metres",
@@ -55,7 +59,7 @@ _UNITS = {
     100.0: "units of 100 m, or the scans are in centimetres",
     39.3701: "units of 39.37 m, or the scans are in inches",
 }
-_SAME_UNIT = 1e-4  # relative difference of two units that are the same
+_SAME_UNIT_DIFFERENCE = 1e-4  # relative difference of two units that are the same
 _SMALLEST_TARGET_M = 0.05  # a smaller model is too small, and not the unit of the scans wrong
 
 
@@ -131,12 +135,12 @@ def compare_sizes(
     if min(scan_m, model_m) > _LARGEST_TARGET_M:
         text = f"{said}: if both are in millimetres, all lengths are 1000 times too large"
         return [Advice("check", "unit", text, "--model-unit mm --scan-unit mm")]
-    if _LEAST <= ratio <= _WHOLE:
-        groups = _grouped_units(clouds, model_m, ratio, unit, most=_SCENE)
+    if _LEAST_SIZE_RATIO <= ratio <= _MAX_TARGET_RATIO:
+        groups = _grouped_units(clouds, model_m, ratio, unit, most=_SCENE_FACTOR)
         other = groups and _unit_advice({unit: [], **groups}, clouds, surface, options, said)
         return other or [_agreeing(said, ratio)]
     whole = _units(ratio, unit)
-    left = ratio > MOST_OF_MODEL and (ratio < _LEFT_OVER or not whole)  # not a wrong unit
+    left = ratio > MOST_OF_MODEL and (ratio < _BACKGROUND_RATIO or not whole)  # not a wrong unit
     located = _located(clouds, surface, registrar) if left else []
     if 2 * len(located) >= len(clouds):
         why = f"the model was found in {len(located)} of {len(clouds)} examined scans"
@@ -173,7 +177,7 @@ def _background_advice(
         else []
     )
     inside = [Sighting(k, points) for k, points in enumerate(targets) if points is not None]
-    if ratio > _LEFT_OVER and len(inside) * 2 <= len(clouds):
+    if ratio > _BACKGROUND_RATIO and len(inside) * 2 <= len(clouds):
         inside = _groups(clouds, model_m)
     grouped = len(inside) * 2 > len(clouds)
     if grouped:
@@ -183,13 +187,13 @@ def _background_advice(
         points = [each.points for each in inside]
         if crop := _crop_advice(clouds, points, _of_size(model_m)):
             return [crop]
-    if grouped or _WHOLE < ratio <= MOST_OF_MODEL:
+    if grouped or _MAX_TARGET_RATIO < ratio <= MOST_OF_MODEL:
         text = (
             f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or"
             " background is left"
         )
         return [Advice("check", "size", text)]
-    if MOST_OF_MODEL < ratio < _LEFT_OVER:
+    if MOST_OF_MODEL < ratio < _BACKGROUND_RATIO:
         text = (
             f"{said}: points around the target seem to be left; a narrower --crop-box or"
             " --crop-range removes them"
@@ -317,13 +321,13 @@ def _few(clouds: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _thinned(cloud: NDArray[Any]) -> NDArray[Any]:
-    return cloud[:: max(len(cloud) // _SEARCHED, 1)]
+    return cloud[:: max(len(cloud) // _SEARCHED_POINTS, 1)]
 
 
 def _agreeing(said: str, ratio: float) -> Advice:
     """Sizes that agree, though the model may be in feet."""
     feet = "; if more than a narrow side is seen, the model is in feet (--model-scale 0.3048)"
-    return Advice("ok", "size", said + feet * (ratio < _FEET))
+    return Advice("ok", "size", said + feet * (ratio < _FEET_RATIO))
 
 
 def _scan_unit(factor: float, model_m: float) -> Unit | None:
@@ -331,7 +335,9 @@ def _scan_unit(factor: float, model_m: float) -> Unit | None:
     explains it.
     """
     of_scans = (
-        unit for unit in Unit if unit is not Unit.M and abs(factor * unit.metres - 1.0) < _SAME_UNIT
+        unit
+        for unit in Unit
+        if unit is not Unit.M and abs(factor * unit.metres - 1.0) < _SAME_UNIT_DIFFERENCE
     )
     return next(of_scans, None) if model_m >= _SMALLEST_TARGET_M else None
 
@@ -363,7 +369,7 @@ def _grouped_units(
     units = dict[float, Sequence[Sighting]]()
     for scale in _UNITS:
         factor = scale / given
-        if scale == given or factor > most or not MOST_OF_MODEL < ratio / factor < _LARGEST_SCENE:
+        if scale == given or factor > most or not MOST_OF_MODEL < ratio / factor < _MAX_SCENE_RATIO:
             continue
         if len(groups := _groups(clouds, factor * model_m)) * 2 > len(clouds):
             units[scale] = groups
@@ -490,7 +496,7 @@ def _crop_advice(
     """The crop that keeps the target in all examined scans; None if hardly any point lies
     outside it.
     """
-    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
+    margin = _CROP_MARGIN_OF_DIAMETER * max(diameter(points, trimmed=False) for points in targets)
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = (
         max(min(r.min() for r in ranges) - margin, 0.0),
@@ -506,10 +512,10 @@ def _crop_advice(
     use_range = by_range.mean() <= 1.2 * by_box.mean()
     option = f"--crop-range {low:.2f},{high:.2f}" if use_range else f"--crop-box {box}"
     share = 1.0 - (by_range if use_range else by_box).mean()
-    if share < _FEW:
+    if share < _LEAST_BACKGROUND_SHARE:
         return None
     text = f"{100 * share:.0f} % of the points are background; {why}"
-    return Advice("fail" if share > _MOST_BACKGROUND else "check", "background", text, option)
+    return Advice("fail" if share > _MAX_BACKGROUND_SHARE else "check", "background", text, option)
 
 
 def _metres(length: float) -> str:

@@ -21,13 +21,14 @@ from avsreplay.region import Region
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
 
-SCANS = 5
+SCANS_FOR_CHECKS = 5  # scans, spread over the log, that are examined before a run
 # distance of the grasp point from the bounding box, in extents, above which it is reported
-OFF_THE_MODEL = 0.25
-_POSES, _PAIRS = 200, 50  # measured poses, and pairs of successive ones, that are examined
-LARGEST_STEP = 0.25  # from one pose to the next, over the extent (docs/poses.md)
-_FOLLOWED = 300  # most scans over which a target is followed back to the first one
-_LOST = 5  # scans without points of the target after which it is lost
+OFF_THE_MODEL_OF_EXTENT = 0.25
+_EXAMINED_POSES = 200  # measured poses that are examined
+_EXAMINED_PAIRS = 50  # pairs of successive poses that are examined
+MAX_STEP_OF_EXTENT = 0.25  # from one pose to the next, over the extent (docs/poses.md)
+_MAX_FOLLOWED_SCANS = 300  # most scans over which a target is followed back to the first one
+_MAX_LOST_SCANS = 5  # scans without points of the target after which it is lost
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 
 
@@ -99,7 +100,7 @@ def _grasp_point(surface: Surface | None) -> list[Advice]:
         np.maximum(surface.vertices.min(axis=0), -surface.vertices.max(axis=0)), 0.0
     )
     distance = float(np.linalg.norm(outside))
-    if distance <= OFF_THE_MODEL * surface.extent:
+    if distance <= OFF_THE_MODEL_OF_EXTENT * surface.extent:
         return []
     text = f"the grasp point, the origin of the model, is {distance:.3g} m outside of the model"
     return [Advice("check", "grasp point", text, "--grasp X,Y,Z")]
@@ -122,7 +123,7 @@ def _grasp_patches(surface: Surface | None) -> list[Advice]:
 
 def _sampled(source: Source) -> list[Scan]:
     """A few scans, spread evenly over the log."""
-    return [source.scan_at(seq) for seq in _spread(len(source), SCANS)]
+    return [source.scan_at(seq) for seq in _spread(len(source), SCANS_FOR_CHECKS)]
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -191,12 +192,12 @@ def _followed_back(source: Source, scan: Scan, surface: Surface, at: Array) -> A
     start = at if scan.sensor is None else scan.sensor.apply(at[None])[0]
     region = Region(start, surface.vertices.min(axis=0), surface.vertices.max(axis=0))
     seen, lost = None, 0
-    for seq in reversed(_spread(scan.seq + 1, _FOLLOWED)):
+    for seq in reversed(_spread(scan.seq + 1, _MAX_FOLLOWED_SCANS)):
         before = source.scan_at(seq)
         if len(before.points):
             kept, seen = region.cut(before.points, -before.t_ns, seen, None)
             lost = 0 if kept.any() else lost + 1
-        if lost > _LOST:
+        if lost > _MAX_LOST_SCANS:
             return None
     return None if seen is None else seen.centre
 
@@ -205,7 +206,7 @@ def _poses(source: Source, surface: Surface | None) -> list[Advice]:
     """Measured poses: how many of a sample are valid, where their covariance comes from, and
     the size of the target.
     """
-    found = [source.scan_at(seq) for seq in _spread(len(source), _POSES)]
+    found = [source.scan_at(seq) for seq in _spread(len(source), _EXAMINED_POSES)]
     bad = [scan for scan in found if scan.pose is None]
     out = [Advice("ok", "poses", f"{len(source)} measured poses")]
     if bad:
@@ -240,7 +241,7 @@ def _step(source: Source, surface: Surface | None) -> list[Advice]:
         return []
     pairs = [
         (source.scan_at(seq).pose, source.scan_at(seq + 1).pose)
-        for seq in _spread(len(source) - 1, _PAIRS)
+        for seq in _spread(len(source) - 1, _EXAMINED_PAIRS)
     ]
     steps = [
         float(np.linalg.norm(b.T_ac.t - a.T_ac.t))
@@ -248,12 +249,12 @@ def _step(source: Source, surface: Surface | None) -> list[Advice]:
         if a is not None and b is not None
     ]
     step = float(np.median(steps)) if steps else 0.0
-    if step <= LARGEST_STEP * surface.extent:
+    if step <= MAX_STEP_OF_EXTENT * surface.extent:
         return []
     text = (
         f"the target moves {step:.3g} m from one pose to the next, {step / surface.extent:.2g}"
-        f" times its size ({LARGEST_STEP:g} is the most): check the size and the unit; a column"
-        " named 'x [mm]' is in millimetres, all other positions in metres"
+        f" times its size ({MAX_STEP_OF_EXTENT:g} is the most): check the size and the unit; a"
+        " column named 'x [mm]' is in millimetres, all other positions in metres"
     )
     return [Advice("fail", "unit", text)]
 

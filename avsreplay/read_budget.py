@@ -7,12 +7,12 @@ compared with what its bytes can hold and with what is left of the budget.
 
 from __future__ import annotations
 
-LEAST_BYTES = 16 << 20  # memory that the content of any file may take [bytes]
+LEAST_BUDGET_BYTES = 16 << 20  # memory that the content of any file may take [bytes]
 BYTES_PER_BYTE = 32  # memory for each byte of a file; compressed clouds take up to 20
-LEAST_RECORDS = 10_000  # records of any file: members, properties, lines
+LEAST_BUDGET_RECORDS = 10_000  # records of any file: members, properties, lines
 RECORDS_PER_BYTE = 1  # no format has records without bytes
-MOST_DEPTH = 32  # levels of nesting; the deepest format of this program has six
-LEAST_WORK = 50_000_000  # elementary steps, about one second of Python
+MAX_DEPTH = 32  # levels of nesting; the deepest format of this program has six
+LEAST_BUDGET_WORK = 50_000_000  # elementary steps, about one second of Python
 WORK_PER_BYTE = 200  # the slowest reader of text takes 50
 
 
@@ -42,7 +42,8 @@ class ReadBudget:
         *,
         most_bytes: int | None = None,
         records: int | None = None,
-        depth: int = MOST_DEPTH,
+        depth: int = MAX_DEPTH,
+        per_byte: int = BYTES_PER_BYTE,
     ) -> None:
         """Create the budget of an input.
 
@@ -51,12 +52,15 @@ class ReadBudget:
             most_bytes: largest memory of its content [bytes], None for the default.
             records: largest number of its records, None for the default.
             depth: largest depth of nesting.
+            per_byte: memory of its content for each of its bytes [bytes].
         """
-        allowed = LEAST_BYTES + BYTES_PER_BYTE * size
+        allowed = LEAST_BUDGET_BYTES + per_byte * size
         self.bytes = allowed if most_bytes is None else min(allowed, most_bytes)
-        self.records = LEAST_RECORDS + RECORDS_PER_BYTE * size if records is None else records
+        self.records = (
+            LEAST_BUDGET_RECORDS + RECORDS_PER_BYTE * size if records is None else records
+        )
         self.depth = depth
-        self.work = LEAST_WORK + WORK_PER_BYTE * size
+        self.work = LEAST_BUDGET_WORK + WORK_PER_BYTE * size
 
     def take_bytes(self, count: int, what: str) -> None:
         """Take memory; call it before the memory is allocated.
@@ -64,6 +68,9 @@ class ReadBudget:
         Args:
             count: number of bytes.
             what: what they are for, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.bytes:
             raise OverBudget(f"{what} of {_mib(count)}; {_mib(self.bytes)} are left for this file")
@@ -75,6 +82,9 @@ class ReadBudget:
         Args:
             count: number of records.
             what: what they are, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file has more than its size allows.
         """
         if count > self.records:
             raise OverBudget(f"{count} {what}; at most {self.records} are read")
@@ -86,6 +96,9 @@ class ReadBudget:
         Args:
             count: number of steps, about one for each value that is touched.
             what: what is parsed, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.work:
             raise OverBudget(f"{what} would take more than {self.work} steps to read")

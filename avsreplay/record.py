@@ -13,12 +13,12 @@ from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.log.options import lost_text
 from avsreplay.log.writer import ROOT_FRAME
-from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
+from avsreplay.records import NS_PER_S, Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.rays import Engine
 from avsreplay.simulate.recorded_faults import disturbed
 from avsreplay.simulate.scenario import Scenario, load_scenario
-from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.simulation import SIMULATED_EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
 
 Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
@@ -164,17 +164,17 @@ def record_scenario(
     simulation = simulate(
         scenario, surface_for(scenario, options.model, options.cloud_model), meshes
     )
-    last_ns = EPOCH_NS + round((simulation.count - 1) * 1e9 / scenario.params.rate_hz)
+    last_ns = SIMULATED_EPOCH_NS + round((simulation.count - 1) * 1e9 / scenario.params.rate_hz)
     header = _labelled(
-        simulation.header, options, EPOCH_NS, moving=scenario.params.camera is not None
+        simulation.header, options, SIMULATED_EPOCH_NS, moving=scenario.params.camera is not None
     )
-    header, outside = _within(header, EPOCH_NS, last_ns)
+    header, outside = _within(header, SIMULATED_EPOCH_NS, last_ns)
     with (
         _writer(output, header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
-        pairs = _with_faults(scans, header, options, EPOCH_NS)
-        tally = _fold(
+        pairs = _with_faults(scans, header, options, SIMULATED_EPOCH_NS)
+        tally = write_scans(
             pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses
         )
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
@@ -230,7 +230,7 @@ def record_source(
             # poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
-            tally = _fold(
+            tally = write_scans(
                 pairs,
                 opened.truth_of,
                 writer,
@@ -287,21 +287,25 @@ class _Tally:
         )
 
     def _fault(self, label: Label) -> tuple[str, float, float, bool]:
-        start, end = ((t - self.first_ns) / 1_000_000_000 for t in (label.start_ns, label.end_ns))
+        start, end = ((t - self.first_ns) / NS_PER_S for t in (label.start_ns, label.end_ns))
         return label.kind, start, end, label.harmful
 
 
-def _fold(
+def write_scans(
     pairs: Iterable[tuple[Scan, Scan | None]],
     truth_of: Callable[[Scan], Truth],
     writer: LogWriter,
     true_clock: bool,
     camera_of: Callable[[Scan], list[tuple[int, Pose]]],
 ) -> _Tally:
-    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or
-    None).
+    """Write scans with the truth at each scan as it was; damaged scans are counted.
 
-    ``camera_of`` gives the poses of a moving camera, each with the time after the stamp [ns].
+    Args:
+        pairs: a scan as it was, and the scan to write; None where it is left out.
+        truth_of: the ground truth of a scan.
+        writer: the log that is written.
+        true_clock: whether truth is stamped with the log clock.
+        camera_of: poses of a moving camera at a scan, each with its time after the stamp [ns].
     """
     tally = _Tally()
     for before, scan in pairs:

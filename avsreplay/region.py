@@ -17,18 +17,25 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 
-_AROUND = 1.5  # radius in which planes are searched, over the diagonal of the model
-_WITHIN = 1.0  # radius in which the target is searched: its centre may be anywhere on it
-_MARGIN = 0.1  # around the box of a known pose, over the diagonal
-_PART = 0.3  # distance of the middle of a part from that of the target, over the diagonal
-_CELL = 0.065  # points nearer than about this, over the diagonal, are connected
-_LOOKED, _SPACINGS = 300, 2.0  # points whose spacing is measured; size of a cell over it
-_FLAT = 0.03  # half the thickness of a plane, over the diagonal
-_PLANES, _TRIPLES, _SEED = 3, 128, 7  # most planes removed, tries for each, seed of the tries
-_OF_PLANE = 0.15  # least share of the points around that a plane has
-_BEYOND = 0.35  # least share of its points outside of the target's reach: it continues
-_LEAST = 8  # fewest points that are a target
-_GAIN, _RATE_GAIN = 0.6, 0.2  # of the follower: position and velocity
+# radius in which planes are searched, over the diagonal of the model
+_PLANE_RADIUS_OF_DIAGONAL = 1.5
+# radius in which the target is searched: its centre may be anywhere on it
+_TARGET_RADIUS_OF_DIAGONAL = 1.0
+_BOX_MARGIN_OF_DIAGONAL = 0.1  # around the box of a known pose, over the diagonal
+# distance of the middle of a part from that of the target, over the diagonal
+_PART_DISTANCE_OF_DIAGONAL = 0.3
+_CELL_OF_DIAGONAL = 0.065  # points nearer than about this, over the diagonal, are connected
+_SPACING_POINTS = 300  # points whose spacing is measured
+_CELL_SPACINGS = 2.0  # size of a cell over the median spacing
+_PLANE_HALF_OF_DIAGONAL = 0.03  # half the thickness of a plane, over the diagonal
+_MAX_PLANES = 3  # that are removed
+_PLANE_TRIPLES = 128  # tries for each plane
+_PLANE_SEED = 7  # of the random triples
+_LEAST_PLANE_SHARE = 0.15  # least share of the points around that a plane has
+_LEAST_BEYOND_SHARE = 0.35  # least share of its points outside of the target's reach: it continues
+_LEAST_TARGET_POINTS = 8  # fewest points that are a target
+_POSITION_GAIN = 0.6  # of the follower
+_VELOCITY_GAIN = 0.2  # of the follower
 
 
 @value_class
@@ -83,23 +90,27 @@ class Region:
         centre = at.centre + dt * at.velocity
         p = points.astype(np.float64)
         away = np.linalg.norm(p - centre, axis=1)
-        wide = np.flatnonzero(away < _AROUND * self.extent_m)
+        wide = np.flatnonzero(away < _PLANE_RADIUS_OF_DIAGONAL * self.extent_m)
         near = wide[~_on_planes(p[wide], away[wide], self.extent_m)]
-        near = near[away[near] < _WITHIN * self.extent_m]
-        on_target = _connected(p[near] - centre, _CELL * self.extent_m, _PART * self.extent_m)
+        near = near[away[near] < _TARGET_RADIUS_OF_DIAGONAL * self.extent_m]
+        on_target = _connected(
+            p[near] - centre,
+            _CELL_OF_DIAGONAL * self.extent_m,
+            _PART_DISTANCE_OF_DIAGONAL * self.extent_m,
+        )
         chosen = near[on_target]
         if pose is not None:
             local = pose.inverse().apply(p[near])
-            margin = _MARGIN * self.extent_m
+            margin = _BOX_MARGIN_OF_DIAGONAL * self.extent_m
             inside = ((local > self.low - margin) & (local < self.high + margin)).all(axis=1)
             if 2 * np.count_nonzero(inside) > len(chosen):  # else the prediction is not used
                 chosen = near[inside]
         kept = np.zeros(len(points), bool)
-        if len(chosen) < _LEAST:
+        if len(chosen) < _LEAST_TARGET_POINTS:
             return kept, at
         kept[chosen] = True
         seen = p[chosen].mean(axis=0)
-        gain, rate_gain = (max(g, 1.0 / max(at.scans, 1)) for g in (_GAIN, _RATE_GAIN))
+        gain, rate_gain = (max(g, 1.0 / max(at.scans, 1)) for g in (_POSITION_GAIN, _VELOCITY_GAIN))
         off = seen - centre
         velocity = at.velocity + rate_gain * off / dt if at.scans and dt > 0.0 else at.velocity
         return kept, Followed(t_ns, centre + gain * off, velocity, at.scans + 1)
@@ -113,14 +124,14 @@ def _on_planes(p: Array, away: Array, extent: float) -> NDArray[np.bool_]:
         away: (n,) their distance from the centre of the target [m].
         extent: size of the target [m].
     """
-    out, rng = np.zeros(len(p), bool), np.random.Generator(np.random.PCG64(_SEED))
-    for _ in range(_PLANES):
+    out, rng = np.zeros(len(p), bool), np.random.Generator(np.random.PCG64(_PLANE_SEED))
+    for _ in range(_MAX_PLANES):
         left = np.flatnonzero(~out)
-        if len(left) < 3 * _LEAST:
+        if len(left) < 3 * _LEAST_TARGET_POINTS:
             break
         on = left[_best_plane(p[left], extent, rng)]
         beyond = np.count_nonzero(away[on] > 0.5 * extent)
-        if len(on) < _OF_PLANE * len(p) or beyond < _BEYOND * len(on):
+        if len(on) < _LEAST_PLANE_SHARE * len(p) or beyond < _LEAST_BEYOND_SHARE * len(on):
             break
         out[on] = True
     return out
@@ -128,7 +139,7 @@ def _on_planes(p: Array, away: Array, extent: float) -> NDArray[np.bool_]:
 
 def _best_plane(p: Array, extent: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Which points are on the plane that has most of them, fitted to them."""
-    a, b, c = (p[rng.integers(len(p), size=_TRIPLES)] for _ in range(3))
+    a, b, c = (p[rng.integers(len(p), size=_PLANE_TRIPLES)] for _ in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     valid = length > 1e-3 * extent**2  # of triples that are no line
@@ -136,11 +147,14 @@ def _best_plane(p: Array, extent: float, rng: np.random.Generator) -> NDArray[np
         return np.zeros(len(p), bool)
     normals, a = normals[valid] / length[valid, None], a[valid]
     off = np.abs(p @ normals.T - np.einsum("ij,ij->i", normals, a))
-    on = off[:, np.argmax((off < _FLAT * extent).sum(axis=0))] < _FLAT * extent
+    on = (
+        off[:, np.argmax((off < _PLANE_HALF_OF_DIAGONAL * extent).sum(axis=0))]
+        < _PLANE_HALF_OF_DIAGONAL * extent
+    )
     for _ in range(2):
         middle = p[on].mean(axis=0)
         normal = np.linalg.svd(p[on] - middle, full_matrices=False)[2][2]
-        on = np.abs((p - middle) @ normal) < _FLAT * extent
+        on = np.abs((p - middle) @ normal) < _PLANE_HALF_OF_DIAGONAL * extent
     return np.asarray(on)
 
 
@@ -151,14 +165,16 @@ def _connected(p: Array, cell: float, reach: float) -> NDArray[np.bool_]:
     Points are connected where their cells touch. The cells have the given size [m], or the spacing
     of the points where these are farther apart.
     """
-    if len(p) < _LEAST:
+    if len(p) < _LEAST_TARGET_POINTS:
         return np.ones(len(p), bool)
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    apart: Array = np.asarray(cKDTree(p).query(p[:: max(len(p) // _LOOKED, 1)], k=2)[0])[:, 1]
-    cell = max(cell, _SPACINGS * float(np.median(apart)))
+    apart: Array = np.asarray(cKDTree(p).query(p[:: max(len(p) // _SPACING_POINTS, 1)], k=2)[0])[
+        :, 1
+    ]
+    cell = max(cell, _CELL_SPACINGS * float(np.median(apart)))
     cells, of = np.unique(np.floor(p / cell).astype(np.int64), axis=0, return_inverse=True)
     of = of.reshape(-1)
     pairs = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
@@ -170,5 +186,5 @@ def _connected(p: Array, cell: float, reach: float) -> NDArray[np.bool_]:
     middles = np.stack([np.bincount(labels, p[:, k]) for k in range(3)], axis=1) / sizes[:, None]
     distance = np.linalg.norm(middles, axis=1)
     parts = distance < reach
-    parts[np.argmin(np.where(sizes >= _LEAST, distance, np.inf))] = True
+    parts[np.argmin(np.where(sizes >= _LEAST_TARGET_POINTS, distance, np.inf))] = True
     return np.asarray(parts[labels])

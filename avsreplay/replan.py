@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.assess import FLIGHTS, FlightLog, Setup, assess, drawn_beliefs, simulated
+from avsreplay.assess import SIMULATED_FLIGHTS, FlightLog, Setup, assess, drawn_beliefs, simulated
 from avsreplay.assessment import Assessment
 from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
@@ -316,7 +316,7 @@ class Replanning:
         log.stamps, log.gammas = (column_of(self.saved.rows, name) for name in ("t_ns", "gamma"))
         return simulated(self._setup(count, seed), log, None, self.belief(index))
 
-    def assess(self, index: int, flights: int = FLIGHTS, seed: int = 0) -> Assessment:
+    def assess(self, index: int, flights: int = SIMULATED_FLIGHTS, seed: int = 0) -> Assessment:
         """Return whether the robot would capture if its approach began at a scan.
 
         Args:

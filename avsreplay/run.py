@@ -41,13 +41,9 @@ from avsreplay.toml_document import own_settings
 if TYPE_CHECKING:
     from avsreplay.reconstruct.model import Reconstruction
 
-RECONSTRUCTED, MOST_LOSSES = (
-    Path("auto"),
-    100,
-)  # a model built from the log; losses listed one by one in run.json
-
-
-_EQUAL_DEG = 3.0  # an error below this is not that of another one of equal poses
+RECONSTRUCTED = Path("auto")  # a model built from the log
+MAX_LISTED_LOSSES = 100  # in run.json
+_EQUAL_POSE_DEG = 3.0  # an error below this is not that of another one of equal poses
 
 
 @value_class
@@ -96,6 +92,7 @@ class Run:
         config: the effective configuration.
         surface: the model of the target.
         registrar: registers scans against that model.
+        stages: the stages of the pipeline.
         model_check: result of the check of the model by the rows so far.
         done: number of scans processed so far.
         taken: the rows of these scans.
@@ -147,8 +144,8 @@ class Run:
             self.model_check = ModelCheck(self.registrar, self.surface)
             self.task, self._target = task_and_target(self.config, self.surface)
             self.acceleration = self._fitted_acceleration()
-            self._stages = self._new_stages()
-            self.estimator = self._stages.estimator
+            self.stages = self._new_stages()
+            self.estimator = self.stages.estimator
         except BaseException:
             self.source.close()
             raise
@@ -160,7 +157,7 @@ class Run:
         self._fitted = HealthyPoses(self.estimator)  # poses of the reference motion
         self._smoothed: tuple[int, Reference | None] | None = None
         self._reference_instants: list[int] = []
-        self._state, self.done = first_state(self._stages), 0
+        self._state, self.done = first_state(self.stages), 0
         self._scored: Scorer | None = None
         self._image: Pose | None = None  # of {C}, which the run follows
         self._end: tuple[Belief, State] | None = None
@@ -202,7 +199,7 @@ class Run:
         Raises:
             UsageError: there are fewer than four healthy poses.
         """
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         poses, instants = HealthyPoses(ready.estimator), set[int]()
         for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
@@ -234,7 +231,7 @@ class Run:
         if self.config.reference is Against.FIT and self._reference is None:
             self.fit_reference(progress)
         listeners, self._scored = tuple(listeners), self._scored or self._scorer()
-        outcomes = self._outcomes(self._stages, progress, "replaying", self._state, self.done)
+        outcomes = self._outcomes(self.stages, progress, "replaying", self._state, self.done)
         if (
             self.job.prefetch
         ):  # the pipeline has a thread of its own; scoring and writing stay in this one
@@ -353,7 +350,7 @@ class Run:
     @property
     def approach(self) -> Limits:
         """Constraints of every plan of this run, with all lengths."""
-        return self._stages.guidance.limits
+        return self.stages.guidance.limits
 
     def summary(self) -> Summary:
         """Summarise the rows taken so far."""
@@ -390,12 +387,12 @@ class Run:
         setup = Setup(
             task=self.task,
             estimator=self._predictor(),
-            guidance=self._stages.guidance,
+            guidance=self.stages.guidance,
             target=self._target,
             solid=len(surface.faces) > 0,
             extent_m=surface.extent,
             since_ns=first_ns,
-            thrust_noise_mps2=robot.thrust_noise * self._stages.guidance.params.a_max_mps2,
+            thrust_noise_mps2=robot.thrust_noise * self.stages.guidance.params.a_max_mps2,
             noise=self.flight.noise,
             advice=grasp_advice(self.task, surface),
         )
@@ -430,7 +427,7 @@ class Run:
             "clock": settings.dump(self.source.clock),
             "clouds": self.source.meaning.record(),
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
-            "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
+            "losses": {"count": len(losses), "first": settings.dump(losses[:MAX_LISTED_LOSSES])},
             "selection": settings.dump(self.job.options),
             "robot": self.config.robot_line,
             "approach": settings.dump(self.approach),
@@ -444,16 +441,18 @@ class Run:
             ),
         }
 
-    def _new_stages(self) -> Stages:
+    def _new_stages(self, plans: bool = True) -> Stages:
         clock = self.source.first_ns, self.source.clock.period_s * self.source.options.every
-        return stages(self.config, self.header, self.surface, self.registrar, self._true, clock)
+        plan = replace(self.config.plan, enabled=plans and self.config.plan.enabled)
+        config = replace(self.config, plan=plan)
+        return stages(config, self.header, self.surface, self.registrar, self._true, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
         """Fit the acceleration to the measured poses of a first pass if this is set, and use it."""
         if not self.config.estimator.fit_acceleration:
             return None
         self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         outcomes = [
             outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
         ]
@@ -503,7 +502,7 @@ class Run:
         if truth is None:
             return
         found, best = outcome.alignment.T_ac, truth
-        if pose_error(found, truth).angle_deg > _EQUAL_DEG:
+        if pose_error(found, truth).angle_deg > _EQUAL_POSE_DEG:
             images = self.registrar.images(truth)
             best = min(images, key=lambda pose: pose_error(found, pose).angle_deg)
         self._image = truth.inverse() @ best

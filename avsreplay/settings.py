@@ -23,7 +23,7 @@ from avsreplay.parts import Parts
 
 S = TypeVar("S", bound="Settings")
 
-LARGEST = 1e100  # of every setting: squares and products of two settings remain finite
+LARGEST_NUMBER = 1e100  # of every setting: squares and products of two settings remain finite
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,8 +111,8 @@ class Setting:
                 each = "each value " if several else ""
                 shown = list(value) if several else value
                 allowed = self.range or "finite"
-                if LARGEST < abs(number) < math.inf:
-                    allowed = f"at most {LARGEST:g} in magnitude"
+                if LARGEST_NUMBER < abs(number) < math.inf:
+                    allowed = f"at most {LARGEST_NUMBER:g} in magnitude"
                 raise SettingError(name, f"{name} is {shown}, {each}must be {allowed}{unit}")
 
     def _allows(self, number: float) -> bool:
@@ -122,7 +122,7 @@ class Setting:
             and (self.below is None or number < self.below)
             and (self.high is None or number <= self.high)
         )
-        return inside and (abs(number) <= LARGEST or (self.infinite and math.isinf(number)))
+        return inside and (abs(number) <= LARGEST_NUMBER or (self.infinite and math.isinf(number)))
 
 
 class SettingError(ValueError):
@@ -140,7 +140,12 @@ class SettingError(ValueError):
 
 
 def is_unit(values: Sequence[float], tolerance: float = 1e-3) -> bool:
-    """Return whether a vector or a quaternion has the length 1 within ``tolerance``."""
+    """Return whether a vector or a quaternion has the length 1 within ``tolerance``.
+
+    Args:
+        values: (n,) components.
+        tolerance: largest difference of the length from 1.
+    """
     return math.isclose(math.hypot(*values), 1.0, abs_tol=tolerance)
 
 
@@ -149,6 +154,11 @@ def are_orthonormal(
 ) -> bool:
     """Return whether two vectors have the length 1 and are perpendicular, each within
     ``tolerance``.
+
+    Args:
+        first: components of one vector.
+        other: components of the other vector.
+        tolerance: largest difference of lengths from 1 and of the scalar product from 0.
     """
     cosine = sum(a * b for a, b in zip(first, other, strict=True))
     return is_unit(first, tolerance) and is_unit(other, tolerance) and abs(cosine) <= tolerance

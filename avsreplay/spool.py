@@ -19,7 +19,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from avsreplay.errors import UnreadableInput
 
-BLOCK_BYTES = 1 << 20  # records of a spool that are kept in memory and written at once [bytes]
+# records of a spool that are kept in memory and written at once [bytes]
+SPOOL_BLOCK_BYTES = 1 << 20
+LARGEST_STORED = 1e15  # magnitude of the numbers of a result
 
 
 class SpoolFile:
@@ -53,6 +55,9 @@ class SpoolFile:
         Args:
             offset: of the first byte.
             out: the array, contiguous.
+
+        Raises:
+            UnreadableInput: the temporary file was truncated.
         """
         assert self._stream is not None
         self._stream.seek(offset)
@@ -112,7 +117,7 @@ class Spool:
         self.dtype, self.shape = np.dtype(dtype), shape
         self._file = file or SpoolFile()
         size = self.dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-        self._each = max(BLOCK_BYTES // size, 1)  # records of a block
+        self._each = max(SPOOL_BLOCK_BYTES // size, 1)  # records of a block
         self._size = size
         self._block: NDArray[Any] = np.empty((self._each, *shape), self.dtype)
         self._fill = 0

@@ -25,15 +25,15 @@ from avsreplay.settings import Entry, SettingError, Tables, declared_of, dump, e
 
 T = TypeVar("T")
 _Path = tuple[str | int, ...]
-MAX_BYTES = 1 << 20
-_SIMILAR = 0.7  # similarity from which a known key is suggested in place of an unknown one
-_LONGEST = 200  # characters of an unknown key that are compared with the known ones
+MAX_TOML_BYTES = 1 << 20
+_LEAST_SIMILARITY = 0.7  # similarity from which a known key is suggested in place of an unknown one
+_MAX_COMPARED_CHARACTERS = 200  # characters of an unknown key that are compared with the known ones
 _BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
 # Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
-_LARGEST_INTEGER = 1 << 1023  # that is taken for a float
-_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
-_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
+_MAX_FLOAT_INTEGER = 1 << 1023  # that is taken for a float
+_KEY_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{2,}}+")
+_TABLE_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
 
@@ -74,8 +74,8 @@ def load(path: str | Path) -> Document:
     path = Path(path)
     try:
         with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)  # a pipe or a device has no size
-        if len(data) > MAX_BYTES:
+            data = stream.read(MAX_TOML_BYTES + 1)  # a pipe or a device has no size
+        if len(data) > MAX_TOML_BYTES:
             raise UnreadableInput(
                 "larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file"
             )
@@ -287,7 +287,7 @@ class _Builder:
             return self._tuple(args, value, path)
         if isinstance(hint, type) and issubclass(hint, enum.Enum):
             return self._member(hint, value, path)
-        if hint is float and type(value) is int and abs(value) <= _LARGEST_INTEGER:
+        if hint is float and type(value) is int and abs(value) <= _MAX_FLOAT_INTEGER:
             return float(value)
         if hint is Path and isinstance(value, str):
             return Path(value)
@@ -329,7 +329,10 @@ class _Builder:
         ):  # an unknown table: its content determines the suggestion
             name, value = next(iter(value.items()))
             inside = (*inside, name)
-        whole, leaf = _dotted((*path, *inside))[:_LONGEST], str(inside[-1])[:_LONGEST]
+        whole, leaf = (
+            _dotted((*path, *inside))[:_MAX_COMPARED_CHARACTERS],
+            str(inside[-1])[:_MAX_COMPARED_CHARACTERS],
+        )
 
         def likeness(entry: str) -> tuple[float, float]:
             in_full = difflib.SequenceMatcher(None, whole, entry).ratio()
@@ -341,7 +344,7 @@ class _Builder:
         here = [_dotted((*path, name)) for name in known]
         every = [*here, *(entry.key for entry in entries(self.cls, self.prefix))]
         best = max(every, key=likeness, default="")
-        if likeness(best)[0] >= _SIMILAR:
+        if likeness(best)[0] >= _LEAST_SIMILARITY:
             return f"did you mean '{best}'?"
         return f"known keys: {', '.join(known) or 'none'}"
 
@@ -371,7 +374,7 @@ def _line_of(text: str, path: Sequence[str | int]) -> int | None:
     table: tuple[str | int, ...] = ()
     counts: dict[tuple[str | int, ...], int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        header, key = _HEADER.match(line), _KEY.match(line)
+        header, key = _TABLE_HEADER.match(line), _KEY.match(line)
         if header:
             table = tuple(p.strip().strip("\"'") for p in header[2].split("."))
             if header[1] == "[[":

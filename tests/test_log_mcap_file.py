@@ -43,7 +43,7 @@ def chunks(path: Path) -> list[tuple[int, int]]:
     data, at, found = path.read_bytes(), 8, []
     while at < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, at)
-        if opcode == mcap.CHUNK:
+        if opcode == mcap.Opcode.CHUNK:
             found.append((at, at + 9 + length))
         at += 9 + length
     return found
@@ -51,9 +51,9 @@ def chunks(path: Path) -> list[tuple[int, int]]:
 
 def data_end_of(data: bytes, at: int) -> int:
     """The end of the DataEnd record, from the end of the last chunk on."""
-    while data[at] == mcap.MESSAGE_INDEX:
+    while data[at] == mcap.Opcode.MESSAGE_INDEX:
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-    assert data[at] == mcap.DATA_END
+    assert data[at] == mcap.Opcode.DATA_END
     return at + 13
 
 
@@ -185,9 +185,9 @@ def test_a_lost_first_chunk_of_a_truncated_recording_loses_only_that_chunk(
 
 def test_without_a_summary_nothing_is_lost(whole: dict[str, Path], tmp_path: Path) -> None:
     data = whole["zstd"].read_bytes()
-    footer = struct.pack("<BQQQI", mcap.FOOTER, 20, 0, 0, 0)
+    footer = struct.pack("<BQQQI", mcap.Opcode.FOOTER, 20, 0, 0, 0)
     (tmp_path / "x.mcap").write_bytes(
-        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MAGIC
+        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MCAP_MAGIC
     )
     found, losses = read(tmp_path / "x.mcap")
     assert len(found) == len(CLOUDS)
@@ -240,7 +240,7 @@ def test_a_decompression_bomb_is_rejected(tmp_path: Path, compression: str) -> N
             + compression.encode()
         )
         chunk = head + struct.pack("<Q", len(bomb)) + bomb
-        record = struct.pack("<BQ", mcap.CHUNK, len(chunk)) + chunk
+        record = struct.pack("<BQ", mcap.Opcode.CHUNK, len(chunk)) + chunk
         intact = tmp_path / "good.mcap"
         write(intact, LogHeader(), CLOUDS[:4], overwrite=True)
         data = intact.read_bytes()
@@ -252,18 +252,39 @@ def test_a_decompression_bomb_is_rejected(tmp_path: Path, compression: str) -> N
         assert losses[0].chunks == 1
 
 
-def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -> None:
-    """A chunk of 32 MiB of zeros is 3.7 million records; compressed it takes 1 kB of the file."""
-    import tracemalloc
-
+def chunk_of(content: bytes) -> bytes:
+    """A chunk record, compressed with zstd."""
     import zstandard
 
-    size = 32 << 20
-    packed = zstandard.compress(bytes(size))
-    chunk = (
-        struct.pack("<QQQII", 0, 1, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
-    )
-    record = struct.pack("<BQ", mcap.CHUNK, len(chunk)) + chunk
+    packed = zstandard.compress(content)
+    head = struct.pack("<QQQII", 0, 1, len(content), 0, 4) + b"zstd"
+    chunk = head + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", mcap.Opcode.CHUNK, len(chunk)) + chunk
+
+
+@pytest.mark.parametrize("count", [0, 3, 40])
+def test_the_chunks_of_a_file_declare_no_more_than_its_bytes_can_hold(
+    tmp_path: Path, count: int
+) -> None:
+    """Messages of zeros of an unknown channel, 4 MiB each and valid; a few are no attack."""
+    write(tmp_path / "good.mcap", LogHeader(), CLOUDS[:4])
+    data, first = (tmp_path / "good.mcap").read_bytes(), chunks(tmp_path / "good.mcap")[0][0]
+    zeros = chunk_of(struct.pack("<BQ", mcap.Opcode.MESSAGE, (4 << 20) - 9) + bytes((4 << 20) - 9))
+    (tmp_path / "zeros.mcap").write_bytes(data[:first] + zeros * count + data[first:])
+    found, losses = read(tmp_path / "zeros.mcap")
+    refused = [loss for loss in losses if "left for this file" in loss.what]
+    most = ((16 << 20) + 1000 * (len(data) + len(zeros) * count)) // (4 << 20)
+    assert len(found) == 4
+    assert sum(loss.chunks for loss in refused) >= max(0, count - most)
+    assert bool(refused) == (count == 40)
+
+
+def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -> None:
+    """A chunk of 12 MiB of zeros is 1.4 million records; compressed it takes 400 bytes."""
+    import tracemalloc
+
+    size = 12 << 20
+    record = chunk_of(bytes(size))
     intact = tmp_path / "good.mcap"
     write(intact, LogHeader(), CLOUDS[:4])
     data, first = intact.read_bytes(), chunks(intact)[0][0]
@@ -373,14 +394,15 @@ def test_the_work_for_hostile_bytes_grows_with_their_number(tmp_path: Path, what
     empty = struct.pack("<QQQI", 0, 0, 1, 7) + name + struct.pack("<Q", 1) + b"x"
     pieces = {
         "private records": struct.pack("<BQ", 0x90, 0),
-        "bad chunks": struct.pack("<BQ", mcap.CHUNK, len(empty)) + empty + b"\x11",
-        "chunk heads": struct.pack("<BQ", mcap.CHUNK, 1 << 40) + empty,
-        "index records": struct.pack("<BQ", mcap.MESSAGE_INDEX, 6) + struct.pack("<HI", 1, 0),
+        "bad chunks": struct.pack("<BQ", mcap.Opcode.CHUNK, len(empty)) + empty + b"\x11",
+        "chunk heads": struct.pack("<BQ", mcap.Opcode.CHUNK, 1 << 40) + empty,
+        "index records": struct.pack("<BQ", mcap.Opcode.MESSAGE_INDEX, 6)
+        + struct.pack("<HI", 1, 0),
         "noise": np.random.Generator(np.random.PCG64(1))
         .integers(0, 256, 4096, dtype=np.uint8)
         .tobytes(),
     }
-    assert_linear(tmp_path / "x.mcap", mcap.MAGIC, pieces[what])
+    assert_linear(tmp_path / "x.mcap", mcap.MCAP_MAGIC, pieces[what])
 
 
 @pytest.mark.parametrize("what", ["chunk marks", "bad chunks", "noise"])

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay import geometry
-from avsreplay.monitor.aliasing import FEWEST, Turns, in_words, two_rates
+from avsreplay.monitor.aliasing import LEAST_TURNS, Turns, in_words, two_rates
 
 
 def poses(spans, rate, axis=(0.0, 0.6, 0.8)):
@@ -24,7 +24,7 @@ def poses(spans, rate, axis=(0.0, 0.6, 0.8)):
 )
 def test_both_rates_turn_the_target_alike_at_every_pose(rate, period, lost):
     """The oracle is the rotation itself: cos and sin of both angles at each instant."""
-    spans = [*([period] * FEWEST), *(k * period for k in lost)]
+    spans = [*([period] * LEAST_TURNS), *(k * period for k in lost)]
     found = two_rates(poses(spans, rate))
     turn = abs((rate * period + np.pi) % (2.0 * np.pi) - np.pi)  # as the poses show it
     if abs(turn - 2.0) < 1e-6:
@@ -47,7 +47,7 @@ def test_intervals_that_are_no_multiples_of_one_exclude_the_other_rate():
 
 def test_a_few_poses_and_poses_at_random_show_no_rate():
     assert two_rates(poses([], 9.0)) is None
-    assert two_rates(poses([0.5] * (FEWEST - 1), 7.0)) is None
+    assert two_rates(poses([0.5] * (LEAST_TURNS - 1), 7.0)) is None
     rng = np.random.default_rng(3)
     turns = Turns()
     for k in range(32):

@@ -15,7 +15,13 @@ from avsreplay.binary_files import read_members
 from avsreplay.errors import UsageError
 from avsreplay.log.ply import read_ply
 from avsreplay.log.scan_files import read_pcd
-from avsreplay.read_budget import LEAST_BYTES, BadFile, OverBudget, ReadBudget, check_declared
+from avsreplay.read_budget import (
+    LEAST_BUDGET_BYTES,
+    BadFile,
+    OverBudget,
+    ReadBudget,
+    check_declared,
+)
 
 
 def zipped(array: np.ndarray) -> bytes:
@@ -46,7 +52,7 @@ def test_a_count_that_the_bytes_cannot_hold_is_malformed(count, each, available)
 
 
 def test_an_archive_of_zeros_is_refused_by_the_size_that_it_declares():
-    data = zipped(np.zeros((LEAST_BYTES // 8, 3), np.float32))
+    data = zipped(np.zeros((LEAST_BUDGET_BYTES // 8, 3), np.float32))
     with pytest.raises(OverBudget, match="MiB"):
         read_members(data, ReadBudget(len(data)))
 

@@ -23,7 +23,7 @@ from avsreplay.reconstruct.reconstruction import evenly, reconstruct, true_frame
 from avsreplay.reconstruct.registration import Pairing, between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import (
-    SAMPLE,
+    SURVEYED_SCANS,
     Survey,
     Twist,
     extent_of,
@@ -656,7 +656,7 @@ def test_a_survey_keeps_few_scans_of_a_long_log():
             scan = Scan(seq=k, t_ns=k, points=points.copy())
             refs.append(weakref.ref(scan.points))
             if k % 20 == 19:
-                assert sum(ref() is not None for ref in refs) <= SAMPLE + 3
+                assert sum(ref() is not None for ref in refs) <= SURVEYED_SCANS + 3
             yield scan
 
     survey = surveyed(given, 100, 50)

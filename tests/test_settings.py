@@ -124,7 +124,7 @@ def test_unreadable_files(tmp_path):
     with pytest.raises(UnreadableInput, match="not UTF-8"):
         toml_document.load(binary)
     bomb = tmp_path / "big.toml"
-    bomb.write_bytes(b"#" * (toml_document.MAX_BYTES + 1))
+    bomb.write_bytes(b"#" * (toml_document.MAX_TOML_BYTES + 1))
     with pytest.raises(UnreadableInput, match="larger than"):
         toml_document.load(bomb)
     with pytest.raises(UnreadableInput):

@@ -15,12 +15,12 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.parts import FAULTS
 from avsreplay.records import ScanStatus
-from avsreplay.report.charts import KINDS
+from avsreplay.report.charts import PLACE_STYLES
 from avsreplay.simulate import faults as kinds
 from avsreplay.simulate.faults import InjectedFault, active
 from avsreplay.simulate.recorded_faults import disturbed
 from avsreplay.simulate.scenario import StartParams, belief, load_scenario, scenario_of
-from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.simulation import SIMULATED_EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface
 
 CAMPAIGN_KINDS = {  # what docs/results.md has figures of
@@ -102,7 +102,7 @@ def test_builtin_scans_have_about_4000_points():
 def test_scans_come_at_their_instants_with_their_truth(plain):
     simulation = simulate(scenario(), SURFACE)
     assert [s.seq for s in plain] == list(range(12))
-    assert [s.t_ns - EPOCH_NS for s in plain] == [500_000_000 * k for k in range(12)]
+    assert [s.t_ns - SIMULATED_EPOCH_NS for s in plain] == [500_000_000 * k for k in range(12)]
     for scan in plain:
         assert scan.t_ns == scan.log_ns
         assert scan.points.dtype == np.float32
@@ -295,7 +295,7 @@ def test_a_motion_that_needs_too_many_steps_is_one_line():
 
 
 def test_a_motion_that_becomes_too_fast_is_one_line(monkeypatch):
-    monkeypatch.setattr("avsreplay.simulate.motion.MOST_STEPS", 200)
+    monkeypatch.setattr("avsreplay.simulate.motion.MAX_INTEGRATION_STEPS", 200)
     found = scenario()
     motion = replace(found.params.motion, torque_std_radps2=100.0, disturbance_step_s=0.1)
     with pytest.raises(UsageError, match="steps"):
@@ -395,7 +395,7 @@ def test_every_kind_is_registered_under_its_name_and_has_a_colour():
         if issubclass(each, kinds.Fault) and each is not kinds.Fault
     }
     assert own == {name: FAULTS.load(name) for name in FAULTS.names()}
-    assert set(KINDS["injected"]) == set(FAULTS.names())
+    assert set(PLACE_STYLES["injected"]) == set(FAULTS.names())
 
 
 @pytest.mark.parametrize("kind", FAULTS.names())
@@ -425,7 +425,7 @@ def test_a_kind_of_another_package_needs_no_change_here(plain, monkeypatch):
             halved = replace(shot.returns, ranges=0.5 * shot.returns.ranges)
             return replace(shot, returns=halved)
 
-    monkeypatch.setitem(FAULTS._built_in, "shrunk", Shrunk)
+    monkeypatch.setitem(FAULTS.built_in, "shrunk", Shrunk)
     found = scans(fault("shrunk"))
     assert_allclose(found[4].points, 0.5 * plain[4].points, rtol=1e-6)
     assert found[4].fault == "shrunk"

@@ -20,7 +20,7 @@ from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.simulate.rays import FieldOfView, Pattern, ray_grid
 from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.simulate.scene import SceneObject
-from avsreplay.simulate.simulation import EPOCH_NS, simulate
+from avsreplay.simulate.simulation import SIMULATED_EPOCH_NS, simulate
 from avsreplay.simulate.target import builtin_surface, ply_bytes
 
 SURFACE = builtin_surface()
@@ -80,7 +80,10 @@ def test_an_object_for_a_part_of_the_log_is_labelled_like_a_fault():
     (label,) = simulation.header.labels
     second = 1_000_000_000
     assert (label.kind, label.harmful) == ("arm", True)
-    assert (label.start_ns - EPOCH_NS, label.end_ns - EPOCH_NS) == (second, 3 * second)
+    assert (label.start_ns - SIMULATED_EPOCH_NS, label.end_ns - SIMULATED_EPOCH_NS) == (
+        second,
+        3 * second,
+    )
     assert [simulation.truth_of(scan).fault for scan in scans] == [None, "arm", "arm", None]
     for k, (target, scene) in enumerate(zip(alone, both, strict=True)):
         assert np.array_equal(target, scene) == (k in (0, 3))
@@ -114,7 +117,7 @@ def test_objects_leave_the_truth_and_the_noise_of_the_target_alone():
     first, _, alone = scans_of()
     second, _, both = scans_of(far)
     assert all(np.array_equal(a, b) for a, b in zip(alone, both, strict=True))
-    assert np.array_equal(first.truth(EPOCH_NS).r_a, second.truth(EPOCH_NS).r_a)
+    assert np.array_equal(first.truth(SIMULATED_EPOCH_NS).r_a, second.truth(SIMULATED_EPOCH_NS).r_a)
 
 
 def test_a_mesh_is_read_from_the_scenario_s_folder_and_recorded(tmp_path):
@@ -431,7 +434,7 @@ def test_the_reported_pose_of_the_camera_has_the_stated_error():
         SURFACE,
     )
     empty = np.zeros((0, 3), np.float32)
-    scans = [Scan(k, 0, empty, log_ns=EPOCH_NS + k * 1_000_000_000) for k in range(400)]
+    scans = [Scan(k, 0, empty, log_ns=SIMULATED_EPOCH_NS + k * 1_000_000_000) for k in range(400)]
     pairs = [
         (simulation.camera_poses(scan)[0][1], exact.camera_poses(scan)[0][1]) for scan in scans
     ]

@@ -31,7 +31,7 @@ VALUES = {
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Blocks of about three rows, so that a few rows fill several of them."""
-    monkeypatch.setattr(spool, "BLOCK_BYTES", 4000)
+    monkeypatch.setattr(spool, "SPOOL_BLOCK_BYTES", 4000)
 
 
 def random_row(rng: random.Random) -> Row:
@@ -127,8 +127,8 @@ def test_the_memory_of_a_table_is_that_of_a_block():
             peaks.append(tracemalloc.get_traced_memory()[1])
     finally:
         tracemalloc.stop()
-    assert peaks[0] < 4 * spool.BLOCK_BYTES
-    assert peaks[1] - peaks[0] < spool.BLOCK_BYTES / 4
+    assert peaks[0] < 4 * spool.SPOOL_BLOCK_BYTES
+    assert peaks[1] - peaks[0] < spool.SPOOL_BLOCK_BYTES / 4
 
 
 def test_poses_and_clouds_come_back(small_blocks):

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from avsreplay.report.table import Table
 
 DECODED_BYTES = 256 << 20  # of a larger log, info decodes a few scans only
-LISTED = 5  # damaged scans that are listed
-WIDTH = 120  # fixed if the output is not a terminal, so that the text is always the same
+LISTED_DAMAGED_SCANS = 5  # damaged scans that are listed
+# fixed if the output is not a terminal, so that the text is always the same
+INFO_WIDTH_CHARACTERS = 120
 
 
 EPILOG = """\b
@@ -221,7 +222,7 @@ def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str], words: 
     from avsreplay.log.bytes_io import shown
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
-    console = make_console(plain_width=WIDTH)
+    console = make_console(plain_width=INFO_WIDTH_CHARACTERS)
     print_table(console, facts_table("Log", [(name, shown(value)) for name, value in _facts(info)]))
     print_table(console, _topics(info))
     print_table(console, _faults(info))
@@ -230,7 +231,7 @@ def _print(info: LogInfo, advice: list[Advice], damaged: dict[int, str], words: 
         click.echo(f"options to add: {' '.join(words)}")
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
-    for seq, why in list(damaged.items())[:LISTED]:
+    for seq, why in list(damaged.items())[:LISTED_DAMAGED_SCANS]:
         print_line(console, f"lost: scan {seq}: {why}")
 
 
@@ -455,7 +456,7 @@ def _print_findings(
         )
         for f in findings
     )
-    console = make_console(plain_width=WIDTH)
+    console = make_console(plain_width=INFO_WIDTH_CHARACTERS)
     print_table(
         console, Table(shown(source), ("severity", "about", "finding", "at"), rows, align="l")
     )

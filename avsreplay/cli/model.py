@@ -249,8 +249,9 @@ def _table(regions: list[dict[str, Any]]) -> list[str]:
 
 
 TUM = (".tum", ".txt")  # names of trajectories
-LEAST_POINTS = 50  # a scan with fewer is left out
-LEAST_M, MOST_M = 1e-6, 1e6  # size of a target
+LEAST_SCAN_POINTS = 50  # a scan with fewer is left out
+LEAST_TARGET_M = 1e-6  # smallest size of a target
+MOST_TARGET_M = 1e6  # largest size of a target
 
 ODOMETRY_EPILOG = """\b
 Examples:
@@ -266,7 +267,7 @@ Examples:
 )
 @click.option(
     "--size",
-    type=click.FloatRange(LEAST_M, MOST_M),
+    type=click.FloatRange(LEAST_TARGET_M, MOST_TARGET_M),
     help="Size of the target [m]; default: of the first scan.",
 )
 @click.option("--no-deskew", is_flag=True, help="Ignore the times of the points.")
@@ -302,19 +303,23 @@ def odometry_command(
     odometry, poses = None, []
     with open_source(log, read_options(reading)) as source:
         for scan in tracked(source.scans(), len(source), "odometry"):
-            if len(scan.points) < LEAST_POINTS:
+            if len(scan.points) < LEAST_SCAN_POINTS:
                 continue
             if odometry is None:
                 extent = bounding_diagonal(scan.points) if size is None else size
-                if not LEAST_M <= extent <= MOST_M:  # also nan
+                if not LEAST_TARGET_M <= extent <= MOST_TARGET_M:  # also nan
                     what = f"the size of the target would be {extent:g} m"
-                    raise UsageError(what, where="--size", hint=f"give {LEAST_M:g} to {MOST_M:g} m")
+                    raise UsageError(
+                        what, where="--size", hint=f"give {LEAST_TARGET_M:g} to {MOST_TARGET_M:g} m"
+                    )
                 odometry = KissOdometry(extent, not no_deskew)
             pose, after_s = odometry.add(scan.points, scan.times_s)
             poses.append((scan.t_ns + round(1e9 * after_s), pose))
     if not poses:
         raise UsageError(
-            f"no scan has {LEAST_POINTS} points", where=str(log), hint="check the crop and --topic"
+            f"no scan has {LEAST_SCAN_POINTS} points",
+            where=str(log),
+            hint="check the crop and --topic",
         )
     click.echo(f"{output}: {write_tum(output, poses)} poses", err=output == STDOUT)
     report_losses(source)

@@ -300,7 +300,7 @@ def check_binary_output(output: Path) -> None:
 
 
 T = TypeVar("T")
-PERIOD_S = 30.0
+PROGRESS_PERIOD_S = 30.0
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
@@ -333,7 +333,7 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
     for count, item in enumerate(items, 1):
         yield item
         now = time.monotonic()
-        if now - said >= PERIOD_S:
+        if now - said >= PROGRESS_PERIOD_S:
             said = now
             of = f" of {total}" if total else ""
             left = f", about {(now - begun) * (total - count) / count:.0f} s left" if total else ""
@@ -344,15 +344,15 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
             )
 
 
-_GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
+_INTERRUPT_GRACE_S = 1.0  # for the scan at which Ctrl-C was pressed
 
 
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; the scan in progress is finished.
 
-    A scan that takes longer than ``_GRACE_S`` after this, or until a second Ctrl-C, is given up:
-    its row is missing. What collects scans is never left with a part of one.
+    A scan that takes longer than ``_INTERRUPT_GRACE_S`` after this, or until a second Ctrl-C, is
+    given up: its row is missing. What collects scans is never left with a part of one.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
@@ -381,7 +381,7 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
         return
     from avsreplay.register import interrupt
 
-    late = threading.Timer(_GRACE_S, _thread.interrupt_main)  # as a second Ctrl-C
+    late = threading.Timer(_INTERRUPT_GRACE_S, _thread.interrupt_main)  # as a second Ctrl-C
     late.daemon = True
     before = signal.signal(signal.SIGINT, ask)
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from avsreplay.rows import Row
     from avsreplay.run import Job
 
-SCANS = 10  # scans that are replayed
+TRIAL_SCANS = 10  # scans that are replayed
 
 
 @value_class(eq=True)
@@ -50,9 +50,12 @@ class Trial:
 
     @property
     def _elsewhere(self) -> bool:
-        from avsreplay.report.verdict import ERROR_FAIL
+        from avsreplay.report.verdict import POSITION_ERROR_FAIL_OF_EXTENT
 
-        return self.pos_err_m is not None and self.pos_err_m > ERROR_FAIL * self.extent_m
+        return (
+            self.pos_err_m is not None
+            and self.pos_err_m > POSITION_ERROR_FAIL_OF_EXTENT * self.extent_m
+        )
 
     @property
     def result(self) -> str:
@@ -137,7 +140,7 @@ def tried(job: Job) -> Trial:
     """
     from avsreplay.run import Run
 
-    n = min(job.options.n_scans or SCANS, SCANS)
+    n = min(job.options.n_scans or TRIAL_SCANS, TRIAL_SCANS)
     try:
         with Run(
             dataclasses.replace(job, options=dataclasses.replace(job.options, n_scans=n))

@@ -10,14 +10,13 @@ from typing import Any
 
 from avsreplay.errors import UnreadableInput, printable
 
-_SMALL, _BLOCK = 256, 1 << 16  # small reads (record heads) are served from one cached block
-ROS1_MAGIC, SQLITE_MAGIC = (
-    b"#ROSBAG V2.0\n",
-    b"SQLite format 3\x00",
-)  # first bytes of the files of ROS bags
-_PER_THREAD = (
-    threading.local()
-)  # a decompressor is expensive to create and may serve one thread at a time
+_SMALL_READ_BYTES = 256  # reads up to this size (record heads) are served from one cached block
+_CACHED_BLOCK_BYTES = 1 << 16
+# first bytes of the files of ROS bags
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+SQLITE_MAGIC = b"SQLite format 3\x00"
+# a decompressor is expensive to create and may serve one thread at a time
+_PER_THREAD = threading.local()
 
 
 class BadMessage(ValueError):
@@ -64,13 +63,13 @@ class ByteFile:
 
     def read(self, offset: int, size: int) -> bytes:
         """Return exactly ``size`` bytes. Raises BadMessage if the file ends before."""
-        if size > _SMALL:
+        if size > _SMALL_READ_BYTES:
             return self._read(offset, size)
         begin, block = self._block
         if not begin <= offset <= offset + size <= begin + len(block):
             begin, block = self._block = (
                 offset,
-                self._read(offset, max(min(_BLOCK, self.size - offset), size)),
+                self._read(offset, max(min(_CACHED_BLOCK_BYTES, self.size - offset), size)),
             )
         return block[offset - begin : offset - begin + size]
 

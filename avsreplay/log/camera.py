@@ -30,11 +30,12 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MILLIMETRE = 1e-3
 _MAX_COEFFICIENTS = 14
 _POLYNOMIALS = {"plumb_bob": 5, "radtan": 5, "rational_polynomial": 12, "equidistant": 4}
-_NEWTON_STEPS, _DIFFERENCE = 12, 1e-6  # iterations of the inverse, step of its Jacobian
-_CONVERGED = 1e-9  # error of the inverse in units of the focal length
-_PIXEL_ERROR = 0.01  # a pixel whose ray is not found to within this [pixel] has no ray
-_MAX_FILE = 1 << 20
-_FILES = re.compile(
+_NEWTON_STEPS = 12  # iterations of the inverse
+_JACOBIAN_STEP = 1e-6  # difference of the numeric Jacobian, in units of the focal length
+_CONVERGED_ERROR = 1e-9  # error of the inverse in units of the focal length
+_MAX_PIXEL_ERROR = 0.01  # a pixel whose ray is not found to within this [pixel] has no ray
+_MAX_CAMERA_FILE_BYTES = 1 << 20
+_CAMERA_FILE_NAME = re.compile(
     r"(?:scene_)?(?:camera|intrinsics?)(?:_info|_intrinsics?)?\.(?:txt|json|ya?ml)$"
 )
 _TAUGHT = (
@@ -147,7 +148,7 @@ def _undistorted(camera: Camera, seen: Array) -> Array:
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
             error = distorted(camera, xy) - seen
-            if float(np.abs(error).max()) < _CONVERGED:
+            if float(np.abs(error).max()) < _CONVERGED_ERROR:
                 break
             a, b, c, d = _jacobian(camera, xy)
             turned = np.stack(
@@ -156,15 +157,15 @@ def _undistorted(camera: Camera, seen: Array) -> Array:
             xy -= (turned / (a * d - b * c)).T
         off = np.abs(distorted(camera, xy) - seen).max(axis=1) * max(camera.focal)
         a, b, c, d = _jacobian(camera, xy)
-        xy[~(off <= _PIXEL_ERROR) | ~(a * d - b * c > 0.0)] = np.nan
+        xy[~(off <= _MAX_PIXEL_ERROR) | ~(a * d - b * c > 0.0)] = np.nan
     return xy
 
 
 def _jacobian(camera: Camera, xy: Array) -> tuple[Array, Array, Array, Array]:
     """Return the elements of d(image) / d(direction) by row, (n,) each."""
     (a, c), (b, d) = (
-        ((distorted(camera, xy + step) - distorted(camera, xy - step)) / (2.0 * _DIFFERENCE)).T
-        for step in _DIFFERENCE * np.eye(2)
+        ((distorted(camera, xy + step) - distorted(camera, xy - step)) / (2.0 * _JACOBIAN_STEP)).T
+        for step in _JACOBIAN_STEP * np.eye(2)
     )
     return a, b, c, d
 
@@ -242,7 +243,9 @@ def find_camera(folder: Path, stated: str | None) -> Camera:
     if stated is not None:
         return stated_camera(stated)
     for place in (folder, folder.resolve().parent):
-        found = sorted(p for p in place.iterdir() if _FILES.match(p.name.lower()) and p.is_file())
+        found = sorted(
+            p for p in place.iterdir() if _CAMERA_FILE_NAME.match(p.name.lower()) and p.is_file()
+        )
         if len(found) > 1:
             names = ", ".join(shown(p.name) for p in found)
             raise UnreadableInput(
@@ -262,7 +265,9 @@ def read_camera(path: Path) -> Camera:
     Raises UnreadableInput with the reason.
     """
     try:
-        raw = read_limited(path, _MAX_FILE, _TAUGHT).decode("utf-8-sig", "backslashreplace")
+        raw = read_limited(path, _MAX_CAMERA_FILE_BYTES, _TAUGHT).decode(
+            "utf-8-sig", "backslashreplace"
+        )
         suffix = path.suffix.lower()
         if suffix == ".json":
             return _of_table(json.loads(raw)).check()

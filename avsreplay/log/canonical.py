@@ -42,12 +42,14 @@ from avsreplay.log.returns import (
     valid,
 )
 
-SAMPLE = 9  # clouds, spread over the log, from which meanings are inferred
-_KNOTS = 17  # instants of a scan at which the pose of a moving sensor is looked up
+INFERENCE_CLOUDS = 9  # clouds, spread over the log, from which meanings are inferred
+_SENSOR_POSE_INSTANTS = 17  # instants of a scan at which the pose of a moving sensor is looked up
 _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity")
 _ORDINARY = 1e-5, 1e7  # magnitudes that coordinates have in any unit
-_GARBAGE, _SOUND = 0.6, 0.9  # share of ordinary coordinates in the wrong and in the right order
-_MOST_UNTIMED = 0.5  # share of points without a valid instant from which on a cloud is not used
+_WRONG_ORDER_SHARE = 0.6  # largest share of ordinary coordinates in the wrong byte order
+_RIGHT_ORDER_SHARE = 0.9  # least share of ordinary coordinates in the right byte order
+# share of points without a valid instant from which on a cloud is not used
+_MAX_UNTIMED_SHARE = 0.5
 
 
 def spread(count: int, most: int) -> list[int]:
@@ -232,7 +234,7 @@ def _timed(
     if not timed.all():
         returns = timed if kept is None else timed & kept
         expected = len(times) if kept is None else int(np.count_nonzero(kept))
-        if np.count_nonzero(returns) < _MOST_UNTIMED * expected:
+        if np.count_nonzero(returns) < _MAX_UNTIMED_SHARE * expected:
             raise BadMessage(
                 f"the times of its points ('{shown(time.text)}') are not near its stamp"
             )
@@ -287,7 +289,7 @@ def _byte_order(
     if options.byte_order is not None:
         swapped = options.byte_order is ByteOrder.REVERSED
         return swapped, [Inference("byte order", options.byte_order.value, "given")]
-    if declared < _GARBAGE and other > _SOUND:
+    if declared < _WRONG_ORDER_SHARE and other > _RIGHT_ORDER_SHARE:
         found = "the bytes of the values are in the other order than declared, and are reversed"
         return True, [Inference("byte order", found, text, "--byte-order reversed", grade="check")]
     return False, []
@@ -430,7 +432,9 @@ def at_stamp(cloud: Cloud, sensor_at: Callable[[int], Pose]) -> Cloud:
     if cloud.times_s is None or not cloud.times_s.any():
         return cloud
     times = cloud.times_s.astype(np.float64)
-    knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
+    knots = np.linspace(
+        min(float(times.min()), 0.0), max(float(times.max()), 0.0), _SENSOR_POSE_INSTANTS
+    )
     T_sa = sensor_at(0).inverse()
     steps = [T_sa @ sensor_at(round(1e9 * after)) for after in knots.tolist()]
     R, t = np.stack([step.R for step in steps]), np.stack([step.t for step in steps])

@@ -25,11 +25,11 @@ import numpy as np
 from avsreplay.errors import value_class
 from avsreplay.log.options import ClockChoice, ClockSummary
 
-_FLOOR_NS = 500_000_000
-_PERIODS = 5
-_FIRST = 9
-_CONFIRM = 3
-_FOLLOW = 0.1
+_LEAST_JUMP_NS = 500_000_000  # a smaller deviation from the log clock is never a jump [ns]
+_JUMP_PERIODS = 5  # least jump, in periods of the scans
+_OFFSET_SCANS = 9  # first scans whose median deviation is the offset of the clocks at the begin
+_STEP_SCANS = 3  # scans in a row with the same jump that make it a permanent step of the clock
+_FOLLOWED_SHARE = 0.1  # share of a deviation by which the offset follows it from scan to scan
 
 
 @value_class(eq=True)
@@ -60,7 +60,9 @@ def place(
         return placed, replace(
             summary, unset=0, note="header stamps are never set: the log clock is used"
         )
-    tracker = _Tracker(max(_FLOOR_NS, _PERIODS * period), period, _first_offset(offsets, header_ns))
+    tracker = _Tracker(
+        max(_LEAST_JUMP_NS, _JUMP_PERIODS * period), period, _first_offset(offsets, header_ns)
+    )
     placed = [tracker.take(r, h) for r, h in zip(log_ns, header_ns, strict=True)]
     return placed, tracker.summary(summary)
 
@@ -71,7 +73,7 @@ def _median(values: Sequence[int]) -> int:
 
 def _first_offset(offsets: Sequence[int], header_ns: Sequence[int]) -> int:
     set_ones = [o for o, h in zip(offsets, header_ns, strict=True) if h != 0]
-    return _median((set_ones or list(offsets))[:_FIRST])
+    return _median((set_ones or list(offsets))[:_OFFSET_SCANS])
 
 
 def _monotone(instants: Sequence[int], summary: ClockSummary) -> tuple[list[Placed], ClockSummary]:
@@ -127,7 +129,7 @@ class _Tracker:
         if trouble is not None:
             return self._by_log(log_ns, deviation, trouble)
         self._jumped.clear()
-        self._offset += round(_FOLLOW * deviation)
+        self._offset += round(_FOLLOWED_SHARE * deviation)
         self._last, self._last_t = (log_ns, header_ns), header_ns - self._correction
         return Placed(self._last_t)
 
@@ -172,10 +174,10 @@ class _Tracker:
     def _permanent(self, deviation: int, header_ns: int) -> bool:
         if self._jumped:
             first, last = self._jumped[0][0], self._jumped[-1][1]
-            if header_ns <= last or abs(deviation - first) > self._tolerance // _PERIODS:
+            if header_ns <= last or abs(deviation - first) > self._tolerance // _JUMP_PERIODS:
                 self._jumped.clear()
         self._jumped.append((deviation, header_ns))
-        if len(self._jumped) < _CONFIRM:
+        if len(self._jumped) < _STEP_SCANS:
             return False
         self._jumped.clear()
         return True

@@ -23,8 +23,10 @@ from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
 from avsreplay.log.point_cloud2 import Field, Layout, check_layout, of_layout, read_layout
 from avsreplay.log.raw_cloud import RawCloud
+from avsreplay.records import NS_PER_S
 
-FOXGLOVE, FOXGLOVE_ROS = "foxglove.PointCloud", "foxglove_msgs/msg/PointCloud"
+FOXGLOVE = "foxglove.PointCloud"
+FOXGLOVE_ROS = "foxglove_msgs/msg/PointCloud"
 LayoutReader = Callable[[bytes | memoryview, str], Layout]
 _MAX_CHANNELS = 256
 _LIVOX = (
@@ -36,7 +38,8 @@ _LIVOX = (
     ("tag", 17, "u1"),
     ("line", 18, "u1"),
 )
-_LIVOX_POINT, _LIVOX_APART = 19, 20  # bytes of a point, and from one to the next in CDR
+_LIVOX_POINT_BYTES = 19
+_LIVOX_STRIDE_BYTES = 20  # from one point to the next in CDR
 _FOXGLOVE_KINDS = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
 
 
@@ -81,8 +84,8 @@ def read_livox(payload: bytes | memoryview, encoding: str) -> Layout:
     for _ in range(4):  # number of the sensor, reserved octets
         cursor.u8()
     count = cursor.u32()
-    step = _LIVOX_POINT if cursor.ros1 else _LIVOX_APART
-    size = (count - 1) * step + _LIVOX_POINT if count else 0
+    step = _LIVOX_POINT_BYTES if cursor.ros1 else _LIVOX_STRIDE_BYTES
+    size = (count - 1) * step + _LIVOX_POINT_BYTES if count else 0
     if size > len(cursor.data) - cursor.pos:
         raise BadMessage(f"{count} points of {step} bytes in {len(cursor.data) - cursor.pos} bytes")
     data = cursor.data[cursor.pos : cursor.pos + size]
@@ -216,7 +219,7 @@ def _table(payload: bytes | memoryview) -> dict[str, Any]:
 def _json_stamp(table: dict[str, Any]) -> int:
     stamp = table.get("timestamp")
     try:
-        return int(stamp["sec"]) * 1_000_000_000 + int(stamp["nsec"])  # type: ignore[index]
+        return int(stamp["sec"]) * NS_PER_S + int(stamp["nsec"])  # type: ignore[index]
     except (TypeError, KeyError, ValueError, OverflowError):
         raise BadMessage("a JSON cloud without a timestamp of sec and nsec") from None
 
@@ -290,7 +293,7 @@ def _octets(value: int | memoryview) -> memoryview:
 
 def _protobuf_stamp(value: int | memoryview | bytes) -> int:
     parts = dict(_protobuf(value)) if not isinstance(value, int) else {}
-    return _integer(parts.get(1, 0)) * 1_000_000_000 + _integer(parts.get(2, 0))
+    return _integer(parts.get(1, 0)) * NS_PER_S + _integer(parts.get(2, 0))
 
 
 def _doubles(value: int | memoryview, count: int) -> list[float]:

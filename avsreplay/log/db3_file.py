@@ -17,10 +17,10 @@ from avsreplay.log.options import Loss
 
 # ValueError: an error message of sqlite may contain bytes that are not UTF-8.
 _SQLITE = (sqlite3.Error, OverflowError, ValueError)
-_HEAD = 64  # the first bytes of a cloud message contain its header stamp
-_STEPS = 4096  # rows tried one by one behind a damaged page before the stride doubles
-_COLUMNS = "SELECT * FROM pragma_table_xinfo(?)"  # the last value of a column: whether hidden
-_MAX_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few steps are needed
+_HEADER_BYTES = 64  # the first bytes of a cloud message contain its header stamp
+_SINGLE_STEPS = 4096  # rows tried one by one behind a damaged page before the stride doubles
+_COLUMNS_QUERY = "SELECT * FROM pragma_table_xinfo(?)"  # the last value of a column: whether hidden
+_MAX_ROW_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few steps are needed
 
 
 class Db3File(Recording):
@@ -89,7 +89,7 @@ class Db3File(Recording):
         try:
             row = self._db.execute("SELECT max(id) FROM messages").fetchone()
         except (sqlite3.DatabaseError, UnicodeDecodeError):
-            return _MAX_ID
+            return _MAX_ROW_ID
         return int(row[0]) if row and row[0] is not None else 0
 
     def _rows(self, last: int) -> Iterator[tuple[object, ...] | None]:
@@ -102,14 +102,16 @@ class Db3File(Recording):
         while at < last:
             done = at
             try:
-                for row in self._db.execute(query, (_HEAD, at, last)):
+                for row in self._db.execute(query, (_HEADER_BYTES, at, last)):
                     yield row
                     done = max(done, row[0] if isinstance(row[0], int) else 0)
                 return
             except (sqlite3.DatabaseError, UnicodeDecodeError):
                 yield None
                 failures = 1 if done > at else failures + 1
-                at = done + (1 if failures <= _STEPS else 1 << min(failures - _STEPS, 62))
+                at = done + (
+                    1 if failures <= _SINGLE_STEPS else 1 << min(failures - _SINGLE_STEPS, 62)
+                )
 
     def _take(self, row: tuple[object, ...]) -> bool:
         row_id, topic_id, log_ns, head = row
@@ -140,7 +142,7 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
         # A virtual table has no pages of its own; a hidden column is computed when it is read.
         found = {
-            str(name): not any(column[6] for column in db.execute(_COLUMNS, (name,)))
+            str(name): not any(column[6] for column in db.execute(_COLUMNS_QUERY, (name,)))
             for (name,) in db.execute(
                 "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
             ).fetchall()

@@ -23,13 +23,15 @@ from avsreplay.log.camera import Camera, rays
 from avsreplay.log.cdr import Cursor
 from avsreplay.log.raw_cloud import RawCloud
 
-IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_PNG, _PNG_HEAD = b"\x89PNG\r\n\x1a\n", struct.Struct(">8sI4sIIBB")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_HEAD = struct.Struct(">8sI4sIIBB")
 _CONFIG = struct.Struct("<iff")  # what compressed_depth_image_transport writes before the PNG
 _NO_RETURN = (0, 65535)
-_MOST_PIXELS = 64 << 20
+_MAX_PIXELS = 64 << 20
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
 
@@ -140,7 +142,7 @@ def read_png(data: bytes, limit: int) -> NDArray[np.uint16]:
     _, _, name, width, height, bits, colour = _PNG_HEAD.unpack_from(data)
     if name != b"IHDR" or (bits, colour) != (16, 0):
         raise BadMessage(f"a PNG of {bits} bits and colour type {colour}: depth is 16-bit grey")
-    if not 0 < width * height <= min(limit // 2, _MOST_PIXELS):
+    if not 0 < width * height <= min(limit // 2, _MAX_PIXELS):
         raise BadMessage(f"a PNG of {width} x {height} pixels is over the limit of {limit} bytes")
     from PIL import Image, UnidentifiedImageError
 

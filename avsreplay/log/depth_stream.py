@@ -15,7 +15,7 @@ from avsreplay.log.index import MessageClouds, Recording
 from avsreplay.log.options import TopicInfo
 from avsreplay.log.raw_cloud import RawCloud
 
-_EXAMINED = 3  # messages of a topic of images that are examined: one may be damaged
+_EXAMINED_IMAGES = 3  # messages of a topic of images that are examined: one may be damaged
 _RECTIFIED = re.compile(r"(?<!un)rect", re.IGNORECASE)
 
 
@@ -25,7 +25,7 @@ def depth_topics(recording: Recording) -> list[TopicInfo]:
 
 
 def _has_depth(recording: Recording, topic: TopicInfo) -> bool:
-    for place in range(min(topic.count, _EXAMINED)):
+    for place in range(min(topic.count, _EXAMINED_IMAGES)):
         try:
             payload = recording.read(topic.name, place)
         except BadMessage:

@@ -22,15 +22,17 @@ from avsreplay.log.cloud_messages import raw_message
 from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, parse_surface
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_format import Channel, is_mcap
+from avsreplay.log.mcap_format import WRITTEN_CHUNK_BYTES, Channel, is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.source import Source
 from avsreplay.log.writer import LIBRARY
 from avsreplay.records import Scan, ScanStatus
 
-_GAP_PERIODS, _GAP_FLOOR_S = 3.0, 0.5
-_NAMED, _APART_S, _CHUNK_BYTES = 5, 1.0, 1 << 20
+_GAP_PERIODS = 3.0  # least gap between two scans, in periods
+_LEAST_GAP_S = 0.5
+_EXAMPLES = 5  # scans, or layouts of points, that a finding names
+_CLOCK_OFFSET_S = 1.0  # offset of header stamps and log clock that is reported
 
 
 class Severity(Enum):
@@ -194,7 +196,7 @@ def _count(tally: _Tally, scan: Scan, last: bytes) -> bytes:
 def _clocks(clock: ClockSummary) -> Iterator[Finding]:
     if clock.note:
         yield Finding(Severity.WARNING, "clock", clock.note)
-    elif abs(clock.offset_s) > _APART_S:
+    elif abs(clock.offset_s) > _CLOCK_OFFSET_S:
         text = (
             f"header and log clock are {clock.offset_s:+.3f} s apart; scan times are taken from the"
             f" {clock.clock} clock"
@@ -220,27 +222,27 @@ def _gaps(times: list[int]) -> Iterator[Finding]:
     steps: Array = np.diff(np.array(times, dtype=np.int64)).astype(np.float64) * 1e-9
     if not len(steps):
         return
-    limit = max(_GAP_PERIODS * float(np.median(steps)), _GAP_FLOOR_S)
+    limit = max(_GAP_PERIODS * float(np.median(steps)), _LEAST_GAP_S)
     wide = [int(i) for i in np.flatnonzero(steps > limit)]
     if wide:
         longest = max(float(steps[i]) for i in wide)
         text = f"{len(wide)} wider than {limit:.3f} s, the widest {longest:.3f} s"
-        yield Finding(Severity.WARNING, "gaps", text, tuple(wide[:_NAMED]))
+        yield Finding(Severity.WARNING, "gaps", text, tuple(wide[:_EXAMPLES]))
     else:
         yield Finding(Severity.OK, "gaps", f"none wider than {limit:.3f} s")
 
 
 def _scans(tally: _Tally) -> Iterator[Finding]:
     if tally.damaged:
-        seqs, first = tuple(seq for seq, _ in tally.damaged[:_NAMED]), tally.damaged[0][1]
+        seqs, first = tuple(seq for seq, _ in tally.damaged[:_EXAMPLES]), tally.damaged[0][1]
         text = f"{len(tally.damaged)} of {tally.scans} cannot be decoded, the first: {first}"
         yield Finding(Severity.ERROR, "scans", text, seqs)
     if tally.empty:
         text = f"{len(tally.empty)} of {tally.scans} have no finite point"
-        yield Finding(Severity.WARNING, "scans", text, tuple(tally.empty[:_NAMED]))
+        yield Finding(Severity.WARNING, "scans", text, tuple(tally.empty[:_EXAMPLES]))
     if tally.repeated:
         text = f"{len(tally.repeated)} are identical to the previous scan"
-        yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_NAMED]))
+        yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_EXAMPLES]))
     total = tally.points + tally.dropped
     share = tally.dropped / total if total else 0.0
     text = f"{total} in {tally.scans} scans, {100 * share:.2f} % no returns"
@@ -270,7 +272,7 @@ def _layout(source: Source) -> Iterator[Finding]:
             f"{fields}, {layout.point_step} bytes a point, {order} endian, frame"
             f" '{shown(layout.frame)}'"
         ] += 1
-    for text, count in layouts.most_common(_NAMED):
+    for text, count in layouts.most_common(_EXAMPLES):
         severity = Severity.OK if len(layouts) == 1 else Severity.WARNING
         yield Finding(severity, "layout", text if len(layouts) == 1 else f"{count} scans: {text}")
 
@@ -292,7 +294,7 @@ class _Copier:
         from mcap.writer import Writer
 
         self.done = Repaired()
-        self._writer: Any = Writer(stream, _CHUNK_BYTES, enable_data_crcs=True)
+        self._writer: Any = Writer(stream, WRITTEN_CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start(profile=profile, library=LIBRARY)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, int] = {}

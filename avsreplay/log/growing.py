@@ -19,15 +19,15 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log.bytes_io import shown
-from avsreplay.log.mcap_format import DATA_END, MAGIC
+from avsreplay.log.mcap_format import MCAP_MAGIC, Opcode
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.source import Source
 from avsreplay.records import Scan, Truth
 
 _POLL_S = 0.05
-_PER_OPENING = 2.0  # seconds between two openings, per second that an opening takes
-_BLOCK = 1 << 16
+_OPENING_DURATIONS = 2.0  # seconds between two openings, per second that an opening takes
+_COPIED_BYTES = 1 << 16  # most bytes of a stream that are read at once
 _NO_POINTS = np.zeros((0, 3), np.float32)
 
 
@@ -71,7 +71,7 @@ class GrowingLog:
             threading.Thread(
                 target=self._copy, args=(feed, copy), name="avsreplay-feed", daemon=True
             ).start()
-        elif not path.is_file() or (path.stat().st_size >= len(MAGIC) and not self._is_mcap()):
+        elif not path.is_file() or (path.stat().st_size >= len(MCAP_MAGIC) and not self._is_mcap()):
             what = "not an MCAP file" if path.exists() else "no such file"
             hint = "leave out --follow; only one MCAP file can be followed"
             raise UsageError(what, where=f"--follow {shown(path)}", hint=hint)
@@ -138,7 +138,7 @@ class GrowingLog:
         """
         before = self._at
         while True:
-            grown = self._advance()
+            grown = self.advance()
             if self.finished or (grown and self._at > before):
                 begun = time.monotonic()
                 try:
@@ -161,25 +161,25 @@ class GrowingLog:
                     if self.finished:
                         raise
                 finally:
-                    self._pause_s = max(_POLL_S, _PER_OPENING * (time.monotonic() - begun))
+                    self._pause_s = max(_POLL_S, _OPENING_DURATIONS * (time.monotonic() - begun))
             self._stop.wait(self._pause_s)
 
     def stop(self) -> None:
         """Wait for no more data; what is complete is still read."""
         self._stop.set()
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         """Step over the records that are complete by now; return whether there were any."""
         ending, start = self._stop.is_set(), self._at
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
-            if not self._at and size >= len(MAGIC):
-                self._at = len(MAGIC) if self._is_mcap() else 0
+            if not self._at and size >= len(MCAP_MAGIC):
+                self._at = len(MCAP_MAGIC) if self._is_mcap() else 0
             while self._at and self._at + 9 <= size:
                 file.seek(self._at)
                 head = file.read(9)
                 end = self._at + 9 + int.from_bytes(head[1:], "little")
-                if head[0] == DATA_END:  # the summary follows; a stream is read to its end
+                if head[0] == Opcode.DATA_END:  # the summary follows; a stream is read to its end
                     ending = ending or (not self._fed and self._closed(size))
                     break
                 if end > size:
@@ -190,18 +190,18 @@ class GrowingLog:
 
     def _closed(self, size: int) -> bool:
         with self.path.open("rb") as file:
-            file.seek(size - len(MAGIC))
-            return file.read() == MAGIC
+            file.seek(size - len(MCAP_MAGIC))
+            return file.read() == MCAP_MAGIC
 
     def _is_mcap(self) -> bool:
         with self.path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
+            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
     def _copy(self, feed: BinaryIO, copy: BinaryIO) -> None:
         read = getattr(feed, "read1", feed.read)
         try:
             with copy:
-                while block := read(_BLOCK):
+                while block := read(_COPIED_BYTES):
                     copy.write(block)
         except OSError as error:  # the stream cannot be read, or the disk is full
             self._broken = error

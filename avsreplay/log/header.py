@@ -36,18 +36,19 @@ from avsreplay.log.ply import read_ply
 from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
 from avsreplay.read_budget import BadFile, ReadBudget
-from avsreplay.records import Belief, Label, LogHeader, State, Surface
+from avsreplay.records import STATE_SIZES, Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
-OWN_MODEL, _OWN_WITHIN = b"comment reconstructed by avsreplay", 1024  # marks a built model
-FORMAT, _MAX_NAME = "1", 256
-_STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
+OWN_MODEL = b"comment reconstructed by avsreplay"  # marks a built model
+_OWN_MODEL_BYTES = 1024  # begin of a file in which this mark is searched
+HEADER_FORMAT = "1"
+_MAX_FRAME_CHARACTERS = 256
 
 
 def encode_header(header: LogHeader) -> dict[str, str]:
     """Return the metadata record of a header; the model itself is an attachment."""
     values = {
-        "format": FORMAT,
+        "format": HEADER_FORMAT,
         "scenario": header.scenario,
         "seed": _json(header.seed),
         "labels": _json([_label(label) for label in header.labels]),
@@ -70,9 +71,9 @@ def decode_header(values: Mapping[str, str]) -> LogHeader:
     rest = {k: v for k, v in values.items() if k != "crc32"}
     if values.get("crc32") != f"{_checksum(rest):08x}":
         raise ValueError("the checksum of the header record is wrong")
-    if values.get("format") != FORMAT:
+    if values.get("format") != HEADER_FORMAT:
         raise ValueError(
-            f"header record of format {values.get('format')!r}, this version reads {FORMAT}"
+            f"header record of format {values.get('format')!r}, this version reads {HEADER_FORMAT}"
         )
     try:
         return LogHeader(
@@ -104,7 +105,7 @@ def _label(label: Label) -> dict[str, Any]:
 
 
 def _state(state: State | None) -> dict[str, Any] | None:
-    return None if state is None else {name: getattr(state, name).tolist() for name in _STATE}
+    return None if state is None else {name: getattr(state, name).tolist() for name in STATE_SIZES}
 
 
 def _belief(belief: Belief | None) -> dict[str, Any] | None:
@@ -130,7 +131,7 @@ def _to_seed(value: Any) -> int | None:
 
 
 def _to_frame(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > _MAX_NAME:
+    if not isinstance(value, str) or len(value) > _MAX_FRAME_CHARACTERS:
         raise ValueError(f"a fixed frame of {str(value)[:40]}")
     return value
 
@@ -152,7 +153,7 @@ def _to_label(values: Any) -> Label:
 def _to_state(values: Any) -> State | None:
     if values is None:
         return None
-    state = State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
+    state = State(**{name: np.array(values[name], dtype=np.float64) for name in STATE_SIZES})
     lengths = np.linalg.norm(state.q_ab), np.linalg.norm(state.q_bc)
     if not all(abs(length - 1.0) < 1e-6 for length in lengths) or np.abs(state.sigma).max() >= 1.0:
         raise ValueError(
@@ -170,12 +171,12 @@ def _to_belief(values: Any) -> Belief | None:
     return Belief(int(values["t_ns"]), state, np.array(values["P"], dtype=np.float64))
 
 
-MAX_BYTES = 512 << 20
-_PLACED_BYTES = 24  # of a vertex or an index of a placed part of a scene [bytes]
-_PART_STEPS = 100_000  # that a placed part takes to read, about 2 ms of Python
+MAX_MODEL_BYTES = 512 << 20
+_PLACED_VALUE_BYTES = 24  # of a vertex or an index of a placed part of a scene [bytes]
+_PLACED_PART_WORK = 100_000  # that a placed part takes to read, about 2 ms of Python
 LEAST_EXTENT_M = 1e-6  # squares of a part of it must not underflow
-_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
-MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
+_MODEL_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
+MODEL_ENDINGS = tuple(f".{name}" for name in _MODEL_FORMATS)
 # Exceptions that trimesh raises for malformed files.
 _FOREIGN = (
     ArithmeticError,
@@ -214,8 +215,8 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
             or has no faces although they are needed.
     """
     path = Path(path)
-    data = read_limited(path, MAX_BYTES, "name a model file of at most 512 MiB")
-    own = OWN_MODEL in data[:_OWN_WITHIN]
+    data = read_limited(path, MAX_MODEL_BYTES, "name a model file of at most 512 MiB")
+    own = OWN_MODEL in data[:_OWN_MODEL_BYTES]
     return _parsed(data, path.name, shown(path), cloud_ok or own)
 
 
@@ -296,10 +297,10 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
         raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
     if data.startswith(b"ply"):
         suffix = "ply"
-    if suffix not in _FORMATS:
+    if suffix not in _MODEL_FORMATS:
         hint = (
-            f"give a model as {', '.join(_FORMATS).upper()}; CAD programs export STEP and IGES"
-            " files as STL"
+            f"give a model as {', '.join(_MODEL_FORMATS).upper()}; CAD programs export STEP and"
+            " IGES files as STL"
         )
         raise UnreadableInput(
             f"'{shown(suffix)}' is not a known model format", where=where, hint=hint
@@ -346,8 +347,8 @@ def _take_scene(data: bytes, budget: ReadBudget) -> None:
         times, parts = max(placed[number], 1), each["primitives"]
         used = [i for p in parts for i in (p["attributes"]["POSITION"], p.get("indices"))]
         numbers = sum(max(counts[i], 0) for i in used if i is not None)
-        budget.take_work(_PART_STEPS * times * len(parts), "the parts of its scene")
-        budget.take_bytes(_PLACED_BYTES * times * numbers, "parts of its scene")
+        budget.take_work(_PLACED_PART_WORK * times * len(parts), "the parts of its scene")
+        budget.take_bytes(_PLACED_VALUE_BYTES * times * numbers, "parts of its scene")
 
 
 def _trimesh(data: bytes, suffix: str, budget: ReadBudget) -> tuple[Array, NDArray[Any]]:

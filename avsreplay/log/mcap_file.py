@@ -30,9 +30,10 @@ from avsreplay.log.mcap_salvage import (
 from avsreplay.log.options import Loss
 from avsreplay.log.record_pass import RecordPass
 
-_TIMES = struct.Struct("<QQ")
-_BLOCK = 1 << 20
-_LEAST_CHUNK, _LEAST_MESSAGE = 49, 22
+_TIME_PAIR = struct.Struct("<QQ")
+_CHECKSUM_BYTES = 1 << 20  # most bytes whose checksum is taken at once
+_LEAST_CHUNK_BYTES = 49
+_LEAST_MESSAGE_BYTES = 22
 
 
 class McapFile(RecordPass):
@@ -93,7 +94,7 @@ class McapFile(RecordPass):
         end, expected = self.data_end
         crc, at = 0, 0
         while expected and at < end:
-            block = self._file.read(at, min(_BLOCK, end - at))
+            block = self._file.read(at, min(_CHECKSUM_BYTES, end - at))
             crc, at = zlib.crc32(block, crc), at + len(block)
         return crc == expected
 
@@ -111,7 +112,7 @@ class McapFile(RecordPass):
             raise UnreadableInput(
                 "the file is empty", where=shown(self.path), hint="record it again"
             )
-        if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
+        if self._size < 8 or self._file.read(0, 8) != mcap.MCAP_MAGIC:
             hint = "give an MCAP, a ROS bag or a folder of scans"
             if self.path.suffix.lower() in (".csv", ".tum", ".txt"):
                 hint += "; measured poses in a file need --backend poses (info: --poses)"
@@ -134,12 +135,12 @@ class McapFile(RecordPass):
 
     def _after_end(self, at: int) -> None:
         """List a second log behind the footer of this one, as in two files that were joined."""
-        opcode = mcap.DATA_END
-        while opcode != mcap.FOOTER and at + 9 <= self._size:
+        opcode: int = mcap.Opcode.DATA_END
+        while opcode != mcap.Opcode.FOOTER and at + 9 <= self._size:
             head = self._file.read(at, 9)
             opcode, at = head[0], at + 9 + int.from_bytes(head[1:], "little")
-        end = at + len(mcap.MAGIC)
-        if end + 8 <= self._size and self._file.read(end, 8) == mcap.MAGIC:
+        end = at + len(mcap.MCAP_MAGIC)
+        if end + 8 <= self._size and self._file.read(end, 8) == mcap.MCAP_MAGIC:
             self._lose(
                 Loss(
                     "another log follows the end of this one: replay each file by itself",
@@ -156,12 +157,16 @@ class McapFile(RecordPass):
         head = self._file.read(at, 9)
         opcode, length = head[0], int.from_bytes(head[1:], "little")
         end = at + 9 + length
-        if opcode != mcap.MESSAGE_INDEX:
+        if opcode != mcap.Opcode.MESSAGE_INDEX:
             self._settle()
         try:
             if end > self._size or (summary.start and end > summary.start):
                 raise BadMessage("a record ends past the file")
-            if length > self._limit and opcode != mcap.CHUNK and begins_record(self._file, end):
+            if (
+                length > self._limit
+                and opcode != mcap.Opcode.CHUNK
+                and begins_record(self._file, end)
+            ):
                 self._lose(Loss(self._too_large(length), at, end - at))
                 return end
             self._take(opcode, at, end)
@@ -176,7 +181,7 @@ class McapFile(RecordPass):
             handler(self, at, end)
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
-        elif end - at > _LEAST_CHUNK and (
+        elif end - at > _LEAST_CHUNK_BYTES and (
             hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None
         ):
             raise BadMessage("a chunk with a damaged opcode")
@@ -223,7 +228,7 @@ class McapFile(RecordPass):
 
     def _take_attachment(self, at: int, end: int) -> None:
         fields = self._content(at, end)
-        times = _TIMES.unpack(fields.take(16))
+        times = _TIME_PAIR.unpack(fields.take(16))
         name, media = fields.text(), fields.text()
         size = fields.number(8)
         start = at + 9 + fields.at
@@ -248,14 +253,14 @@ class McapFile(RecordPass):
 
     def _take_chunk(self, at: int, end: int) -> None:
         head = mcap.chunk_head(
-            self._file.read_at_most(at, min(mcap.CHUNK_PREFIX, end - at)), end - at
+            self._file.read_at_most(at, min(mcap.CHUNK_PREFIX_BYTES, end - at)), end - at
         )
         try:
             data = self._chunks.check(at, head)
             for opcode, begin, stop in mcap.records(
                 memoryview(data)
             ):  # checked before any of it is used
-                if opcode == mcap.MESSAGE and stop - begin < _LEAST_MESSAGE:
+                if opcode == mcap.Opcode.MESSAGE and stop - begin < _LEAST_MESSAGE_BYTES:
                     raise BadMessage("a message shorter than its fixed fields")
         except BadMessage as error:
             start_ns, end_ns = (min(t, MAX_NS) for t in (head.start_ns, head.end_ns))
@@ -268,11 +273,11 @@ class McapFile(RecordPass):
         self.unchecked += head.crc == 0
         view = memoryview(data)
         for opcode, begin, stop in mcap.records(view):
-            if opcode == mcap.MESSAGE:
+            if opcode == mcap.Opcode.MESSAGE:
                 self._message(view, begin, stop, number, begin)
-            elif opcode == mcap.SCHEMA:
+            elif opcode == mcap.Opcode.SCHEMA:
                 self._channels.schema(Fields(view[begin:stop]))
-            elif opcode == mcap.CHANNEL:
+            elif opcode == mcap.Opcode.CHANNEL:
                 self._channels.channel(Fields(view[begin:stop]))
 
     def _swallowed(self, at: int, end: int) -> int | None:
@@ -282,7 +287,7 @@ class McapFile(RecordPass):
         inner = first_chunk(self._file, at + 1, end)
         if inner is None:
             return None
-        head = mcap.chunk_head(self._file.read_at_most(inner, mcap.CHUNK_PREFIX))
+        head = mcap.chunk_head(self._file.read_at_most(inner, mcap.CHUNK_PREFIX_BYTES))
         try:
             self._chunks.check(inner, head)
         except BadMessage:
@@ -343,7 +348,9 @@ class McapFile(RecordPass):
     def _adopt(self, summary: SummarySection) -> None:
         """Add the channels of an intact summary, in case the chunk that defines them is lost."""
         for opcode, fields in summary.definitions:
-            (self._channels.schema if opcode == mcap.SCHEMA else self._channels.channel)(fields)
+            (self._channels.schema if opcode == mcap.Opcode.SCHEMA else self._channels.channel)(
+                fields
+            )
 
     def _account(self, summary: SummarySection) -> None:
         """List the messages that the summary counts and the pass did not find."""
@@ -365,13 +372,13 @@ class McapFile(RecordPass):
 
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {
-    mcap.HEADER: McapFile._take_header,
-    mcap.SCHEMA: lambda file, at, end: file._channels.schema(file._content(at, end)),
-    mcap.CHANNEL: lambda file, at, end: file._channels.channel(file._content(at, end)),
-    mcap.MESSAGE: McapFile._take_message,
-    mcap.CHUNK: McapFile._take_chunk,
-    mcap.MESSAGE_INDEX: McapFile._take_message_index,
-    mcap.ATTACHMENT: McapFile._take_attachment,
-    mcap.METADATA: McapFile._take_metadata,
-    mcap.DATA_END: McapFile._take_data_end,
+    mcap.Opcode.HEADER: McapFile._take_header,
+    mcap.Opcode.SCHEMA: lambda file, at, end: file._channels.schema(file._content(at, end)),
+    mcap.Opcode.CHANNEL: lambda file, at, end: file._channels.channel(file._content(at, end)),
+    mcap.Opcode.MESSAGE: McapFile._take_message,
+    mcap.Opcode.CHUNK: McapFile._take_chunk,
+    mcap.Opcode.MESSAGE_INDEX: McapFile._take_message_index,
+    mcap.Opcode.ATTACHMENT: McapFile._take_attachment,
+    mcap.Opcode.METADATA: McapFile._take_metadata,
+    mcap.Opcode.DATA_END: McapFile._take_data_end,
 }

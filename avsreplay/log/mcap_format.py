@@ -7,22 +7,40 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import field, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Protocol
 
 from avsreplay.errors import value_class
 from avsreplay.log.bytes_io import BadMessage, ByteFile
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
-ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
-CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
-_HEAD = struct.Struct("<BQ")
+WRITTEN_CHUNK_BYTES = 1 << 20  # of a chunk that is written
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+class Opcode(IntEnum):
+    """Kinds of records of an MCAP file."""
+
+    HEADER = 1
+    FOOTER = 2
+    SCHEMA = 3
+    CHANNEL = 4
+    MESSAGE = 5
+    CHUNK = 6
+    MESSAGE_INDEX = 7
+    ATTACHMENT = 9
+    STATISTICS = 11
+    METADATA = 12
+    DATA_END = 15
+
+
+# opcode and length, then the longest head of a chunk
+CHUNK_PREFIX_BYTES = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8
+_RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-_KNOWN, _MOST_FOREIGN = (
-    frozenset(range(1, 16)),
-    10_000,
-)  # a chunk of zeros is millions of records of length 0
+_KNOWN_OPCODES = frozenset(range(1, 16))
+# Records of unknown kinds after which a part is not read on: zeros are millions of empty records.
+MAX_FOREIGN_RECORDS = 10_000
 _SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))")
 
 
@@ -106,11 +124,11 @@ def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
     """
     at, size, foreign = 0, len(view), 0
     while at + 9 <= size:
-        opcode, length = _HEAD.unpack_from(view, at)
+        opcode, length = _RECORD_HEAD.unpack_from(view, at)
         if length > size - at - 9:
             raise BadMessage("a record ends past its container")
-        foreign += opcode not in _KNOWN
-        if opcode == 0 or foreign > _MOST_FOREIGN:
+        foreign += opcode not in _KNOWN_OPCODES
+        if opcode == 0 or foreign > MAX_FOREIGN_RECORDS:
             raise BadMessage("records of unknown kinds")
         yield opcode, at + 9, at + 9 + length
         at += 9 + length
@@ -123,9 +141,9 @@ def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> Chun
 
     Raises BadMessage if its lengths contradict each other.
     """
-    if len(view) < 49 or view[0] != CHUNK:
+    if len(view) < 49 or view[0] != Opcode.CHUNK:
         raise BadMessage("not a chunk")
-    _, length = _HEAD.unpack_from(view, 0)
+    _, length = _RECORD_HEAD.unpack_from(view, 0)
     start, end, size, crc, name_size = _CHUNK.unpack_from(view, 9)
     if name_size > 16 or len(view) < 49 + name_size:
         raise BadMessage("a chunk with an unknown compression")
@@ -152,7 +170,7 @@ def is_mcap(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(8) == MAGIC
+        return file.read(8) == MCAP_MAGIC
 
 
 class RecordSink(Protocol):
@@ -172,9 +190,9 @@ class RecordSink(Protocol):
         """Receive a metadata record."""
 
 
-TAIL = 37  # footer record (29 bytes) and closing magic
+TAIL_BYTES = 37  # footer record (29 bytes) and closing magic
 _DATA_END = re.compile(rb"\x0f\x04\x00{7}")
-_SEARCHED = 4 << 20
+_SUMMARY_SEARCH_BYTES = 4 << 20  # end of a file in which a moved summary is searched
 _FOOTER_HEAD = b"\x02\x14\x00\x00\x00\x00\x00\x00\x00"
 
 
@@ -204,16 +222,16 @@ def read_summary(file: ByteFile, limit: int) -> SummarySection:
 
 
 def _read(file: ByteFile, limit: int) -> SummarySection:
-    if file.size < 8 + TAIL:
+    if file.size < 8 + TAIL_BYTES:
         raise BadMessage("no footer")
-    tail = file.read(file.size - TAIL, TAIL)
-    if tail[29:] != MAGIC or tail[:9] != _FOOTER_HEAD:
+    tail = file.read(file.size - TAIL_BYTES, TAIL_BYTES)
+    if tail[29:] != MCAP_MAGIC or tail[:9] != _FOOTER_HEAD:
         raise BadMessage("no footer")
     start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
     if start == 0:
         return SummarySection()
-    inside = 8 < start <= file.size - TAIL and file.size - start <= limit
-    data = file.read(start, file.size - TAIL - start + 25) if inside else b""
+    inside = 8 < start <= file.size - TAIL_BYTES and file.size - start <= limit
+    data = file.read(start, file.size - TAIL_BYTES - start + 25) if inside else b""
     if inside and (not crc or zlib.crc32(data) == crc):
         return _walk(start, memoryview(data)[: len(data) - 25])
     moved = _moved(file, crc)
@@ -234,9 +252,9 @@ def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
     """Return the summary that follows a data-end record and matches the checksum, if the footer's
     offset is wrong.
     """
-    begin = max(file.size - _SEARCHED, 8)
+    begin = max(file.size - _SUMMARY_SEARCH_BYTES, 8)
     window = file.read(begin, file.size - begin)
-    end = len(window) - TAIL + 25
+    end = len(window) - TAIL_BYTES + 25
     for match in _DATA_END.finditer(window):
         start = match.start() + 13
         if crc and start <= end - 25 and zlib.crc32(window[start:end]) == crc:
@@ -247,8 +265,8 @@ def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
 def _walk(start: int, view: memoryview) -> SummarySection:
     messages, definitions = None, list[tuple[int, Fields]]()
     for opcode, begin, end in records(view):
-        if opcode in (SCHEMA, CHANNEL):
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.append((opcode, Fields(view[begin:end])))
-        elif opcode == STATISTICS:
+        elif opcode == Opcode.STATISTICS:
             messages = Fields(view[begin:end]).number(8)
     return SummarySection(start, messages, tuple(definitions))

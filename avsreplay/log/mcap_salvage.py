@@ -61,17 +61,18 @@ class ChannelTable:
             self._table.declare(channel.topic, channel.type, channel.encoding)
 
 
-_POSE, _ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+_POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 
 def guess_channel(number: int, payload: memoryview, library: str) -> Channel | None:
     """Return the channel that a message seems to belong to, None if it is unknown."""
     if _is_cloud(payload):
         return Channel(number, f"/lost/channel_{number}", "sensor_msgs/msg/PointCloud2", "cdr")
-    if library == LIBRARY and _is_whole(_POSE, payload, 7):
-        return Channel(number, TRUTH_TOPIC, _POSE, "cdr")
-    if library == LIBRARY and _is_whole(_ODOMETRY, payload, 7 + 36 + 6 + 36):
-        return Channel(number, BODY_TOPIC, _ODOMETRY, "cdr")
+    if library == LIBRARY and _is_whole(_POSE_TYPE, payload, 7):
+        return Channel(number, TRUTH_TOPIC, _POSE_TYPE, "cdr")
+    if library == LIBRARY and _is_whole(_ODOMETRY_TYPE, payload, 7 + 36 + 6 + 36):
+        return Channel(number, BODY_TOPIC, _ODOMETRY_TYPE, "cdr")
     return None
 
 
@@ -89,7 +90,7 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
         read_pose(kind, payload)
         cursor = Cursor(payload)
         cursor.header()
-        if kind == _ODOMETRY:
+        if kind == _ODOMETRY_TYPE:
             cursor.string()
         cursor.f64s(doubles)
     except BadMessage:
@@ -103,7 +104,7 @@ _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
 def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
     """Return whether a plausible chunk record begins at ``at`` and ends before ``stop``."""
     try:
-        mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX), stop - at)
+        mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX_BYTES), stop - at)
     except BadMessage:
         return False
     return True
@@ -122,7 +123,7 @@ def begins_record(file: ByteFile, at: int) -> bool:
 def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
     """Return whether a record with a private opcode is a chunk except for its first byte."""
     try:
-        mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX - 1), end - at)
+        mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX_BYTES - 1), end - at)
     except BadMessage:
         return False
     return True

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.read_budget import BadFile, ReadBudget
 
-_TYPES = {
+_PLY_TYPES = {
     "char": "i1",
     "int8": "i1",
     "uchar": "u1",
@@ -35,7 +35,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
-_MAX_HEADER = 1 << 16
+_MAX_PLY_HEADER_BYTES = 1 << 16
 _VALUE_BYTES = 8  # memory of a value
 
 
@@ -116,7 +116,7 @@ def read_ply(data: bytes, budget: ReadBudget | None = None) -> Ply:
 
 
 def _header(data: bytes) -> tuple[str | None, list[_Element], int]:
-    end = data.find(b"end_header", 0, _MAX_HEADER)
+    end = data.find(b"end_header", 0, _MAX_PLY_HEADER_BYTES)
     if not data.startswith(b"ply") or end < 0:
         raise BadFile("no PLY header")
     line_end = data.find(b"\n", end)
@@ -153,8 +153,8 @@ def _element(words: list[str], limit: int) -> _Element:
 def _property(words: list[str]) -> _Property:
     try:
         if words[1] == "list":
-            return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
-        return _Property(words[2], _TYPES[words[1]])
+            return _Property(words[4], _PLY_TYPES[words[3]], _PLY_TYPES[words[2]])
+        return _Property(words[2], _PLY_TYPES[words[1]])
     except (IndexError, KeyError):
         raise BadFile(f"unreadable line '{' '.join(words)[:60]}'") from None
 

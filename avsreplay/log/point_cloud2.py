@@ -14,7 +14,7 @@ from avsreplay.log.cdr import Cursor
 from avsreplay.log.raw_cloud import RawCloud
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_MAX_FIELDS = 256
+_MAX_CLOUD_FIELDS = 256
 
 
 @value_class(eq=True)
@@ -106,8 +106,8 @@ def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
 
 def _fields(cursor: Cursor) -> tuple[Field, ...]:
     count = cursor.u32()
-    if count > _MAX_FIELDS:
-        raise BadMessage(f"{count} fields, at most {_MAX_FIELDS} are read")
+    if count > _MAX_CLOUD_FIELDS:
+        raise BadMessage(f"{count} fields, at most {_MAX_CLOUD_FIELDS} are read")
     fields = []
     for _ in range(count):
         name, offset, datatype, many = cursor.string(), cursor.u32(), cursor.u8(), cursor.u32()

@@ -29,19 +29,20 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.log.raw_cloud import RawCloud
 
-_MOST_PERIODS = 1.6  # reach of the times of a scan over the time between two scans
-_PERIODS_APART = 1.2  # an origin farther than this from the stamps is that of another clock
-_USUAL_PERIOD = 0.3  # from here on the reach is an ordinary part of the period
+_MAX_REACH_PERIODS = 1.6  # reach of the times of a scan over the time between two scans
+_OTHER_CLOCK_PERIODS = 1.2  # an origin farther than this from the stamps is that of another clock
+_USUAL_REACH_PERIODS = 0.3  # from here on the reach is an ordinary part of the period
 _USUAL_S = 1e-3, 3.0  # ordinary durations of a scan
-_MOST_S = 30.0  # longest duration where the period is unknown
-_MARGIN = 0.9  # decades by which a unit must be more plausible than any other
-_DENSE_PER_S = 1e8  # more distinct instants per second than any scanner has
-_COARSE = 0.02  # of the period: a field that resolves less cannot place a point
+_MAX_DURATION_S = 30.0  # longest duration where the period is unknown
+_MARGIN_DECADES = 0.9  # decades by which a unit must be more plausible than any other
+_MAX_INSTANTS_PER_S = 1e8  # more distinct instants per second than any scanner has
+_COARSE_PERIODS = 0.02  # of the period: a field that resolves less cannot place a point
 _ADVANCE_PERIODS = 2.5  # stamps must differ by so much before an advance is tested
-_ADVANCE_ERROR = 0.2  # of that difference
-_MOST_SCANS = 0.85  # share of the scans that agree; the others may have a wrong stamp
+_ADVANCE_TOLERANCE = 0.2  # of that difference
+_LEAST_AGREEING_SHARE = 0.85  # share of the scans that agree; the others may have a wrong stamp
 _CYCLES_S = 1.0, 60.0, 3600.0, 86400.0
-_NAMED, _HINTED = 3.0, 1.4  # decades that a unit in the name, or the usual unit of a type, counts
+_NAMED_UNIT_DECADES = 3.0  # that a unit in the name of the field counts
+_USUAL_UNIT_DECADES = 1.4  # that the usual unit of a type counts
 
 
 class TimeUnit(Enum):
@@ -396,7 +397,11 @@ class _Candidate:
                 3600e9, 2.0 * self._step * unit.ns
             )
             step_s = self._step * unit.seconds
-            if self._first_ns > 10**17 and near and step_s > _COARSE * (self._period or 0.1):
+            if (
+                self._first_ns > 10**17
+                and near
+                and step_s > _COARSE_PERIODS * (self._period or 0.1)
+            ):
                 text = (
                     f"it holds the time of day in {unit.value} as float32, which resolves"
                     f" {step_s:.3g} s: the instants of the points are lost"
@@ -416,17 +421,19 @@ class _Candidate:
         if len(self._columns) > 1 and not self._fits_relative():
             for unit in self._units:
                 for cycle_ns in self._cycles(unit):
-                    if self._steady(self._residual(unit), unit, cycle_ns) > _MOST_SCANS:
+                    if self._steady(self._residual(unit), unit, cycle_ns) > _LEAST_AGREEING_SHARE:
                         return self._of_clock(unit, cycle_ns)
         unit_by_value = self._by_value()
         return None if unit_by_value is None else self._of_clock(unit_by_value, 0)
 
     def _plausible(self, unit: TimeUnit) -> bool:
-        most_s = _MOST_S if self._period is None else 2.0 * _MOST_PERIODS * self._period
+        most_s = (
+            _MAX_DURATION_S if self._period is None else 2.0 * _MAX_REACH_PERIODS * self._period
+        )
         return self._span * unit.seconds <= most_s
 
     def _fits_relative(self) -> bool:
-        return any(self._score(unit) > -_NAMED for unit in self._units)
+        return any(self._score(unit) > -_NAMED_UNIT_DECADES for unit in self._units)
 
     def _cycles(self, unit: TimeUnit) -> Iterator[int]:
         most_ns = self._reach * unit.ns
@@ -462,10 +469,10 @@ class _Candidate:
         if apart <= 0.0 or len(stamps) < 3 or apart < _ADVANCE_PERIODS * span_s:
             # two scans: an advance by the difference of the stamps, and no relative time that fits
             advance = float(self._middle[-1] - self._middle[0]) * unit.seconds
-            near = abs(advance - float(stamps[-1])) < _ADVANCE_ERROR * apart
+            near = abs(advance - float(stamps[-1])) < _ADVANCE_TOLERANCE * apart
             return near and not self._fits_relative()
-        near_middle = np.abs(residual - _median(residual)) < _ADVANCE_ERROR * apart
-        return float(np.mean(near_middle)) > _MOST_SCANS
+        near_middle = np.abs(residual - _median(residual)) < _ADVANCE_TOLERANCE * apart
+        return float(np.mean(near_middle)) > _LEAST_AGREEING_SHARE
 
     def _by_value(self) -> TimeUnit | None:
         """The unit in which the values of a single scan are next to its stamp."""
@@ -483,10 +490,10 @@ class _Candidate:
             offsets = sorted(_within(each, cycle_ns) for each in offsets)
         offset_ns = offsets[len(offsets) // 2]
         span_s = self._span * unit.seconds
-        near_s = _PERIODS_APART * max(self._period or 0.0, span_s, 1e-3)
+        near_s = _OTHER_CLOCK_PERIODS * max(self._period or 0.0, span_s, 1e-3)
         same = abs(offset_ns) * 1e-9 <= near_s
         limit_s = 2.0 * near_s + span_s
-        if self._step * unit.seconds > _COARSE * max(self._period or 0.0, span_s):
+        if self._step * unit.seconds > _COARSE_PERIODS * max(self._period or 0.0, span_s):
             text = f"it resolves {self._step * unit.seconds:.3g} s, too little for its scans"
             return Reading(self.name, refused=text)
         origin = TimeOrigin.CLOCK if same else TimeOrigin.OTHER
@@ -510,7 +517,7 @@ class _Candidate:
         (best, unit), second = scores[0], scores[1][0] if scores[1:] else -np.inf
         reach = self._reach * unit.seconds
         of = "" if self._period is None else f" of the {self._period:.4g} s between two scans"
-        if not np.isfinite(best) or best - second < _MARGIN:
+        if not np.isfinite(best) or best - second < _MARGIN_DECADES:
             low, high = min(map(float, self._low)), max(map(float, self._high))
             text = (
                 f"its values from {low:.10g} to {high:.10g} do not tell the unit or the origin"
@@ -529,20 +536,24 @@ class _Candidate:
     def _score(self, unit: TimeUnit) -> float:
         """How plausible a unit is for times relative to the stamp [decades], 0 at best."""
         reach_s = self._reach * unit.seconds
-        if reach_s > (_MOST_S if self._period is None else _MOST_PERIODS * self._period):
+        if reach_s > (
+            _MAX_DURATION_S if self._period is None else _MAX_REACH_PERIODS * self._period
+        ):
             return float(-np.inf)
         score = -_decades(_USUAL_S[0], reach_s) - _decades(reach_s, _USUAL_S[1])
         if self._period is not None:
-            score -= _decades(_USUAL_PERIOD * self._period, reach_s)
-        if self._distinct / max(self._span * unit.seconds, 1e-12) > _DENSE_PER_S:
+            score -= _decades(_USUAL_REACH_PERIODS * self._period, reach_s)
+        if self._distinct / max(self._span * unit.seconds, 1e-12) > _MAX_INSTANTS_PER_S:
             score -= 1.0
         hint = next((_UNIT_WORDS[w] for w in _words(self.name) if w in _UNIT_WORDS), None)
         if hint is not None:
-            return score + (_NAMED if hint is unit else 0.0)
+            return score + (_NAMED_UNIT_DECADES if hint is unit else 0.0)
         if self._integer and unit is TimeUnit.S:
-            return score - _NAMED  # whole seconds cannot tell the points of a scan apart
+            return (
+                score - _NAMED_UNIT_DECADES
+            )  # whole seconds cannot tell the points of a scan apart
         usual = TimeUnit.NS if self._integer else TimeUnit.S
-        return score + (_HINTED if unit is usual else 0.0)
+        return score + (_USUAL_UNIT_DECADES if unit is usual else 0.0)
 
     @property
     def _distinct(self) -> int:

@@ -18,7 +18,8 @@ from avsreplay.log.cdr import Cursor
 from avsreplay.log.index import POSE_NAMES, Sink
 from avsreplay.records import State
 
-_MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
+_MAX_TRANSFORMS = 4096  # of one message
+_MAX_MAGNITUDE = 1e9  # of the numbers of a pose
 _ROW = struct.Struct("13d")  # pose and twist of a track
 
 
@@ -49,7 +50,10 @@ def checked(out: Transform) -> Transform:
 
     Raises BadMessage if it is not finite or its quaternion is far from unit length.
     """
-    if not all(abs(v) < _MAX_VALUE for v in out.pose) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
+    if (
+        not all(abs(v) < _MAX_MAGNITUDE for v in out.pose)
+        or not 0.5 < math.hypot(*out.pose[3:]) < 2.0
+    ):
         raise BadMessage("a pose that is not finite or has no unit quaternion")
     return out
 
@@ -90,9 +94,8 @@ def _transform(cursor: Cursor) -> Transform:
 POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = dict(
     zip(POSE_NAMES, (_pose, _with_covariance, _odometry, _transform), strict=True)
 )
-_UNIT_WITHIN = (
-    0.01  # a measured quaternion whose length is off by more is not a rounded unit quaternion
-)
+# a measured quaternion whose length is off by more is not a rounded unit quaternion
+_UNIT_LENGTH_ERROR = 0.01
 
 
 def decode_measured(
@@ -130,10 +133,10 @@ def pose_of_numbers(values: Sequence[float]) -> MeasuredPose:
     Raises:
         BadMessage: a value is not finite, or the quaternion is not of unit length within 1 %.
     """
-    if not all(abs(v) < _MAX_VALUE for v in values):
+    if not all(abs(v) < _MAX_MAGNITUDE for v in values):
         raise BadMessage("a pose that is not finite")
     length = math.hypot(*values[3:])
-    if abs(length - 1.0) > _UNIT_WITHIN:
+    if abs(length - 1.0) > _UNIT_LENGTH_ERROR:
         raise BadMessage(f"a quaternion of length {length:.4g}, not 1")
     return MeasuredPose(Pose(np.array(values[3:]) / length, np.array(values[:3])))
 
@@ -227,7 +230,7 @@ class PoseTrack:
         gives sigma, c_b and q_bc.
         """
         row = self._at(t_ns)
-        if row is None or not (np.abs(row[7:]) < _MAX_VALUE).all():
+        if row is None or not (np.abs(row[7:]) < _MAX_MAGNITUDE).all():
             return None
         q_ab = row[3:7]
         v_a = geometry.matrix(q_ab) @ row[7:10]

@@ -14,11 +14,9 @@ from avsreplay.log.index import ChunkStore, Recording, Sink
 from avsreplay.log.options import Loss
 
 _MAX_LOSSES = 10_000
-_FIRST_WINDOW, _WINDOW = (
-    1 << 12,
-    1 << 20,
-)  # the next record is usually near; the search grows to the largest window
-_MARGIN = 64  # a candidate is recognised by at most so many bytes
+_FIRST_WINDOW_BYTES = 1 << 12  # in which the next record is searched at first: it is usually near
+_MAX_WINDOW_BYTES = 1 << 20  # to which the window grows
+_CANDIDATE_BYTES = 64  # by which a candidate is recognised at most
 _MAX_CANDIDATES = 1_000_000
 
 
@@ -38,16 +36,16 @@ def search(
         candidates: gives the places in some bytes where a record may begin.
         accept: whether one begins at an offset.
     """
-    tried, width = 0, _FIRST_WINDOW
+    tried, width = 0, _FIRST_WINDOW_BYTES
     while at < stop:
-        window = file.read_at_most(at, min(width, stop - at) + _MARGIN)
+        window = file.read_at_most(at, min(width, stop - at) + _CANDIDATE_BYTES)
         for place in candidates(window):
             tried += 1
             if tried > _MAX_CANDIDATES:  # a file made to look like records everywhere
                 return None
             if at + place < stop and accept(at + place):
                 return at + place
-        at, width = at + width, min(2 * width, _WINDOW)
+        at, width = at + width, min(2 * width, _MAX_WINDOW_BYTES)
     return None
 
 

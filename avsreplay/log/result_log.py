@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,17 @@ from numpy.typing import NDArray
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
+from avsreplay.log.mcap_format import WRITTEN_CHUNK_BYTES
 from avsreplay.records import Surface
 
-CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
+CAMERA = "camera"
+TARGET = "target"
+TRUE = "target_true"
+ROOT = "map"
 LIBRARY = "avsreplay"
 RUN_RECORD = "avsreplay-run"  # not the record with which a log can be replayed
-CHUNK_BYTES = 1 << 20
-ROWS, ROW_TYPE = "/rows", "avsreplay/msg/Row"
-_TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
+ROWS = "/rows"
+ROW_TYPE = "avsreplay/msg/Row"
 _TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -44,7 +48,17 @@ _TOPICS = {
     "/rosout": "rcl_interfaces/msg/Log",
     ROWS: ROW_TYPE,
 }
-_INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
+
+
+class _Marker(IntEnum):  # visualization_msgs/msg/Marker
+    LINE_LIST = 5
+    POINTS = 8
+    TRIANGLE_LIST = 11
+
+
+class _Level(IntEnum):  # rcl_interfaces/msg/Log
+    INFO = 20
+    WARN = 30
 
 
 @value_class
@@ -120,7 +134,9 @@ class ResultLog:
             raise UnreadableInput(
                 what, where=str(path), hint="check the folder and its rights"
             ) from None
-        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True)
+        self._writer = Writer(
+            self._stream, WRITTEN_CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True
+        )
         self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
             self._writer.add_metadata(RUN_RECORD, dict(metadata))
@@ -153,7 +169,9 @@ class ResultLog:
                 self._append(
                     "/plan/cone",
                     t,
-                    _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m),
+                    _marker(
+                        t, TARGET, _Marker.LINE_LIST, self._cone, (0.0, 0.62, 0.45, 0.9), width_m
+                    ),
                 )
         self._count += 1
         self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
@@ -254,7 +272,7 @@ def _status(frame: ResultFrame) -> bytes:
 
 def _said(frame: ResultFrame) -> bytes:
     """Return a rcl_interfaces Log: whether the scan is used, or why not."""
-    level = _INFO if frame.healthy else _WARN
+    level = _Level.INFO if frame.healthy else _Level.WARN
     packer = Packer().i32(frame.t_ns // 10**9).u32(frame.t_ns % 10**9).u8(level).string("avsreplay")
     return packer.string(frame.message).string("").string("").u32(0).bytes()
 
@@ -264,7 +282,9 @@ def _model_marker(t_ns: int, frame: str, surface: Surface) -> bytes:
     faces = surface.faces
     corners = surface.vertices[faces.reshape(-1)] if len(faces) else surface.vertices
     colour = (0.6, 0.65, 0.7, 0.5) if frame == TARGET else (0.2, 0.7, 0.6, 0.25)
-    return _marker(t_ns, frame, _TRIANGLE_LIST if len(faces) else _POINTS, corners, colour, 1.0)
+    return _marker(
+        t_ns, frame, _Marker.TRIANGLE_LIST if len(faces) else _Marker.POINTS, corners, colour, 1.0
+    )
 
 
 def _marker(
@@ -276,7 +296,7 @@ def _marker(
     scale: float,
 ) -> bytes:
     """Return a visualization_msgs Marker of points (m, 3) in a frame."""
-    name = "cone" if kind == _LINES else "model"
+    name = "cone" if kind == _Marker.LINE_LIST else "model"
     packer = Packer().header(t_ns, frame).string(name).i32(0).i32(kind)
     packer.i32(0).pose(Pose.identity()).f64s(scale, scale, scale).f32s(
         *colour

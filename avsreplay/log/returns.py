@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 
-MAX_COORDINATE_M = (
-    1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
-)
-_LEAST_COUNT = 10  # points that are equal before they are taken for a code
-_LEAST_SHARE = 0.005  # of the points of a cloud
-_OFTEN = 10.0  # how much more often than the others a point is repeated
-_PROBE = 512  # points of a cloud that are compared before all are
-_APART = 0.05  # gap between a largest depth or range and the next point, over it
-_EQUAL = 3e-6  # relative difference of values that are written as float32
+# a larger coordinate is a sensor error; squares and grid cells stay in range
+MAX_COORDINATE_M = 1e6
+_LEAST_REPEATS = 10  # points that are equal before they are taken for a code
+_LEAST_REPEATED_SHARE = 0.005  # of the points of a cloud
+_REPEATS_OVER_OTHERS = 10.0  # how much more often than the others a point is repeated
+_PROBE_POINTS = 512  # points of a cloud that are compared before all are
+_RANGE_GAP_SHARE = 0.05  # gap between a largest depth or range and the next point, over it
+_FLOAT32_DIFFERENCE = 3e-6  # relative difference of values that are written as float32
 _DIGITS = range(10, 17)  # bits of a depth image
 _DIGIT_UNITS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 2.5e-4)  # their units
 
@@ -127,14 +126,14 @@ def repeated(points: NDArray[Any]) -> NDArray[Any] | None:
     Args:
         points: (n, 3) finite.
     """
-    if len(points) < 2 * _LEAST_COUNT:
+    if len(points) < 2 * _LEAST_REPEATS:
         return None
-    probe = points[:: max(len(points) // _PROBE, 1)]
-    if _most_common(probe)[1] <= max(1, int(_LEAST_SHARE * len(probe))):
+    probe = points[:: max(len(points) // _PROBE_POINTS, 1)]
+    if _most_common(probe)[1] <= max(1, int(_LEAST_REPEATED_SHARE * len(probe))):
         return None
     code, count, distinct = _most_common(points)
-    often = count >= max(_LEAST_COUNT, _LEAST_SHARE * len(points))
-    return code if often and count >= _OFTEN * len(points) / distinct else None
+    often = count >= max(_LEAST_REPEATS, _LEAST_REPEATED_SHARE * len(points))
+    return code if often and count >= _REPEATS_OVER_OTHERS * len(points) / distinct else None
 
 
 def _most_common(points: NDArray[Any]) -> tuple[NDArray[Any], int, int]:
@@ -163,7 +162,7 @@ def find_codes(clouds: Sequence[NDArray[Any]]) -> NoReturn:
     finite = [cloud for cloud in finite if len(cloud)]
     depths = [(axis, v) for k, axis in enumerate("xyz") if (v := _largest_depth(finite, k))]
     ranges = [] if depths else [v for v in (_largest_range(finite),) if v]
-    few = tuple((x, y, z) for x, y, z in list(points)[:_LEAST_COUNT])
+    few = tuple((x, y, z) for x, y, z in list(points)[:_LEAST_REPEATS])
     return NoReturn(few, tuple(depths), tuple(ranges))
 
 
@@ -215,7 +214,7 @@ def _differs(points: NDArray[Any], code: NDArray[Any]) -> NDArray[np.bool_] | No
 
 
 def _equals(values: NDArray[Any], code: float) -> NDArray[np.bool_]:
-    equal: NDArray[np.bool_] = np.isclose(values, code, rtol=_EQUAL, atol=0.0)
+    equal: NDArray[np.bool_] = np.isclose(values, code, rtol=_FLOAT32_DIFFERENCE, atol=0.0)
     return equal
 
 
@@ -233,7 +232,9 @@ def _largest_depth(clouds: Sequence[NDArray[Any]], axis: int) -> float | None:
         return None
     digits = [value / unit for unit in _DIGIT_UNITS]
     full = [2**k - one for k in _DIGITS for one in (0, 1)]
-    if not any(abs(each - number) <= _EQUAL * number for each in digits for number in full):
+    if not any(
+        abs(each - number) <= _FLOAT32_DIFFERENCE * number for each in digits for number in full
+    ):
         return None
     return next(
         float(cloud[k, axis])
@@ -262,12 +263,12 @@ def _apart(values: Sequence[NDArray[Any]], least: int) -> float | None:
     for each in values:
         equal = _equals(each, largest)
         rest = each[~equal]
-        if len(rest) and rest.max() > (1.0 - _APART) * largest:
+        if len(rest) and rest.max() > (1.0 - _RANGE_GAP_SHARE) * largest:
             return None
         counts.append(int(np.count_nonzero(equal)))
         others += len(rest)
     many = [
-        n >= max(_LEAST_COUNT, _LEAST_SHARE * len(each))
+        n >= max(_LEAST_REPEATS, _LEAST_REPEATED_SHARE * len(each))
         for n, each in zip(counts, values, strict=True)
     ]
     return largest if others and sum(many) >= least and 2 * sum(many) > len(values) else None

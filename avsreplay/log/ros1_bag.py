@@ -10,20 +10,33 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from enum import IntEnum
 from pathlib import Path
 
 from avsreplay.errors import value_class
 from avsreplay.log.bytes_io import ROS1_MAGIC, BadMessage
 from avsreplay.log.index import Sink, canonical_type
-from avsreplay.log.mcap_format import ChunkHead, Fields
+from avsreplay.log.mcap_format import MAX_FOREIGN_RECORDS, ChunkHead, Fields
 from avsreplay.log.options import Loss
 from avsreplay.log.record_pass import RecordPass, search
+from avsreplay.records import NS_PER_S
 
-_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+
+class _Op(IntEnum):
+    MESSAGE = 2
+    BAG = 3
+    INDEX = 4
+    CHUNK = 5
+    CHUNK_INFO = 6
+    CONNECTION = 7
+
+
 # the length of a record's header, and the first of its fields, of which a chunk has three
-_HEAD = re.compile(rb"(?=[\x08-\x80]\x00{3}[\x04-\x40]\x00{3}(?:op=\x05|compression=|size=))")
-_MAX_HEAD, _MOST_FOREIGN = 1 << 16, 10_000
-_COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
+_RECORD_HEADER = re.compile(
+    rb"(?=[\x08-\x80]\x00{3}[\x04-\x40]\x00{3}(?:op=\x05|compression=|size=))"
+)
+_MAX_HEADER_BYTES = 1 << 16  # of the header of one record
+_BAG_COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 
 @value_class(eq=True)
@@ -93,7 +106,7 @@ class Ros1Bag(RecordPass):
         """
         try:
             head = self._record(len(ROS1_MAGIC))
-            place = head.number("index_pos") if head.op == _BAG else 0
+            place = head.number("index_pos") if head.op == _Op.BAG else 0
         except BadMessage:
             return None
         return place if head.end <= place < self._file.size else None
@@ -103,7 +116,7 @@ class Ros1Bag(RecordPass):
         while at is not None and at < self._file.size:
             try:
                 record = self._record(at)
-                if record.op == _CONNECTION:
+                if record.op == _Op.CONNECTION:
                     self._connection(record, self._data(record))
             except BadMessage:
                 return
@@ -114,7 +127,7 @@ class Ros1Bag(RecordPass):
             record = self._record(at)
             if record.end > end:
                 raise BadMessage("a record ends past the file")
-            if record.op != _INDEX:
+            if record.op != _Op.INDEX:
                 self._settle()
             self._take(at, record)
         except BadMessage as error:
@@ -122,28 +135,28 @@ class Ros1Bag(RecordPass):
         return record.end
 
     def _take(self, at: int, record: _Record) -> None:
-        if record.op == _CHUNK:
+        if record.op == _Op.CHUNK:
             self._take_chunk(at, record)
-        elif record.op == _MESSAGE:
+        elif record.op == _Op.MESSAGE:
             data = self._data(record)
             self._message(record, data, -1, record.data_at)
-        elif record.op == _CONNECTION:
+        elif record.op == _Op.CONNECTION:
             self._connection(record, self._data(record))
-        elif record.op == _INDEX:
+        elif record.op == _Op.INDEX:
             self._count_lost(record.number("count") if self._bad_chunk else 0)
-        elif record.op not in (_BAG, _CHUNK_INFO):
+        elif record.op not in (_Op.BAG, _Op.CHUNK_INFO):
             raise BadMessage(f"a record of unknown kind {record.op}")
 
     def _take_chunk(self, at: int, record: _Record) -> None:
         name = record.fields.get("compression", b"").decode("ascii", "replace")
-        if name not in _COMPRESSIONS:
+        if name not in _BAG_COMPRESSIONS:
             raise BadMessage("a chunk with an unknown compression")
         head = ChunkHead(
             0,
             0,
             record.number("size"),
             0,
-            _COMPRESSIONS[name],
+            _BAG_COMPRESSIONS[name],
             record.data_at - at,
             record.data_size,
         )
@@ -157,9 +170,9 @@ class Ros1Bag(RecordPass):
         number = self._chunks.add(at, head)
         for found in _records(data):
             body = data[found.data_at : found.end]
-            if found.op == _CONNECTION:
+            if found.op == _Op.CONNECTION:
                 self._connection(found, body)
-            elif found.op == _MESSAGE:
+            elif found.op == _Op.MESSAGE:
                 self._message(found, body, number, found.data_at)
 
     def _connection(self, record: _Record, data: memoryview) -> None:
@@ -174,7 +187,7 @@ class Ros1Bag(RecordPass):
             self._orphans += 1
             return
         time = record.number("time")
-        log_ns = (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32)
+        log_ns = (time & 0xFFFFFFFF) * NS_PER_S + (time >> 32)
         self._table.add(topic, (log_ns, log_ns), payload, (container, offset))
 
     def _data(self, record: _Record) -> memoryview:
@@ -184,7 +197,7 @@ class Ros1Bag(RecordPass):
 
     def _record(self, at: int) -> _Record:
         size = int.from_bytes(self._file.read(at, 4), "little")
-        if size > _MAX_HEAD:
+        if size > _MAX_HEADER_BYTES:
             raise BadMessage("a record header that is too long")
         raw = self._file.read(at + 4, size + 4)
         return _parsed(memoryview(raw)[:size], at + 8 + size, int.from_bytes(raw[size:], "little"))
@@ -194,7 +207,7 @@ class Ros1Bag(RecordPass):
             self._file,
             at + 1,
             end,
-            lambda window: (match.start() for match in _HEAD.finditer(window)),
+            lambda window: (match.start() for match in _RECORD_HEADER.finditer(window)),
             lambda place: self._is_chunk(place, end),
         )
         resume = end if found is None else found
@@ -206,7 +219,7 @@ class Ros1Bag(RecordPass):
             record = self._record(at)
         except BadMessage:
             return False
-        return record.op == _CHUNK and record.end <= end
+        return record.op == _Op.CHUNK and record.end <= end
 
 
 def _records(view: memoryview) -> Iterator[_Record]:
@@ -216,8 +229,8 @@ def _records(view: memoryview) -> Iterator[_Record]:
         head = walk.take(walk.number(4))
         size = walk.number(4)
         record = _parsed(head, walk.at, size)
-        foreign += record.op not in (_MESSAGE, _CONNECTION)
-        if foreign > _MOST_FOREIGN:
+        foreign += record.op not in (_Op.MESSAGE, _Op.CONNECTION)
+        if foreign > MAX_FOREIGN_RECORDS:
             raise BadMessage("records of unknown kinds")
         yield record
         walk.take(size)

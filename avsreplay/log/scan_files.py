@@ -140,7 +140,8 @@ _READERS: dict[str, Callable[[bytes, ReadBudget], NDArray[Any]]] = {
 }
 SCAN_FORMATS = tuple(_READERS)
 DEPTH_FORMAT = ".png"  # a folder of depth images, where it has no other scans
-LOG_FORMATS, LISTED = (".mcap", ".bag", ".db3"), 3
+LOG_FORMATS = (".mcap", ".bag", ".db3")
+LISTED_LOGS = 3  # logs that a message names
 
 
 _NUMBER = re.compile(r"\d+")
@@ -192,8 +193,8 @@ def _no_scans(folder: Path) -> UnreadableInput:
     kinds = f"{', '.join(SCAN_FORMATS)} or depth {DEPTH_FORMAT} files"
     hint = f"scans are {kinds}; a log is an MCAP or a ROS bag"
     if logs:
-        more = ", ..." if len(logs) > LISTED else ""
-        hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED]))}{more}"
+        more = ", ..." if len(logs) > LISTED_LOGS else ""
+        hint = f"it holds logs, name one of them: {', '.join(map(shown, logs[:LISTED_LOGS]))}{more}"
     return UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
 
 
@@ -202,9 +203,9 @@ def by_number(name: str) -> tuple[tuple[int, ...], str]:
     return tuple(int(n) for n in _NUMBER.findall(name)), name
 
 
-_KINDS = {"F": "f", "I": "i", "U": "u"}
-_MAX_HEADER = 1 << 16
-_MAX_RATIO = 256  # three bytes of LZF decompress to at most 264
+_PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
+_MAX_PCD_HEADER_BYTES = 1 << 16
+_MAX_EXPANSION_RATIO = 256  # three bytes of LZF decompress to at most 264
 
 
 @value_class(eq=True)
@@ -260,7 +261,7 @@ def _header(data: bytes) -> _Header:
     found: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in found:
-        end = data.find(b"\n", at, _MAX_HEADER)
+        end = data.find(b"\n", at, _MAX_PCD_HEADER_BYTES)
         if end < 0:
             raise BadFile("no PCD header")
         words = data[at:end].decode("ascii", "replace").split()
@@ -280,7 +281,7 @@ def _header(data: bytes) -> _Header:
 
 
 def _kind(type_: str, size: str) -> str:
-    kind = f"{_KINDS.get(type_, '?')}{size}"
+    kind = f"{_PCD_KINDS.get(type_, '?')}{size}"
     if kind not in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"):
         raise BadFile(f"a field of TYPE {type_} and SIZE {size}")
     return kind
@@ -343,7 +344,7 @@ def _compressed(data: bytes, header: _Header) -> list[NDArray[Any]]:
     packed, size = (int.from_bytes(data[at + i : at + i + 4], "little") for i in (0, 4))
     if packed > len(data) - at - 8:
         raise BadFile(f"a compressed part of {packed} bytes in {len(data) - at - 8} bytes")
-    if size != header.points * header.row.itemsize or size > packed * _MAX_RATIO:
+    if size != header.points * header.row.itemsize or size > packed * _MAX_EXPANSION_RATIO:
         raise BadFile(f"a compressed part that declares {size} bytes")
     raw = unpack_lzf(data[at + 8 : at + 8 + packed], size)
     out, start = [], dict[str, int]()

@@ -21,7 +21,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.canonical import (
-    SAMPLE,
+    INFERENCE_CLOUDS,
     Cloud,
     Meaning,
     at_stamp,
@@ -44,7 +44,8 @@ from avsreplay.log.point_times import TimedCloud
 from avsreplay.log.streams import CloudStream, GroundTruth, about_grasp, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
-_BLOCK, UNKNOWN_SENSOR = 1 << 20, "the pose of the sensor is unknown at the time of the scan"
+_HASHED_BYTES = 1 << 20  # most bytes of a file that are hashed at once
+UNKNOWN_SENSOR = "the pose of the sensor is unknown at the time of the scan"
 
 
 class Source:
@@ -132,7 +133,7 @@ class Source:
             return Meaning()
         sound = [k for k, placed in enumerate(self._placed) if placed.note is None]
         sample = list[TimedCloud]()
-        for k in spread(len(sound), SAMPLE):
+        for k in spread(len(sound), INFERENCE_CLOUDS):
             with suppress(BadMessage):
                 sample.append(TimedCloud(self._clouds.load(sound[k]), self._stamp(sound[k])))
         return infer(sample, self._period_s(), self.options)
@@ -173,7 +174,7 @@ class Source:
                     + b"\0"
                 )
             with path.open("rb") as file:
-                while block := file.read(_BLOCK):
+                while block := file.read(_HASHED_BYTES):
                     digest.update(block)
         return digest.hexdigest()
 

@@ -31,8 +31,9 @@ from avsreplay.read_budget import BadFile
 from avsreplay.records import LogHeader
 
 T = TypeVar("T")
-_WAIT_S = 0.1
-EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero means "unset"
+_QUEUE_WAIT_S = 0.1
+# stamp of the first scan of a folder: a stamp of zero means "unset"
+FOLDER_EPOCH_NS = 1_000_000_000
 
 
 class PoseMessages(MessageClouds):
@@ -77,7 +78,7 @@ class PoseFile(_Files):
         found = read_poses(path)
         self._poses = found.poses
         self.timed = found.t_ns is not None
-        steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
+        steady = [FOLDER_EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
         self.log_ns = self.publish_ns = self.header_ns = (
             steady if found.t_ns is None else list(found.t_ns)
         )
@@ -112,7 +113,7 @@ class FolderClouds(_Files):
         camera: Camera | None = None,
     ) -> None:
         self._files, self._limit, self._camera = files, limit, camera
-        steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
+        steady = [FOLDER_EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns = self.publish_ns = self.header_ns = times_ns or steady
 
     def load(self, place: int) -> RawCloud:
@@ -148,7 +149,7 @@ def ahead(items: Iterator[T], count: int) -> Generator[T]:
     def put(entry: tuple[bool, T | BaseException | None]) -> None:
         while not stop.is_set():
             try:
-                queue.put(entry, timeout=_WAIT_S)
+                queue.put(entry, timeout=_QUEUE_WAIT_S)
                 return
             except Full:
                 continue
@@ -180,7 +181,7 @@ def _drained(
 ) -> Iterator[T]:
     while True:
         try:
-            more, item = queue.get(timeout=_WAIT_S)
+            more, item = queue.get(timeout=_QUEUE_WAIT_S)
         except Empty:
             if thread.is_alive():
                 continue

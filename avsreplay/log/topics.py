@@ -13,7 +13,7 @@ from avsreplay.log.depth_stream import depth_topics
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Recording
 from avsreplay.log.options import SourceOptions, TopicInfo
 
-_NAMED = 12  # topics that a message names
+_LISTED_TOPICS = 12  # topics that a message names
 _CONVERTED = (
     (
         re.compile(r"CompressedPointCloud", re.IGNORECASE),
@@ -88,8 +88,8 @@ def chosen_topic(recording: Recording, options: SourceOptions, path: Path) -> st
 
 
 def _named(topics: Sequence[TopicInfo]) -> str:
-    more = ", ..." if len(topics) > _NAMED else ""
-    return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in topics[:_NAMED]) + more
+    more = ", ..." if len(topics) > _LISTED_TOPICS else ""
+    return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in topics[:_LISTED_TOPICS]) + more
 
 
 def _without_scans(recording: Recording, path: Path, what: str) -> UnreadableInput:

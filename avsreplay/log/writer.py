@@ -31,16 +31,17 @@ from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS
 from avsreplay.records import Label, LogHeader, Scan, State
 
-CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = (
-    "/points",
-    "/truth/pose",
-    "/truth/body",
-    "/faults",
-)
+CLOUD_TOPIC = "/points"
+TRUTH_TOPIC = "/truth/pose"
+BODY_TOPIC = "/truth/body"
+FAULT_TOPIC = "/faults"
 CAMERA_TOPIC = "/camera/pose"
-CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"
+CAMERA_FRAME = "camera"
+TARGET_FRAME = "target"
+BODY_FRAME = "target_body"
+ROOT_FRAME = "map"
 LIBRARY = "avsreplay"
-_TYPES = {
+_TOPIC_TYPES = {
     CLOUD_TOPIC: "sensor_msgs/msg/PointCloud2",
     TRUTH_TOPIC: "geometry_msgs/msg/PoseStamped",
     BODY_TOPIC: "nav_msgs/msg/Odometry",
@@ -354,7 +355,7 @@ class LogWriter:
 
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
-            kind = _TYPES[topic]
+            kind = _TOPIC_TYPES[topic]
             schema = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
             qos = {"offered_qos_profiles": _LATCHED if topic == "/tf_static" else ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, qos)

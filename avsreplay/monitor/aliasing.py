@@ -18,10 +18,11 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 
-MOST_TURN_RAD = 2.0  # between two poses: less is far enough from half a turn for any tumbling body
+# Turn between two poses: less is far enough from half a turn for any tumbling body.
+MAX_UNIQUE_TURN_RAD = 2.0
 ALIKE_RAD = 0.35  # the other rate differs at no pose by more than this, so that none excludes it
-KEPT = 32  # poses that are compared
-FEWEST = 6  # turns from pose to pose whose median counts
+COMPARED_POSES = 32  # poses that are compared
+LEAST_TURNS = 6  # turns from pose to pose whose median counts
 # Interquartile range of these turns; that of poses that have nothing to do with one another is 1.0
 MOST_SPREAD_RAD = 0.7
 
@@ -43,7 +44,9 @@ class Turns:
             t_ns: its instant [ns].
             q: (4,) its attitude.
         """
-        return Turns((*self.t_ns, t_ns)[-KEPT:], frozen(np.vstack([self.q, q])[-KEPT:]))
+        return Turns(
+            (*self.t_ns, t_ns)[-COMPARED_POSES:], frozen(np.vstack([self.q, q])[-COMPARED_POSES:])
+        )
 
 
 def two_rates(turns: Turns) -> tuple[float, float] | None:
@@ -59,12 +62,12 @@ def two_rates(turns: Turns) -> tuple[float, float] | None:
     period = float(spans[spans > 0.0].min())
     number = spans / period
     single = np.round(number) == 1.0
-    if np.count_nonzero(single) < FEWEST:
+    if np.count_nonzero(single) < LEAST_TURNS:
         return None
     q = turns.q
     angles = geometry.angle(geometry.multiply(geometry.conjugate(q[:-1]), q[1:]))[single]
     low, turn, high = np.quantile(angles, (0.25, 0.5, 0.75)).tolist()
-    if turn <= MOST_TURN_RAD or high - low > MOST_SPREAD_RAD:
+    if turn <= MAX_UNIQUE_TURN_RAD or high - low > MOST_SPREAD_RAD:
         return None
     if 2.0 * math.pi * float(np.abs(number - np.round(number)).max()) > ALIKE_RAD:
         return None

@@ -23,8 +23,8 @@ from avsreplay.monitor.chi_square import mean_band
 from avsreplay.records import BLOCKS, UNLIKELY, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
-KEPT = 2.0  # a flight goes on up to this multiple of the error with which it may begin
-_NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
+ABORT_ERROR_RATIO = 2.0  # a flight goes on up to this multiple of the error with which it may begin
+_MAX_SIGMA_RATIO = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ def violations(
     claimed, measured = pose_covariance.diagonal().tolist(), R.diagonal().tolist()
     blocks = (slice(0, 3), float(inflation[1])), (slice(3, 6), float(inflation[0]))
     if not all(
-        sum(claimed[b]) <= max(factor, 1.0) * _NOT_WORSE**2 * sum(measured[b])
+        sum(claimed[b]) <= max(factor, 1.0) * _MAX_SIGMA_RATIO**2 * sum(measured[b])
         for b, factor in blocks
     ):
         found.append("worse_than_measured")
@@ -338,13 +338,15 @@ class Convergence:
                 a limit, convergence is not claimed. The dwell goes on: once later scans exclude the
                 change, the test has held.
             flown: a plan is flown: further scans will arrive before the capture, so that the
-                flight is given up only where the error is ``KEPT`` times as large.
+                flight is given up only where the error is ``ABORT_ERROR_RATIO`` times as large.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(
             name for name, limit in self._limits.items() if not one_sigma[name] <= limit
         )
-        predictive = forecast is not None and self.ratio(forecast) <= (KEPT if flown else 1.0)
+        predictive = forecast is not None and self.ratio(forecast) <= (
+            ABORT_ERROR_RATIO if flown else 1.0
+        )
         printed = (
             self.params.criterion is Criterion.COVARIANCE
         )  # the paper's test looks at the covariance only
@@ -352,7 +354,11 @@ class Convergence:
         if not holds:
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
         since = belief.t_ns if track.since_ns is None else track.since_ns
-        excluded = possible is None or printed or self.ratio(possible) <= (KEPT if flown else 1.0)
+        excluded = (
+            possible is None
+            or printed
+            or self.ratio(possible) <= (ABORT_ERROR_RATIO if flown else 1.0)
+        )
         converged = excluded and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)

@@ -21,13 +21,13 @@ from avsreplay.reconstruct.tracking import FreeMotion
 from avsreplay.reconstruct.views import averaged, point_tree
 from avsreplay.records import BLOCKS, Surface
 
-PATCH = 0.04  # radius of a grasp patch as a share of the extent
-APPROACH = np.cos(
+PATCH_RADIUS_OF_EXTENT = 0.04  # radius of a grasp patch as a share of the extent
+APPROACH_COSINE = np.cos(
     np.radians(20.0)
 )  # cosine of the half-angle of the cone about the outward normal that must be free
-MOST_REGIONS = 10
-FEWEST_IN_REGION = 10  # least number of points of a region
-FEWEST_EMPTY = 3.0  # least number of scans without a return from a surface that they faced
+MAX_REGIONS = 10
+LEAST_REGION_POINTS = 10  # least number of points of a region
+LEAST_EMPTY_SCANS = 3.0  # least number of scans without a return from a surface that they faced
 
 
 @value_class
@@ -132,7 +132,7 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
         raise UsageError(
             f"the grasp point is {distance:.3f} m from the surface", where="--grasp", hint=hint
         )
-    index = tree.query_ball_point(made.points[nearest], PATCH * made.extent)
+    index = tree.query_ball_point(made.points[nearest], PATCH_RADIUS_OF_EXTENT * made.extent)
     x = _unit(made.normals[index].mean(axis=0))
     y = _unit(np.cross([0.0, 0.0, 1.0] if abs(x[2]) < 0.9 else [1.0, 0.0, 0.0], x))
     T_old_new = Pose(
@@ -156,7 +156,9 @@ def _flattest(made: Reconstruction) -> Array:
     scans = np.bincount(cell, made.scans) / np.bincount(cell)
     chosen = np.flatnonzero(scans >= np.median(scans))
     chosen = chosen[:: max(1, len(chosen) // 4000)]
-    near: Any = cKDTree(points).query_ball_point(points[chosen], PATCH * made.extent)
+    near: Any = cKDTree(points).query_ball_point(
+        points[chosen], PATCH_RADIUS_OF_EXTENT * made.extent
+    )
     full = np.median([len(k) for k in near])
     flat = np.array(
         [float(np.linalg.norm(normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near]
@@ -172,8 +174,8 @@ def _reachable(points: Array, extent: float, at: Array, normal: Array) -> bool:
     """Whether the cone about the outward normal is free of points of the model."""
     away = points - at
     distance = np.linalg.norm(away, axis=1)
-    inside = (distance > PATCH * extent) & (distance < 0.5 * extent)
-    return not bool(np.any(away[inside] @ _unit(normal) > APPROACH * distance[inside]))
+    inside = (distance > PATCH_RADIUS_OF_EXTENT * extent) & (distance < 0.5 * extent)
+    return not bool(np.any(away[inside] @ _unit(normal) > APPROACH_COSINE * distance[inside]))
 
 
 def _unit(v: Array) -> Array:
@@ -329,9 +331,7 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     regions = _regions("added", p_m[extra], signed[extra], made.spacing_m)
     for kind, found_m, away in _missing(made, cad, T_mc, tolerance):
         regions += _regions(kind, found_m, -away, made.spacing_m)
-    largest = tuple(
-        sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MOST_REGIONS]
-    )
+    largest = tuple(sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MAX_REGIONS])
     return Deviations(T_mc, signed, most, ratio, median, float(np.quantile(known, 0.95)), largest)
 
 
@@ -363,17 +363,20 @@ def _missing(
     for sight in made.sights if far.any() else ():
         through += sight.seen_through(p_c[far], 1.5 * made.spacing_m) > 6.0 * made.spacing_m
         empty += sight.without_return(p_c[far], normals, 3.0 * made.spacing_m)
-    kinds = (("missing", through >= 2.0), ("no_return", (empty >= FEWEST_EMPTY) & (through < 2.0)))
+    kinds = (
+        ("missing", through >= 2.0),
+        ("no_return", (empty >= LEAST_EMPTY_SCANS) & (through < 2.0)),
+    )
     return [(kind, p_m[far][which], away[far][which]) for kind, which in kinds]
 
 
 def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list[Region]:
     """Groups of points closer together than three voxels."""
-    if len(points) < FEWEST_IN_REGION:
+    if len(points) < LEAST_REGION_POINTS:
         return []
     group = point_tree(points).groups(3.0 * voxel_m)
     found = []
-    for k in np.flatnonzero(np.bincount(group) >= FEWEST_IN_REGION):
+    for k in np.flatnonzero(np.bincount(group) >= LEAST_REGION_POINTS):
         p, known = points[group == k], deviation[group == k]
         known = known[np.isfinite(known)]
         middle = float(np.median(known)) if len(known) else float("nan")

@@ -26,7 +26,7 @@ import numpy as np
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.fusion import (
-    MISSED,
+    MISSED_SHARE,
     all_poses,
     contradicting,
     fused,
@@ -72,15 +72,14 @@ __all__ = [
 ]
 
 # below this ratio of the eigenvalues of a registration, a surface leaves three directions open
-WEAKEST = 1e-3
+WEAKEST_EIGENVALUE_RATIO = 1e-3
 # free motion replaces the refined poses if it increases the rms between scans by no more than this
-AS_WELL = 1.01
+MAX_RMS_RATIO = 1.01
 STILL_RAD = np.radians(5.0)  # a target that turned by less is at rest
-MOST_ROUNDS = (
-    6  # times views that contradict the others are left out and the poses are refined again
-)
-CONFIRMING = 10  # fewest poses that test the 20 parameters of a free motion
-MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
+# times views that contradict the others are left out and the poses are refined again
+MAX_REFINEMENT_ROUNDS = 6
+LEAST_CONFIRMING_POSES = 10  # fewest poses that test the 20 parameters of a free motion
+MAX_FUSED_SCANS = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
 
@@ -97,7 +96,7 @@ class Assembly:
         rms: of the distances between the views [m].
         gate: largest distance that counted [m].
         missed: share of the surface in the direction of each view that contradicts it.
-        refuted: whether views contradict one another after MOST_ROUNDS.
+        refuted: whether views contradict one another after MAX_REFINEMENT_ROUNDS.
         left_out: number of views that were left out.
     """
 
@@ -151,7 +150,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
             found.views, fine, motion, found.gate, p.thin * survey.extent, survey.extent
         )
         poses = _on_motion(found, motion)
-    chosen = evenly(sorted(poses), MOST_FUSED)
+    chosen = evenly(sorted(poses), MAX_FUSED_SCANS)
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
     points, normals, one_sigma_m, seen, sights = fused(
         surveyed_scans(scans, survey),
@@ -264,13 +263,13 @@ def _assembled(
     left out.
     """
     left_out = 0
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_REFINEMENT_ROUNDS):
         better, keys, rms, gate = refined(views, tracked, p, extent)
         poses = all_poses(better, tracked, keys, p, extent)
         used = sorted(poses)
         motion = free_motion([views[k].t_ns for k in used], [poses[k] for k in used], extent)
         wrong, shares = contradicting(better, poses, p, extent)
-        tested = motion is not None and motion.agrees.sum() >= CONFIRMING
+        tested = motion is not None and motion.agrees.sum() >= LEAST_CONFIRMING_POSES
         missed = shares[:, 0 if tested or not tracked.searched else 1]
         if not wrong and refuted(missed):
             wrong = [used[int(np.argmax(missed))]]
@@ -284,14 +283,14 @@ def _assembled(
 
 def _refuse_contradictions(found: Assembly) -> None:
     if found.refuted:
-        count = int((found.missed > MISSED).sum())
+        count = int((found.missed > MISSED_SHARE).sum())
         what = (
             f"the scans contradict one another at every pose that was found: {count} of"
             f" {len(found.missed)} scans"
         )
         what += (
-            f" do not show more than {100.0 * MISSED:.0f} % of the surface that the others show in"
-            " their direction"
+            f" do not show more than {100.0 * MISSED_SHARE:.0f} % of the surface that the others"
+            " show in their direction"
         )
         hint = (
             "steps between scans are too large, or other objects are in view: record more scans, or"
@@ -334,7 +333,7 @@ def _on_motion(found: Assembly, motion: FreeMotion) -> dict[int, Pose]:
     before, after = (
         pair_rms(found.views, {k: at[k] for k in keys}, found.gate) for at in (found.keys, moved)
     )
-    return moved if after < AS_WELL * before else found.poses
+    return moved if after < MAX_RMS_RATIO * before else found.poses
 
 
 def _refuse_undetermined(turned: float, weakest: Sequence[float]) -> None:
@@ -342,7 +341,7 @@ def _refuse_undetermined(turned: float, weakest: Sequence[float]) -> None:
     drifts by degrees.
     """
     what = f"the scans show a turn of {np.degrees(turned):.1f} deg only: the target is at rest"
-    if float(np.median(weakest)) < WEAKEST:
+    if float(np.median(weakest)) < WEAKEST_EIGENVALUE_RATIO:
         what = "the surface of the target does not determine its attitude, as that of a sphere"
     elif turned >= STILL_RAD:
         return

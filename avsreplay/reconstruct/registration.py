@@ -18,20 +18,19 @@ from avsreplay.reconstruct.views import ScanView, sight_lines
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
 
-SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
-MOST_POINTS = 1500  # points of a scan in one registration
-COARSE_POINTS, COARSE_PASSES, HALVED = (
-    200,
-    8,
-    (2, 4, 5),
-)  # search over attitudes: points, passes, halving passes
+SAME_SIDE_COSINE = 0.5  # least cosine between the normals of two corresponding points
+REGISTERED_POINTS = 1500  # points of a scan in one registration
+# Search over attitudes.
+ATTITUDE_SEARCH_POINTS = 200
+ATTITUDE_SEARCH_PASSES = 8
+HALVING_PASSES = (2, 4, 5)  # passes after which the worse half of the attitudes is dropped
 PAIR_TURN_RAD = np.radians(
     90.0
 )  # key scans seen from directions closer than this are compared in the refinement
-PAIRS = 12  # most key scans with which one is compared
+COMPARED_KEY_SCANS = 12  # most key scans with which one is compared
 PAIR_POINTS = 600  # points of a scan in one comparison
-FEWEST_COMMON = 30  # points that two scans must share to be compared
-FINE_STARTS = 6  # poses of a search that are registered with all points
+LEAST_COMMON_POINTS = 30  # points that two scans must share to be compared
+REFINED_ATTITUDES = 6  # poses of a search that are registered with all points
 
 
 @value_class
@@ -69,6 +68,14 @@ def registered(
 ) -> Match:
     """Point-to-plane ICP of a view on the model, with Tukey's weights whose scale follows the
     residuals.
+
+    Args:
+        view: the view.
+        model: the model so far.
+        guess: T_ac at which the search begins.
+        reach_m: largest distance of corresponding points at first [m].
+        extent: diameter of the target [m].
+        passes: largest number of passes.
     """
     T_ca, gate = guess.inverse(), reach_m
     ratio = rms = weakest = 0.0
@@ -93,12 +100,12 @@ def _normal_equations(
     """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m],
     and their share.
     """
-    every = max(1, len(view.points) // MOST_POINTS)
+    every = max(1, len(view.points) // REGISTERED_POINTS)
     p, n_view = T_ca.apply(view.points[::every]), view.normals[::every] @ T_ca.R.T
     distance, nearest = model.tree.query(p, most_m=gate)
     near = np.isfinite(distance[:, 0])
     index = np.where(near, nearest[:, 0], 0)
-    near &= np.einsum("ni,ni->n", n_view, model.normals[index]) > SAME_SIDE
+    near &= np.einsum("ni,ni->n", n_view, model.normals[index]) > SAME_SIDE_COSINE
     p, q, n = p[near], model.points[index[near]], between(n_view[near], model.normals[index[near]])
     e = np.einsum("ni,ni->n", n, q - p)
     w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2
@@ -129,18 +136,23 @@ def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
 
 
 def moved(T_ca: Pose, step: Array) -> Pose:
-    """The pose after a step [theta; v] in {C} [rad, m]."""
+    """The pose after a step [theta; v] in {C} [rad, m].
+
+    Args:
+        T_ca: the pose of {A} in {C}.
+        step: rotation vector and displacement (6,) in {C} [rad, m].
+    """
     return Pose(geometry.exp(step[:3]), step[3:]) @ T_ca
 
 
 def best_starts(
     view: ScanView, model: Patchwork, attitudes: Array, gate_m: float, extent: float
 ) -> list[Pose]:
-    """Return the FINE_STARTS poses with most points on the model, after a few passes from every
-    attitude, all at once.
+    """Return the REFINED_ATTITUDES poses with most points on the model, after a few passes from
+    every attitude, all at once.
 
-    A part of the points is registered; after the passes HALVED the worse half of the poses is left
-    out.
+    A part of the points is registered; after the passes HALVING_PASSES the worse half of the poses
+    is left out.
 
     Args:
         view: the scan.
@@ -151,12 +163,12 @@ def best_starts(
         extent: of the target [m].
     """
     R_ac = geometry.matrix(attitudes)
-    every = max(1, len(view.points) // COARSE_POINTS)
+    every = max(1, len(view.points) // ATTITUDE_SEARCH_POINTS)
     points, normals, centre = view.points[::every], view.normals[::every], view.points.mean(axis=0)
     R, t = R_ac.transpose(0, 2, 1), _visible_centres(model, R_ac, view.camera - centre)  # T_ca
     t = t - R @ centre
     gate, scale = np.full(len(R), gate_m), np.array([1.0 / extent] * 3 + [1.0] * 3)
-    for number in range(COARSE_PASSES):
+    for number in range(ATTITUDE_SEARCH_PASSES):
         p, n = points @ R.transpose(0, 2, 1) + t[:, None], normals @ R.transpose(0, 2, 1)
         d, index = (
             found.reshape(p.shape[:2])
@@ -165,7 +177,7 @@ def best_starts(
         near = np.isfinite(d) & (d < gate[:, None])
         index = np.where(near, index, 0)
         other = model.normals[index]
-        near &= np.einsum("mki,mki->mk", n, other) > SAME_SIDE
+        near &= np.einsum("mki,mki->mk", n, other) > SAME_SIDE_COSINE
         both = n + other
         along = both / np.maximum(np.linalg.norm(both, axis=2, keepdims=True), 1e-12)
         e = np.where(near, np.einsum("mki,mki->mk", along, model.points[index] - p), np.nan)
@@ -187,17 +199,17 @@ def best_starts(
         tighter = 3.0 * 1.4826 * np.nanmedian(np.where(few[:, None], gate_m, np.abs(e)), axis=1)
         gate = np.minimum(gate, np.maximum(tighter, 0.01 * extent))
         best = np.argsort(-shown, kind="stable")
-        if number in HALVED:
-            kept = best[: max(FINE_STARTS, len(best) // 2)]
+        if number in HALVING_PASSES:
+            kept = best[: max(REFINED_ATTITUDES, len(best) // 2)]
             R, t, gate, best = R[kept], t[kept], gate[kept], np.arange(len(kept))
-    return [Pose(geometry.quaternion(R[m]), t[m]).inverse() for m in best[:FINE_STARTS]]
+    return [Pose(geometry.quaternion(R[m]), t[m]).inverse() for m in best[:REFINED_ATTITUDES]]
 
 
 def _visible_centres(model: Patchwork, R_ac: Array, towards: Array) -> Array:
     """Centre (m, 3) of the side of the model that faces the camera in the direction ``towards``,
     for every attitude.
     """
-    every = max(1, len(model.points) // MOST_POINTS)
+    every = max(1, len(model.points) // REGISTERED_POINTS)
     points, normals = model.points[::every], model.normals[::every]
     facing = (normals @ (R_ac.transpose(0, 2, 1) @ towards).T > 0.0).T
     facing |= facing.sum(axis=1, keepdims=True) < 0.01 * len(points)
@@ -223,7 +235,13 @@ def _axes() -> list[Array]:
 
 
 def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:
-    """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
+    """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m].
+
+    Args:
+        views: the views, in order of time.
+        poses: T_ac by number of the view.
+        gate: largest distance of corresponding points [m].
+    """
     keys = sorted(poses)
     T_ca = [poses[k].inverse() for k in keys]
     return Pairing([views[k] for k in keys], T_ca, PAIR_POINTS, 0.0).equations(T_ca, gate)[3]
@@ -276,7 +294,7 @@ class Pairing:
         p = np.vstack([T.apply(view.points) for view, T in zip(views, poses, strict=True)])
         n = np.vstack([view.normals @ T.R.T for view, T in zip(views, poses, strict=True)])
         self._search(p, n, first, poses, gate)
-        used = np.array([len(own) >= FEWEST_COMMON for own, _ in self._found], dtype=bool)
+        used = np.array([len(own) >= LEAST_COMMON_POINTS for own, _ in self._found], dtype=bool)
         if not used.any():
             return np.eye(6 * count), np.zeros(6 * count), np.zeros(1), 0.0
         found = [pair for pair, good in zip(self._found, used, strict=True) if good]
@@ -311,7 +329,7 @@ class Pairing:
             d, index = self._views[j].tree.query(to_j.apply(p[own]), most_m=gate)
             near = np.isfinite(d[:, 0])
             own, other = own[near], first[j] + index[near, 0]
-            same = np.einsum("ni,ni->n", n[own], n[other]) > SAME_SIDE
+            same = np.einsum("ni,ni->n", n[own], n[other]) > SAME_SIDE_COSINE
             self._at[number], self._found[number] = at, (own[same], other[same])
 
 
@@ -329,6 +347,7 @@ def overlapping(views: Sequence[ScanView], poses: Sequence[Pose]) -> NDArray[np.
         ]
         if order:
             found += [
-                (i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())
+                (i, order[int(k)])
+                for k in np.unique(np.linspace(0, len(order) - 1, COMPARED_KEY_SCANS).round())
             ]
     return np.array(found, dtype=np.int64).reshape(-1, 2)

@@ -32,8 +32,8 @@ from avsreplay.records import BLOCKS, State
 from avsreplay.register import sampling
 
 MOTION_POSES = 8  # fewest poses to which free motion is fitted
-MOTION_SHARE = 0.7  # share of the poses that must agree with it
-MOTION_RMS = 0.01  # largest deviation of these on the surface, as a share of the extent
+LEAST_AGREEING_POSES_SHARE = 0.7  # share of the poses that must agree with it
+MOTION_RMS_OF_EXTENT = 0.01  # largest deviation of these on the surface, as a share of the extent
 
 
 @value_class
@@ -53,11 +53,19 @@ class FreeMotion:
     rms: tuple[float, float]
 
     def state_at(self, t_ns: int) -> State:
-        """The state at an instant."""
+        """The state at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         return propagate_state(self.state, (t_ns - self.epoch_ns) * 1e-9)[0]
 
     def at(self, t_ns: int) -> Pose:
-        """The pose T_ac at an instant."""
+        """The pose T_ac at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         return self.state_at(t_ns).T_ac
 
     def pose_jacobian(
@@ -84,7 +92,11 @@ class FreeMotion:
         return J, np.diag(prior.one_sigma**-2.0)
 
     def twist_at(self, t_ns: int) -> Twist:
-        """Pose, rate in {C} and velocity of {C} in {A} at an instant."""
+        """Pose, rate in {C} and velocity of {C} in {A} at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         x = self.state_at(t_ns)
         return Twist(x.T_ac, geometry.matrix(x.q_bc).T @ x.w_b, x.fixture_velocity)
 
@@ -106,21 +118,22 @@ def free_motion(t_ns: Sequence[int], poses: Sequence[Pose], extent: float) -> Fr
         extent: of the target [m].
 
     Returns:
-        The motion, or None if the poses are too few or do not follow one: at least MOTION_SHARE of
-        them must agree, and those must deviate by less than MOTION_RMS of the extent on the
-        surface. A turntable that is turned by hand, or scans without real instants, do not.
+        The motion, or None if the poses are too few or do not follow one: at least
+        LEAST_AGREEING_POSES_SHARE of them must agree, and those must deviate by less than
+        MOTION_RMS_OF_EXTENT of the extent on the surface. A turntable that is turned by hand, or
+        scans without real instants, do not.
     """
     if len(poses) < MOTION_POSES or np.diff(t_ns).min() <= 0:
         return None
     fitted = free_fit(t_ns, poses, None, extent)
     agrees = np.asarray(fitted.weights > 0.5)
-    if agrees.mean() < MOTION_SHARE:
+    if agrees.mean() < LEAST_AGREEING_POSES_SHARE:
         return None
     squares = np.square(fitted.d[agrees])
     angle, distance = (
         float(np.sqrt(squares[:, k].sum(axis=1).mean())) for k in (slice(0, 3), slice(3, 6))
     )
-    if not np.hypot(0.5 * extent * angle, distance) < MOTION_RMS * extent:
+    if not np.hypot(0.5 * extent * angle, distance) < MOTION_RMS_OF_EXTENT * extent:
         return None
     return FreeMotion(fitted.x, fitted.P, t_ns[0], agrees, (angle, distance))
 
@@ -130,6 +143,11 @@ def twists(
 ) -> dict[int, Twist]:
     """Motion of the target at every view that has a pose: of the free motion, else from its
     neighbours' poses.
+
+    Args:
+        t_ns: stamp of each view [ns].
+        poses: T_ac by number of the view.
+        motion: the free motion; None where there is none.
     """
     known = sorted(poses)
     found = {}
@@ -144,29 +162,28 @@ def twists(
     return found
 
 
-KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
-MOST_SHIFT = (
-    0.4  # largest distance of the target's centre from its prediction, as a share of the extent
-)
+LEAST_ON_MODEL_SHARE = 0.4  # share of the points of a scan that must lie on the model so far
+# largest distance of the target's centre from its prediction, as a share of the extent
+MAX_SHIFT_OF_EXTENT = 0.4
 SHIFT_PER_LOST = 0.01  # increase of that share with every scan that was lost before
-LEAST_EXPLAINED = 0.15  # share of the model's visible side that a scan must show
+LEAST_VISIBLE_SHARE = 0.15  # share of the model's visible side that a scan must show
 # share of points that may lie in the free space in front of what another view has measured
-MOST_VIOLATING = 0.12
+MAX_FREE_SPACE_SHARE = 0.12
 GRAZING = np.cos(
     np.radians(70.0)
 )  # least cosine of the inclination to a line of sight for a test of free space
-MOST_TESTED = 600  # points of a scan in one test of free space
-SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
+FREE_SPACE_POINTS = 600  # points of a scan in one test of free space
+# while the target is lost, all attitudes are searched for two scans of this many
+SEARCH_PERIOD_SCANS = 6
 LARGE_STEP_RAD = np.radians(
     30.0
 )  # a registration after a larger step may end at another pose of a similar side
-MOST_CONFIRMED = (
-    6  # scans whose poses are not certain that are searched again in the complete model
-)
+# scans whose poses are not certain that are searched again in the complete model
+MAX_CONFIRMED_SCANS = 6
 # such a pose is ambiguous if another one explains this share of the points that it explains
-RIVAL = 0.8
+RIVAL_SHARE = 0.8
 DISTINCT_RAD = np.radians(60.0)  # starts nearer to the pose mostly lead back to it
-MOST_RETRIES = 20  # lost scans that are tried again at the end
+MAX_RETRIED_SCANS = 20  # lost scans that are tried again at the end
 KEY_TURN_RAD = np.radians(
     7.0
 )  # a scan seen from a direction that differs by this from all key scans becomes one
@@ -212,6 +229,11 @@ class Tracked:
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
     """Register every view against the model that the key views before it give; then try the
     lost ones once more.
+
+    Args:
+        views: the views, in order of time.
+        p: the parameters of the reconstruction.
+        extent: diameter of the target [m].
     """
     origin = views[0].points.mean(axis=0)
     found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], [], 0, [])
@@ -220,13 +242,18 @@ def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> 
         model = _tracked(views, found, k, model, p, extent)
     lost = [k for k in range(len(views)) if k not in found.poses]
     found.lost = 0
-    for k in lost[:: max(1, -(-len(lost) // MOST_RETRIES))]:
+    for k in lost[:: max(1, -(-len(lost) // MAX_RETRIED_SCANS))]:
         model = _tracked(views, found, k, model, p, extent)
     return found
 
 
 def without(found: Tracked, wrong: Sequence[int]) -> Tracked:
-    """The result of tracking without the views that have these numbers."""
+    """The result of tracking without the views that have these numbers.
+
+    Args:
+        found: the result of tracking.
+        wrong: numbers of the views that are left out.
+    """
     poses = {k: T for k, T in found.poses.items() if k not in wrong}
     return replace(found, poses=poses, keys=[k for k in found.keys if k in poses])
 
@@ -274,17 +301,18 @@ def _accepted(
     The target must also be near its predicted position, because another object in front of it fits
     to some flat side.
     """
-    if match.ratio < KEEP_RATIO or match.rms_m > 0.01 * extent:
+    if match.ratio < LEAST_ON_MODEL_SHARE or match.rms_m > 0.01 * extent:
         return False
     centre = model.points.mean(axis=0)
     shift = float(np.linalg.norm(match.T_ac.apply(centre) - guess.apply(centre)))
-    if shift > (MOST_SHIFT + SHIFT_PER_LOST * found.lost) * extent:
+    if shift > (MAX_SHIFT_OF_EXTENT + SHIFT_PER_LOST * found.lost) * extent:
         return False
-    if _explained(views[k], model, match.T_ac, extent) < LEAST_EXPLAINED:
+    if _explained(views[k], model, match.T_ac, extent) < LEAST_VISIBLE_SHARE:
         return False
     near = sorted(found.keys, key=lambda j: turn(found.poses[j], match.T_ac))[:3]
     return all(
-        _violation(views, found.poses[j], match.T_ac, j, k, extent) < MOST_VIOLATING for j in near
+        _violation(views, found.poses[j], match.T_ac, j, k, extent) < MAX_FREE_SPACE_SHARE
+        for j in near
     )
 
 
@@ -314,7 +342,7 @@ def _violation(
     shares = []
     for a, T_a, b, T_b in ((views[k], T_k, views[j], T_j), (views[j], T_j, views[k], T_k)):
         T_ba = T_b @ T_a.inverse()
-        every = max(1, len(a.points) // MOST_TESTED)
+        every = max(1, len(a.points) // FREE_SPACE_POINTS)
         p, n = (
             T_ba.apply(a.points[::every]),
             a.normals[::every] @ T_ba.R.T,
@@ -341,7 +369,7 @@ def _searched(
     all attitudes.
     """
     turned = [near_attitudes(guess.q)]
-    if found.lost % SEARCH_EVERY < 2:
+    if found.lost % SEARCH_PERIOD_SCANS < 2:
         turned.append(sampling.attitudes(400))
     for attitudes in turned:
         for start in best_starts(views[k], model, attitudes, 2.0 * p.reach * extent, extent):
@@ -374,11 +402,11 @@ def ambiguous(
     ]
     if not known:
         return False
-    known = known[:: max(1, -(-len(known) // MOST_CONFIRMED))]
+    known = known[:: max(1, -(-len(known) // MAX_CONFIRMED_SCANS))]
     model, count = patchwork(views, replace(found, keys=used), p.thin * extent), 0
     for k in known:
         own = found.poses[k]
-        least = RIVAL * registered(views[k], model, own, p.reach * extent, extent).ratio
+        least = RIVAL_SHARE * registered(views[k], model, own, p.reach * extent, extent).ratio
         others = [q for q in sampling.attitudes(400) if turn(Pose(q, own.t), own) > DISTINCT_RAD]
         starts = best_starts(views[k], model, np.array(others), 2.0 * p.reach * extent, extent)
         fine = [registered(views[k], model, start, p.reach * extent, extent) for start in starts]
@@ -394,7 +422,13 @@ def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
 
 
 def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patchwork:
-    """The model that the key views give, averaged over voxels of the given size."""
+    """The model that the key views give, averaged over voxels of the given size.
+
+    Args:
+        views: the views, in order of time.
+        found: the result of tracking.
+        size_m: edge of a voxel [m].
+    """
     each = [(found.poses[k].inverse(), views[k]) for k in found.keys]
     points, normals = (
         [T.apply(view.points) for T, view in each],

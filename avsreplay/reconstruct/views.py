@@ -15,19 +15,18 @@ from avsreplay.records import Scan
 from avsreplay.register.sampling import at_instant
 from avsreplay.register.surface_index import kernel_module
 
-SAMPLE = 24  # most scans from which extent and position of the camera are determined
-NEIGHBOURS = 12  # nearest points from which a normal is estimated
-ISOLATED = (
-    4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
-)
+SURVEYED_SCANS = 24  # most scans from which extent and position of the camera are determined
+NORMAL_NEIGHBOURS = 12  # nearest points from which a normal is estimated
+# a point is isolated if its fourth neighbour is farther than this many times the median
+ISOLATED_DISTANCE_RATIO = 4.0
 # points closer than this many times the typical distance of the fourth neighbour belong together
-LINK = 2.0
-SMALL_GROUP = 0.02  # a group with a smaller share of the points does not count for the extent
+LINK_DISTANCE_RATIO = 2.0
+SMALL_GROUP_SHARE = 0.02  # a group with a smaller share of the points does not count for the extent
 SIDES = np.array(
     [0.61, 0.53, 0.59]
 )  # the two sides of a thin wall have normals of opposite sign along this direction
 # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
-FAR_OF_EXTENT = 0.6
+ORIGIN_DISTANCE_OF_EXTENT = 0.6
 
 
 @value_class
@@ -85,7 +84,7 @@ class Twist:
 
 
 def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: int) -> Survey:
-    """Read all scans once; at most SAMPLE of them are in memory at a time.
+    """Read all scans once; at most SURVEYED_SCANS of them are in memory at a time.
 
     Args:
         scans: gives the scans of the log from its begin each time it is called.
@@ -101,7 +100,7 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
             continue
         if len(usable) % stride == 0:
             kept.append(scan)
-        if len(kept) > SAMPLE:
+        if len(kept) > SURVEYED_SCANS:
             kept, stride = kept[::2], 2 * stride
         usable.append(offered - 1)
     chosen = tuple(usable[:: max(1, -(-len(usable) // n_scans))])
@@ -117,13 +116,23 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
 
 
 def surveyed_scans(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
-    """The scans that are used, in order."""
+    """The scans that are used, in order.
+
+    Args:
+        scans: gives all scans of the log anew.
+        survey: which of them are used.
+    """
     chosen = frozenset(survey.chosen)
     return (scan for place, scan in enumerate(scans()) if place in chosen)
 
 
 def full_cloud(scan: Scan, twist: Twist | None) -> Array:
-    """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp."""
+    """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp.
+
+    Args:
+        scan: the scan.
+        twist: motion of the target during it; None for a target at rest.
+    """
     points = np.asarray(scan.points, dtype=np.float64)
     return _connected(
         points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist)
@@ -166,7 +175,12 @@ def point_tree(points: Array) -> Any:
 
 
 def spacings(tree: Any, points: Array) -> Array:
-    """Distance of each point (n, 3) of a tree to its fourth neighbour (n,) [m]."""
+    """Distance of each point (n, 3) of a tree to its fourth neighbour (n,) [m].
+
+    Args:
+        tree: k-d tree of the points.
+        points: (n, 3) [m].
+    """
     return np.asarray(tree.query(points, k=5)[0][:, 4])
 
 
@@ -181,24 +195,24 @@ def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
 
 
 def _connected(points: Array) -> Array:
-    """The points without isolated ones: the fourth neighbour is farther away than ISOLATED
-    times the median.
+    """The points without isolated ones: the fourth neighbour is farther away than
+    ISOLATED_DISTANCE_RATIO times the median.
     """
     distance = spacings(point_tree(points), points)
-    return np.asarray(points[distance < ISOLATED * np.median(distance)])
+    return np.asarray(points[distance < ISOLATED_DISTANCE_RATIO * np.median(distance)])
 
 
 def extent_of(points: Array) -> float:
     """Return the diagonal [m] of the box around a target, from one scan of it that may contain
     scattered outliers.
 
-    Points are grouped where they lie closer together than LINK times the typical spacing; groups of
-    less than SMALL_GROUP of all points are left out. A box around all points would grow to the
-    range limits of the scanner.
+    Points are grouped where they lie closer together than LINK_DISTANCE_RATIO times the typical
+    spacing; groups of less than SMALL_GROUP_SHARE of all points are left out. A box around all
+    points would grow to the range limits of the scanner.
     """
     tree = point_tree(points)
-    group = tree.groups(LINK * max(float(np.median(spacings(tree, points))), 1e-9))
-    large = np.bincount(group)[group] >= SMALL_GROUP * len(points)
+    group = tree.groups(LINK_DISTANCE_RATIO * max(float(np.median(spacings(tree, points))), 1e-9))
+    large = np.bincount(group)[group] >= SMALL_GROUP_SHARE * len(points)
     return geometry.bounding_diagonal(points[large] if large.any() else points)
 
 
@@ -214,7 +228,7 @@ def _camera(clouds: Sequence[Array]) -> Array:
     """
     extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
-    if np.median(distances) > FAR_OF_EXTENT * np.median(extents):
+    if np.median(distances) > ORIGIN_DISTANCE_OF_EXTENT * np.median(extents):
         return np.zeros(3)
     scatter, sides = np.zeros((3, 3)), []
     for points, extent in zip(clouds, extents, strict=True):
@@ -230,6 +244,10 @@ def _camera(clouds: Sequence[Array]) -> Array:
 def central_points(points: Array, size_m: float) -> Array:
     """The point nearest to the mean of each voxel: a measured point, because a mean lies
     inside a curved surface.
+
+    Args:
+        points: (n, 3) [m].
+        size_m: edge of a voxel [m].
     """
     cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
@@ -241,6 +259,11 @@ def central_points(points: Array, size_m: float) -> Array:
 def cell_of(points: Array, size_m: float, normals: Array | None = None) -> NDArray[np.intp]:
     """Number (n,) of the occupied voxel of every point; with normals the two sides of a thin
     wall are distinguished.
+
+    Args:
+        points: (n, 3) [m].
+        size_m: edge of a voxel [m].
+        normals: unit normals (n, 3).
     """
     place = np.floor(points / size_m).astype(np.int64)
     place -= place.min(axis=0)
@@ -266,6 +289,11 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
     """Return mean points and unit normals (m, 3) of the voxels, and the voxel (n,) of every point.
 
     The two sides of a thin wall, which have opposite normals, are averaged separately.
+
+    Args:
+        points: (n, 3) [m].
+        normals: unit normals (n, 3).
+        size_m: edge of a voxel [m].
     """
     cell = cell_of(points, size_m, normals)
     mean, normal = means(points, cell), means(normals, cell)
@@ -276,16 +304,26 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
     """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest
     points of the whole scan.
+
+    Args:
+        points: (n, 3) in {A} [m].
+        full: all points (m, 3) of the scan in {A} [m].
+        camera: position (3,) of the camera in {A} [m].
     """
     full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
-    normals = point_tree(full).planes(full, full, points, points, NEIGHBOURS)[0]
+    normals = point_tree(full).planes(full, full, points, points, NORMAL_NEIGHBOURS)[0]
     away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
     normals[away] *= -1.0
     return np.asarray(normals)
 
 
 def sight_lines(views: Sequence[ScanView], T_ca: Sequence[Pose]) -> Array:
-    """(n, 3) unit vectors in {C} from the scanned surface to the camera."""
+    """(n, 3) unit vectors in {C} from the scanned surface to the camera.
+
+    Args:
+        views: the views, in order of time.
+        T_ca: pose of {A} in {C} at each view.
+    """
     lines = [T.R @ (v.camera - v.points.mean(axis=0)) for v, T in zip(views, T_ca, strict=True)]
     return np.array([line / np.linalg.norm(line) for line in lines])
 
@@ -302,6 +340,13 @@ def depth_behind(
     where none was.
 
     ``tree`` is that over the directions of the measured points, if it is known.
+
+    Args:
+        p: points (m, 3) [m].
+        measured: measured points (n, 3) [m].
+        camera: position (3,) of the camera [m].
+        spacing_m: distance between two directions that are the same, at the points [m].
+        tree: k-d tree of the directions of the measured points, if it is known.
     """
     if not len(p):
         return np.zeros(0)

@@ -151,28 +151,6 @@ class Backend(ABC):
         """
         return self.align(points, guess)
 
-    def align_within(
-        self,
-        points: NDArray[Any],
-        guess: Pose,
-        gate_m: float,  # noqa: ARG002 (an ability that this back end does not have)
-        near: bool = False,  # noqa: ARG002
-        most: int = MOST_WITHIN,  # noqa: ARG002
-        most_work: int = NO_LIMIT,  # noqa: ARG002
-    ) -> Fit:
-        """Return T_ca with correspondences nearer than ``gate_m`` in all passes. A back end without
-        this ability aligns with its own rejection distances.
-
-        Args:
-            points: as of ``align``.
-            guess: as of ``align``.
-            gate_m: rejection distance from the first pass on [m].
-            near: the guess is a registered pose, which the first passes must not leave.
-            most: largest number of passes.
-            most_work: point searches after which it ends, not converged.
-        """
-        return self.align(points, guess)
-
 
 class HornBackend(Backend):
     """Exact closest points on the model, one fused pass, identical results for any number of
@@ -425,33 +403,16 @@ def _state(name: str) -> Availability:
         )
 
 
-def aligned(
-    name: str,
-    backend: Backend,
-    scan: NDArray[Any],
-    guess: Pose,
-    width_m: float | None,
-    most_work: int,
-    rough: bool,
-) -> Fit | str:
+def aligned(name: str, align: Callable[[], Fit]) -> Fit | str:
     """Run a back end. An exception, or a result of a wrong type, is returned as the text of a
     failure.
 
     Args:
         name: of the back end.
-        backend: built for the target.
-        scan: (n, 3) points in {A} [m].
-        guess: T_ca to begin with.
-        width_m: rejection distance from the first pass on [m], see ``align_within``; None for the
-            back end's own.
-        most_work: point searches after which it ends where ``width_m`` is given.
-        rough: without ``width_m``, align with ``align_roughly``.
+        align: one of its methods with its arguments.
     """
     try:
-        if width_m is not None:
-            fit = backend.align_within(scan, guess, width_m, near=True, most_work=most_work)
-        else:
-            fit = (backend.align_roughly if rough else backend.align)(scan, guess)
+        fit = align()
         if not isinstance(fit, Fit):
             return f"back end '{name}' returned {type(fit).__name__}, not Fit"
         finite = bool(np.isfinite(fit.T_ca.matrix).all())

@@ -20,8 +20,6 @@ from avsreplay.geometry import Array, Pose, exp
 from avsreplay.parts import LawResult
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.backend import (
-    NO_LIMIT,
-    Backend,
     Target,
     aligned,
     create_backend,
@@ -79,41 +77,24 @@ class Bench:
         self.accuracy = self._factory.accuracy
         self.registrar = Registrar(self.surface, self.params)
 
-    @property
-    def gate_m(self) -> float:
-        """Rejection distance of the last iteration [m]."""
-        return self.params.limits(self.surface.extent).gate_m
-
-    def able(self, ability: str) -> bool:
-        """Return whether the back end has a method of its own in place of that of the base class.
-
-        Args:
-            ability: name of the method.
-        """
-        return getattr(self._factory, ability) is not getattr(Backend, ability)
-
     def fit(
         self,
         T_ac: Pose,
-        width_m: float | None = None,
-        most_work: int = NO_LIMIT,
         rough: bool = False,
     ) -> Fit | str:
         """Return what the back end itself gives for the scan, or the text of its failure.
 
         Args:
             T_ac: pose to begin with.
-            width_m: rejection distance of ``align_within`` [m]; None for the others.
-            most_work: its limit of point searches.
             rough: use ``align_roughly``.
         """
         limits = self.params.limits(self.surface.extent)
         visibility = Visibility(self.surface, self.params.camera)
         index = SurfaceIndex.build(visibility.surface, limits.reach_m)
         target = Target(visibility.surface, index, limits, visibility)
-        name, guess = self.params.backend, T_ac.inverse()
         backend = create_backend(self.params, self._factory, target)
-        return aligned(name, backend, self.scan, guess, width_m, most_work, rough)
+        align = backend.align_roughly if rough else backend.align
+        return aligned(self.params.backend, lambda: align(self.scan, T_ac.inverse()))
 
     def fresh(
         self, surface: Surface | None = None, params: RegisterParams | None = None
@@ -247,23 +228,6 @@ def roughly(bench: Bench) -> LawResult:
     return _ability(law, bench, bench.guess, rough=True)
 
 
-def within(bench: Bench) -> LawResult:
-    """With a fixed rejection distance, a scan stays where it was registered."""
-    law = "a fixed rejection distance keeps a registered pose"
-    return _ability(law, bench, bench.T_ac, width_m=bench.gate_m)
-
-
-def limited(bench: Bench) -> LawResult:
-    """An alignment with a fixed rejection distance that may search one point does not claim that it
-    converged; a back end without this ability has no limit.
-    """
-    law = "a limit of the work is kept"
-    if bench.able("align_within"):
-        fit = bench.fit(bench.guess, width_m=bench.gate_m, most_work=1)
-        return LawResult(law, isinstance(fit, Fit) and not fit.converged, str(fit)[:DETAIL])
-    return LawResult(law, True, "not an ability of this back end")
-
-
 def far(bench: Bench) -> LawResult:
     """A scan ten extents away has no overlap."""
     away = bench.scan + 10.0 * bench.surface.extent
@@ -334,8 +298,6 @@ LAWS: tuple[Law, ...] = (
     views,
     repeats,
     roughly,
-    within,
-    limited,
     far,
     planar,
     collinear,

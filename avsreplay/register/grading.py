@@ -1,8 +1,15 @@
-"""Registration of a scan from one pose, and the quality of the result."""
+"""Registration of a scan from one pose, and the quality of the result.
+
+Hypotheses are registered by the program's own method, whatever the back end is: most of them are
+wrong, and a library can need hundreds of times its usual work to find no fit. The back end
+registers the guess where few points confirm it, and the pose that the decision would accept. The
+work of another library is not counted, since this is at most two alignments of a scan.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -23,18 +30,28 @@ POOR_OF_GATE = 0.3
 
 
 class Grader:
-    """One back end with the quality of its poses."""
+    """One back end with the quality of its poses.
+
+    Attributes:
+        own: the program's own method, ``horn``; the back end itself if it is that.
+        foreign: the back end is another one.
+    """
 
     def __init__(
         self, target: Target, params: RegisterParams, backend: Backend, screen: Screen
     ) -> None:
         self._target, self._params, self._backend = target, params, backend
         self._screen = screen
-        self._accuracy: tuple[float, float] = backend.accuracy
-        self._closest = isinstance(backend, HornBackend)
+        self.own = backend if isinstance(backend, HornBackend) else HornBackend(target)
+        self.foreign = self.own is not backend
 
     def graded(
-        self, case: Case, guess: Pose, width_m: float | None, rough: bool = False
+        self,
+        case: Case,
+        guess: Pose,
+        width_m: float | None = None,
+        by_backend: bool = False,
+        rough: bool = False,
     ) -> tuple[Alignment, int]:
         """Register a scan and measure the quality of the pose; also return the work.
 
@@ -44,19 +61,24 @@ class Grader:
         Args:
             case: the scan.
             guess: T_ac to begin with.
-            width_m: rejection distance from the first pass on, and of inliers [m]; None: that of
-                the back end.
+            width_m: rejection distance from the first pass on, and of inliers [m], for the own
+                method; None: the usual ones.
+            by_backend: by the back end, not by the own method.
             rough: a part of the scan suffices where it shows that the fit is not close; it is then
                 not converged.
         """
         start = T_ca = guess.inverse()
         index, limits, scan = self._target.index, self._target.limits, case.points
         limits = limits if width_m is None else replace(limits, gate_m=width_m)
-        spent, left = 0, case.work.left
+        used = self._backend if by_backend else self.own
+        name = self._params.backend if by_backend else used.name
+        closest, spent, left = used is self.own, 0, case.work.left
         for last in (False, True):
             most = max(1, left - spent - grade_work(len(scan), noisy=True) - TEST_WORK)
-            rule = (width_m, most, rough and not last)
-            fit = aligned(self._params.backend, self._backend, scan, T_ca, *rule)
+            align = used.align_roughly if rough and not last else used.align
+            if width_m is not None:
+                align = partial(self.own.align_within, gate_m=width_m, near=True, most_work=most)
+            fit = aligned(name, partial(align, scan, T_ca))
             if isinstance(fit, str):
                 none = quality.not_measured(len(scan), AlignStatus.FAILED, guess)
                 return replace(none, message=fit), spent
@@ -64,19 +86,19 @@ class Grader:
             options = (
                 self._params,
                 case.halves and full,
-                self._accuracy,
+                used.accuracy,
                 full and not case.carried,
                 start,
             )
             found = quality.grade(
-                index, self._target.visibility, of, fit, limits, *options, full and self._closest
+                index, self._target.visibility, of, fit, limits, *options, full and closest
             )
             if fit.rough:
                 found = replace(
                     found, points=len(scan), inliers=found.inliers * len(scan) // len(of)
                 )
-            noisy = full and self._closest and found.rms_m > quality.SMALL_NOISE * index.extent_m
-            spent += alignment_work(fit, found, len(of), noisy)
+            noisy = full and closest and found.rms_m > quality.SMALL_NOISE * index.extent_m
+            spent += alignment_work(fit, found, len(of), noisy) if closest else 0
             ended = last or fit.iterations >= limits.n_max or left - spent < case.work.healthy
             if (
                 ended
@@ -86,9 +108,7 @@ class Grader:
                 break
             T_ca = fit.T_ca
         if found.status is AlignStatus.FAILED:
-            found = replace(
-                found, T_ac=guess, message=f"back end '{self._params.backend}' {found.message}"
-            )
+            found = replace(found, T_ac=guess, message=f"back end '{name}' {found.message}")
         return found, spent
 
     def close(self, found: Alignment) -> bool:

@@ -23,7 +23,7 @@ from avsreplay.register.work import Work
 class Refine(Enum):
     """How a hypothesis that was chosen is registered to the whole scan."""
 
-    BACKEND = "by the back end with its own rejection distances"
+    BACKEND = "by the back end"
     NOISE = "within a rejection distance that follows the noise"
     BOTH = "in both ways, of which the nearer result is taken"
 
@@ -54,6 +54,7 @@ class Candidate:
 
     Attributes:
         found: the alignment.
+        by_backend: it is one of the back end, not of the program's own method.
         evidence: what the rays say of the pose; None with too few near the model.
         examined: the evidence was measured.
         reason: why the evidence is against it, "" if it is not.
@@ -69,6 +70,7 @@ class Candidate:
     """
 
     found: Alignment
+    by_backend: bool = False
     evidence: Evidence | None = None
     examined: bool = False
     reason: str = ""

@@ -53,6 +53,7 @@ NOT_VERIFIED = (
     f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a"
     " search"
 )
+LEFT = "the back end ends at another pose than the search, although it begins there"
 NOT_FOUND = "no pose of the model explains the scan, and no work is left for a longer search"
 
 
@@ -150,23 +151,51 @@ class Loop:
 
     def _register(self, case: Case, hypothesis: Hypothesis, refine: Refine) -> None:
         """Register a hypothesis to the whole scan: it becomes the candidate."""
+        by_backend = refine is Refine.BACKEND and self._hopeful(case, hypothesis.T_ca)
         if refine is Refine.BACKEND:
-            found = self._graded(case, hypothesis.T_ca, None, rough=True)
+            found = self._graded(case, hypothesis.T_ca, by_backend=by_backend, rough=True)
         else:
             found = self._within(case, hypothesis)
         if refine is Refine.BOTH and case.work.allows(LAST_WORK):
-            wide = self._graded(case, hypothesis.T_ca, None)
+            wide = self._graded(case, hypothesis.T_ca)
             same = self.poses.same(wide.T_ac.inverse(), found.T_ac.inverse(), ONE_MINIMUM)
             found = wide if same else self._nearest(case, [found, wide], self._gate)
-        kept = case.current or Candidate(found)
-        case.current = replace(
-            kept, found=found, evidence=None, examined=False, reason="", images=None
-        )
+        self._replace(case, found, by_backend)
+
+    def _hopeful(self, case: Case, T_ca: Pose) -> bool:
+        """Whether a back end of another library is called at a pose: few points confirm it."""
+        if not self.grader.foreign:
+            return True
+        hopeful, work = self.screen.confirms(case.points, T_ca.inverse())
+        case.work.spend(work)
+        return hopeful
+
+    def _replace(self, case: Case, found: Alignment, by_backend: bool) -> None:
+        """An alignment becomes the candidate; what is known of other poses stays."""
+        at = case.current or Candidate(found)
+        at = replace(at, found=found, by_backend=by_backend, evidence=None, examined=False)
+        case.current = replace(at, reason="", images=None)
+
+    def _finish(self, case: Case) -> None:
+        """Register an accepted pose that the own method found by the back end, and measure its
+        evidence again. A back end that leaves the pose is not converged.
+        """
+        at = case.at
+        if not self.grader.foreign or at.by_backend:
+            return
+        found = self._graded(case, at.T_ca, by_backend=True)
+        if found.measured and not self.poses.same(found.T_ac.inverse(), at.T_ca):
+            status = AlignStatus.NOT_CONVERGED
+            found = replace(found, status=status, covariance=None, message=LEFT)
+        self._replace(case, found, by_backend=True)
+        self._examine(case)
+        if at.searched:
+            self._size(case)
 
     def _graded(
-        self, case: Case, T_ca: Pose, width_m: float | None, rough: bool = False
+        self, case: Case, T_ca: Pose, width_m: float | None = None, **how: bool
     ) -> Alignment:
-        found, work = self.grader.graded(case, T_ca.inverse(), width_m, rough)
+        found, work = self.grader.graded(case, T_ca.inverse(), width_m, **how)
         case.work.spend(work)
         return found
 
@@ -343,6 +372,9 @@ class Loop:
     def _decided(self, case: Case) -> Alignment:
         """The decision, with what the scan says about the size and the covariance."""
         found = self.decision.decide(case)
+        if found.status in ACCEPTED:
+            self._finish(case)
+            found = self.decision.decide(case)
         if case.guess is not None and not case.at.searched:
             found, work = self.decision.consistent(case.few, case.guess, found)
             case.work.spend(work)
@@ -416,14 +448,16 @@ class Loop:
         return Round(one, search, self.decision.decide(one))
 
     def _resolve(self, case: Case) -> None:
-        """Compare the result of a search with the poses turned by a near-symmetry, and fit the size
-        where the scan shows a part of the target.
-        """
+        """Compare the result of a search with the poses turned by a near-symmetry."""
         at = case.at
         if not at.found.measured or at.reason or self.decision.too_little(at):
             return
         if self._turns.needed(case):
             self._draw(case, self._turns)
+        self._size(case)
+
+    def _size(self, case: Case) -> None:
+        """Fit the size to the result of a search where the scan shows a part of the target."""
         at = case.at
         if at.accepted and not at.rivals and not at.covered:
             found, work = self.decision.with_size(case, at.found)

@@ -16,11 +16,14 @@ from avsreplay.report.view import View
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers
 
-WIDTH, HEIGHT, BORDER = 440, 380, 26  # of one panel [px]
+PANEL_WIDTH_PX = 440
+PANEL_HEIGHT_PX = 380
+PANEL_BORDER_PX = 26
 FLOWN = frozenset(
     ("approach", "approach_on_prediction", "capture")
 )  # actions during which the plan is followed
-_POSITION, _ATTITUDE = ("x_m", "y_m", "z_m"), ("qx", "qy", "qz", "qw")
+_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+_ATTITUDE_COLUMNS = ("qx", "qy", "qz", "qw")
 _BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
@@ -38,7 +41,7 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[tuple[int, Array]]:
     t = np.array(column_of(rows, "t_ns"), np.int64)
     r, q = (
         np.stack([numbers(rows, name) for name in names], axis=1)
-        for names in (_POSITION, _ATTITUDE)
+        for names in (_POSITION_COLUMNS, _ATTITUDE_COLUMNS)
     )
     y, flown = (
         np.full((len(rows), 3), np.nan),
@@ -93,16 +96,21 @@ def approach_picture(
         panels.append((name, shown[0], shown[1 : 1 + len(lines)], np.concatenate(shown)))
     low = np.min([p[3].min(axis=0) for p in panels], axis=0)
     high = np.max([p[3].max(axis=0) for p in panels], axis=0)
-    scale = float(np.min((np.array([WIDTH, HEIGHT]) - 2 * BORDER) / np.maximum(high - low, 1e-6)))
+    scale = float(
+        np.min(
+            (np.array([PANEL_WIDTH_PX, PANEL_HEIGHT_PX]) - 2 * PANEL_BORDER_PX)
+            / np.maximum(high - low, 1e-6)
+        )
+    )
 
     def place(points: Array) -> Array:
         x, y = (points - 0.5 * (low + high)).T * scale
-        return np.round(np.stack([0.5 * WIDTH + x, 0.5 * HEIGHT - y], axis=1), 1)
+        return np.round(np.stack([0.5 * PANEL_WIDTH_PX + x, 0.5 * PANEL_HEIGHT_PX - y], axis=1), 1)
 
-    bar_m = max((b for b in _BARS_M if b * scale <= 0.3 * WIDTH), default=_BARS_M[0])
+    bar_m = max((b for b in _BARS_M if b * scale <= 0.3 * PANEL_WIDTH_PX), default=_BARS_M[0])
     return {
-        "width": WIDTH,
-        "height": HEIGHT,
+        "width": PANEL_WIDTH_PX,
+        "height": PANEL_HEIGHT_PX,
         "bar": round(bar_m * scale, 1),
         "bar_text": f"{bar_m:g} m",
         "cone_name": "cone or corridor in which the approach stays",

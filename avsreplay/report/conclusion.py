@@ -28,7 +28,7 @@ from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers
 
-HEADLINES = {  # the metrics of the conclusion: words, unit and factor
+COMPARED_METRICS = {  # the metrics of the conclusion: words, unit and factor
     "healthy_ratio": ("scans used", " %", 100.0),
     "all_pos_rmse_m": ("rms position error of all scans", " mm", 1000.0),
     "all_rot_rmse_deg": ("rms attitude error of all scans", " deg", 1.0),
@@ -41,7 +41,7 @@ HEADLINES = {  # the metrics of the conclusion: words, unit and factor
     "capture_miss_m": ("miss at capture", " mm", 1000.0),
     "losses": ("lost parts of the log", "", 1.0),
 }
-_MORE = {
+_MORE_IS_BETTER = {
     "capture_probability",
     "captured",
     "scans",
@@ -72,9 +72,13 @@ _COUNTS = {
     "losses",
     "ogm_rank",
 }
-_MENTIONED = 0.1  # relative change of a main metric without an interval that the sentence mentions
+# relative change of a main metric without an interval that the sentence mentions
+_MENTIONED_CHANGE = 0.1
 _MARKS = {"better": "good", "worse": "bad"}
-_BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS = 10, 5, 5, 5
+_MAX_BLOCKS = 10  # of scans in a row, from which the interval of one log follows
+_LEAST_BLOCK_SCANS = 5
+_LEAST_BLOCKS = 5
+_LEAST_PAIRED_RUNS = 5
 
 
 def _scanwise(
@@ -187,7 +191,7 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     """
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
     apart = [named for base, other in pairs if (named := different_logs(base.header, other.header))]
-    paired = not apart or len(pairs) >= _LEAST_RUNS
+    paired = not apart or len(pairs) >= _LEAST_PAIRED_RUNS
     changes = tuple(
         change for m in METRICS if (change := _change(m.name, figures, pairs, paired)) is not None
     )
@@ -261,14 +265,14 @@ def _word(name: str, differences: Sequence[float], interval: tuple[float, float]
     sure = len(differences) == 1 if interval is None else interval[0] > 0.0 or interval[1] < 0.0
     if not sure:
         return "no evidence"
-    return "better" if (mean > 0.0) == (name in _MORE) else "worse"
+    return "better" if (mean > 0.0) == (name in _MORE_IS_BETTER) else "worse"
 
 
 def _interval(
     name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]], differences: Sequence[float]
 ) -> tuple[float, float] | None:
     """95 % interval of the mean difference; None with too few pairs of runs or of scans."""
-    if len(pairs) >= _LEAST_RUNS:
+    if len(pairs) >= _LEAST_PAIRED_RUNS:
         return interval_of_mean(np.array(differences))
     if len(pairs) > 1 or not (name in _ROOTS or name in _MEANS):
         return None
@@ -294,7 +298,7 @@ def _blocks(
         stamps.append(np.array(column_of(run.rows, "t_ns"))[known])
         found.append(figures[known])
     shared, *places = np.intersect1d(stamps[0], stamps[1], return_indices=True)
-    count = min(_BLOCKS, len(shared) // _IN_BLOCK)
+    count = min(_MAX_BLOCKS, len(shared) // _LEAST_BLOCK_SCANS)
     if count < _LEAST_BLOCKS:
         return None
     parts = [np.array_split(figures[at], count) for figures, at in zip(found, places, strict=True)]
@@ -309,7 +313,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
             f"no difference; all {rows} rows agree within the tolerances of their columns",
         )
     found = {
-        word: [c for c in changes if c.word == word and c.metric in HEADLINES]
+        word: [c for c in changes if c.word == word and c.metric in COMPARED_METRICS]
         for word in ("worse", "better")
     }
     said = [
@@ -321,7 +325,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
         else "no evidence"
     )
     changed = [
-        c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)
+        c for c in changes if c.metric in COMPARED_METRICS and c.word == "changed" and _mentioned(c)
     ]
     if not paired:
         differ = ", ".join(map(_said, changed))
@@ -341,18 +345,22 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
 
 def _mentioned(change: Change) -> bool:
     base, other = change.base or 0.0, change.other or 0.0
-    return abs(other - base) > _MENTIONED * abs(base)
+    return abs(other - base) > _MENTIONED_CHANGE * abs(base)
 
 
 def _said(change: Change) -> str:
-    words, unit, factor = HEADLINES[change.metric]
+    words, unit, factor = COMPARED_METRICS[change.metric]
     if change.note or change.base is None or change.other is None:
         return f"{words} ({change.note or 'no value'})"
     return f"{words} ({factor * change.base:.4g} to {factor * change.other:.4g}{unit})"
 
 
 def settings_table(conclusion: Conclusion) -> Table:
-    """Return the table of the settings in which a run differs from the baseline."""
+    """Return the table of the settings in which a run differs from the baseline.
+
+    Args:
+        conclusion: the comparison with the baseline.
+    """
     texts = conclusion.settings or ("none",)
     return facts_table(
         f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts]
@@ -369,7 +377,9 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
         show_all: also show the metrics that are equal and not among the main ones.
     """
     shown = [
-        c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"
+        c
+        for c in conclusion.changes
+        if show_all or c.metric in COMPARED_METRICS or c.word != "equal"
     ]
     meaning = {m.name: m.doc for m in METRICS}
     rows = tuple(

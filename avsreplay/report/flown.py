@@ -23,7 +23,7 @@ from avsreplay.rows import Row
 
 WITHDRAWN = ("hold", "retreat", "abort")  # actions that end an attempt
 LEAST_STEP_S = 0.25  # between positions: below it their rounding shows in the acceleration
-MOST_WITHDRAWN = 3  # withdrawals that are listed
+LISTED_WITHDRAWALS = 3  # withdrawals that are listed
 
 
 def flight_facts(
@@ -138,6 +138,6 @@ def _withdrawals(rows: Sequence[Row]) -> Iterator[tuple[str, str]]:
             found.append(f"{plain(action)} at {first.t_s:.1f} s ({rule})")
         moved = moved or action in FLOWN
     if found:
-        more = len(found) - MOST_WITHDRAWN
+        more = len(found) - LISTED_WITHDRAWALS
         last = f"; {more} more" if more > 0 else ""
-        yield "withdrawals", "; ".join(found[:MOST_WITHDRAWN]) + last
+        yield "withdrawals", "; ".join(found[:LISTED_WITHDRAWALS]) + last

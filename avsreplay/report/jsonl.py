@@ -24,34 +24,37 @@ from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_text, refuse_pointer
 from avsreplay.rows import Row, field_types
+from avsreplay.settings import LARGEST_NUMBER
 from avsreplay.tables import RowTable
 
-_NAMES = tuple(f.name for f in dataclasses.fields(Row))
-_VALUES = attrgetter(*_NAMES)
+_ROW_COLUMNS = tuple(f.name for f in dataclasses.fields(Row))
+_ROW_VALUES = attrgetter(*_ROW_COLUMNS)
 _ENCODE = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
-_PLAIN = (float, str, int, bool, type(None))  # types of values that JSON has
-_MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
-_BLOCK = 1 << 20
-_MAX_JSON = 64 << 20
-_LARGEST = 1e100  # sums of squares of larger values are not finite
+_PLAIN_TYPES = (float, str, int, bool, type(None))  # types of values that JSON has
+_MAX_LINE_BYTES = 1 << 20
+_MAX_ROWS_BYTES = 2 << 30
+_MAX_NAME_CHARACTERS = 100
+_MAX_TEXT_CHARACTERS = 10_000
+_READ_BYTES = 1 << 20  # of a file that are read at once, to the end of a line
+_MAX_JSON_BYTES = 64 << 20
 
 
 def plain(value: Any) -> Any:
     """Return a value that JSON has: numpy scalars as those of Python, floats that are not finite as
     None.
     """
-    if type(value) not in _PLAIN and hasattr(value, "item"):
+    if type(value) not in _PLAIN_TYPES and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def dump_row(row: Row) -> str:
     """Return a row as one line of JSON, without the line end."""
-    values = _VALUES(row)
+    values = _ROW_VALUES(row)
     try:
-        return _ENCODE(dict(zip(_NAMES, values, strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, values, strict=True)))
     except (TypeError, ValueError):  # a numpy scalar, or a float that is not finite
-        return _ENCODE(dict(zip(_NAMES, map(plain, values), strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, map(plain, values), strict=True)))
 
 
 class RowWriter:
@@ -100,6 +103,9 @@ def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
     The columns are not checked, but every name is printable text and every value is null, a bool, a
     number of 64 bits or printable text.
 
+    Args:
+        path: a rows.jsonl file.
+
     Raises:
         UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
     """
@@ -114,13 +120,13 @@ def _blocks(path: Path) -> Iterator[tuple[int, int, bytes]]:
     A line that is too long is cut.
     """
     try:
-        if path.stat().st_size > _MAX_FILE or not path.is_file():
+        if path.stat().st_size > _MAX_ROWS_BYTES or not path.is_file():
             raise UnreadableInput(
                 "not a rows.jsonl file", where=str(path), hint="name a rows.jsonl file"
             )
         number = 1
         with path.open("rb") as stream:
-            while block := stream.read(_BLOCK) + stream.readline(_MAX_LINE + 1):
+            while block := stream.read(_READ_BYTES) + stream.readline(_MAX_LINE_BYTES + 1):
                 if number == 1:
                     refuse_pointer(block, str(path))
                 ends = block.count(b"\n")
@@ -143,13 +149,13 @@ def _records(block: bytes, path: str | Path, first: int) -> Iterator[tuple[str, 
 
 def _parse(line: bytes, where: str) -> dict[str, Any]:
     hint = "name the directory that 'avsreplay run LOG -o DIR' writes"
-    if len(line) > _MAX_LINE:
+    if len(line) > _MAX_LINE_BYTES:
         raise UnreadableInput("a line longer than 1 MiB, not a row", where=where, hint=hint)
     record = parse_json(line, where=where, hint=hint)
     if not isinstance(record, dict):
         raise UnreadableInput("not a JSON object", where=where, hint=hint)
     for name, value in record.items():
-        if not name.isprintable() or len(name) > _MAX_NAME:
+        if not name.isprintable() or len(name) > _MAX_NAME_CHARACTERS:
             raise UnreadableInput(
                 f"a column with the name {ascii(name)[:40]}", where=where, hint=hint
             )
@@ -160,14 +166,18 @@ def _parse(line: bytes, where: str) -> dict[str, Any]:
 
 def _is_cell(value: Any) -> bool:
     if isinstance(value, str):
-        return value.isprintable() and len(value) <= _MAX_TEXT
+        return value.isprintable() and len(value) <= _MAX_TEXT_CHARACTERS
     if isinstance(value, float):
-        return abs(value) <= _LARGEST
+        return abs(value) <= LARGEST_NUMBER
     return value is None or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
     """Build a row from its JSON object; a text column and one that may be null may be missing.
+
+    Args:
+        record: the object.
+        where: file and line, for messages.
 
     Raises:
         UnreadableInput: a column is unknown or missing, or a value has the wrong type.
@@ -279,8 +289,8 @@ def _decoder() -> Callable[[bytes], list[Row] | None] | None:
     meta = msgspec.Meta
     kinds: dict[type, Any] = {
         int: Annotated[int, meta(ge=-(2**63), le=2**63 - 1)],
-        float: Annotated[float, meta(ge=-_LARGEST, le=_LARGEST)],
-        str: Annotated[str, meta(max_length=_MAX_TEXT)],
+        float: Annotated[float, meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)],
+        str: Annotated[str, meta(max_length=_MAX_TEXT_CHARACTERS)],
         bool: bool,
     }
     fields = [
@@ -325,10 +335,14 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
 def read_json(path: Path, *, hint: str) -> Any:
     """Return the value of a JSON file, see ``parse_json``.
 
+    Args:
+        path: the file.
+        hint: what to do where it cannot be read.
+
     Raises:
         UnreadableInput: the file cannot be read, or is no such JSON.
     """
-    return parse_json(read_limited(path, _MAX_JSON, hint), where=str(path), hint=hint)
+    return parse_json(read_limited(path, _MAX_JSON_BYTES, hint), where=str(path), hint=hint)
 
 
 def _reject_constant(name: str) -> None:

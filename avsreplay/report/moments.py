@@ -17,7 +17,7 @@ from avsreplay.report.summary_parts import length_text
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers
 
-MOMENTS = 5
+MAX_MOMENTS = 5
 
 
 @value_class(eq=True)
@@ -41,10 +41,13 @@ class Moment:
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
     """Return the five worst intervals, which do not overlap: those without a used scan, and those
     whose error or NIS is far above the median.
+
+    Args:
+        rows: the rows of a run.
     """
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
-        if len(kept) == MOMENTS:
+        if len(kept) == MAX_MOMENTS:
             break
         if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
             kept.append(moment)
@@ -82,7 +85,7 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
 
 def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]:
     places = np.flatnonzero(used & np.isfinite(figures))
-    chosen = places[np.argsort(figures[places], kind="stable")[: -MOMENTS - 1 : -1]]
+    chosen = places[np.argsort(figures[places], kind="stable")[: -MAX_MOMENTS - 1 : -1]]
     return list(zip(figures[chosen].tolist(), chosen.tolist(), strict=True))
 
 
@@ -141,7 +144,11 @@ def _cause_in_estimate(
 
 
 def plain(name: str) -> str:
-    """Return a status or reason in words."""
+    """Return a status or reason in words.
+
+    Args:
+        name: a value of the columns ``status`` or ``reason``.
+    """
     return "no usable points" if name == "no_scan" else name.replace("_", " ")
 
 

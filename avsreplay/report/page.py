@@ -41,7 +41,7 @@ from avsreplay.report.view import View, cone_lines, scene, thin_surface
 from avsreplay.rows import Row
 from avsreplay.tables import chosen, column_of, numbers
 
-MOST_ROWS = 20_000
+MAX_PAGE_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
 
 
@@ -175,7 +175,7 @@ def build_page(
         The page as text.
     """
     verdict = verdict_of(rows, summary, header)
-    kept = charts.most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
+    kept = charts.most_telling(rows, MAX_PAGE_ROWS, (moment.row for moment in verdict.moments))
     place, all_rows = {k: n for n, k in enumerate(kept)}, rows
     rows = chosen(rows, np.array(kept, int))
     stamps = set(column_of(rows, "t_ns"))

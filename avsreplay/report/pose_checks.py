@@ -12,9 +12,10 @@ from avsreplay.report.moments import median_of
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers, used_rows
 
-MOST_SIGMAS = 5.0  # median error of the pose over its own 1 sigma from which it is reported
-_LEAST_ROWS = 10  # used scans with a true pose from which the median is judged
-_SIGNIFICANT = 3.0  # displacement during a scan over the 1 sigma of the position that matters
+MAX_ERROR_SIGMAS = 5.0  # median error of the pose over its own 1 sigma from which it is reported
+_LEAST_JUDGED_ROWS = 10  # used scans with a true pose from which the median is judged
+# displacement during a scan over the 1 sigma of the position that matters
+_SIGNIFICANT_SIGMAS = 3.0
 
 
 def error_over_sigma(rows: Sequence[Row]) -> str:
@@ -38,7 +39,10 @@ def error_over_sigma(rows: Sequence[Row]) -> str:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(stated > 0.0, numbers(used, error) / stated, np.nan)
         ratio = ratio[np.isfinite(ratio)]
-        if len(ratio) >= _LEAST_ROWS and (typical := median_of(ratio) or 0.0) > MOST_SIGMAS:
+        if (
+            len(ratio) >= _LEAST_JUDGED_ROWS
+            and (typical := median_of(ratio) or 0.0) > MAX_ERROR_SIGMAS
+        ):
             said.append(f"{name} {typical:.2g}")
     if not said or any(nees is not None for nees in column_of(used, "nees")):
         return ""
@@ -68,7 +72,7 @@ def times_may_matter(rows: Sequence[Row], extent_m: float, period_s: float) -> s
     speed = np.linalg.norm([numbers(used, f"v{axis}_mps") for axis in "xyz"], axis=0)
     motion = median_of(np.asarray(speed + 0.5 * extent_m * rate))
     sigma = median_of(numbers(used, "pos_1s_m"))
-    if motion is None or sigma is None or 0.5 * motion * period_s <= _SIGNIFICANT * sigma:
+    if motion is None or sigma is None or 0.5 * motion * period_s <= _SIGNIFICANT_SIGMAS * sigma:
         return ""
     return (
         f"the points have no times, and the target moves up to {motion * period_s:.2g} m from scan"

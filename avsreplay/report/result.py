@@ -23,19 +23,22 @@ from avsreplay.assessment import Assessment
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, bounding_diagonal
-from avsreplay.records import Label, State, Surface
+from avsreplay.records import NS_PER_S, STATE_SIZES, Label, State, Surface
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.settings import dump
+from avsreplay.spool import LARGEST_STORED
 from avsreplay.tables import PoseTable, RowTable
 
-_STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 _RUN_AGAIN = "the result is not as a run wrote it: run again"
-_MAX_TUM, _LEAST, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e-12, 1e15, 1e-3, 9_000_000_000
+_MAX_TUM_BYTES = 512 << 20
+_LEAST_SIZE_M = 1e-12
+_UNIT_NORM_ERROR = 1e-3  # difference of the norm of a stored quaternion from 1
+_MAX_TIME_S = 9_000_000_000  # whose nanoseconds have 64 bits
 
 
 @value_class
@@ -121,12 +124,17 @@ def facts_record(
 ) -> dict[str, Any]:
     """Return what ``Summary.fold`` received beside the rows as JSON values, for the key ``facts``
     of ``run.json``.
+
+    Args:
+        labels: labels of the log; None where it has none.
+        truth: true state at the last scan.
+        counts: further counts by name.
     """
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
         "truth": None
         if truth is None
-        else {name: getattr(truth, name).tolist() for name in _STATE},
+        else {name: getattr(truth, name).tolist() for name in STATE_SIZES},
         "counts": dict(counts or {}),
     }
 
@@ -150,6 +158,9 @@ def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file.
+
+    Args:
+        path: the file.
 
     Raises:
         OSError: it cannot be read.
@@ -240,7 +251,10 @@ def _header(path: Path) -> dict[str, Any]:
     drawn = [
         header.get("limits", {}).get(name) for name in ("rms_max_m", "alpha_max_m", "length_m")
     ]
-    if not all(v is None or (type(v) in (int, float) and _LEAST <= v < _LARGEST) for v in drawn):
+    if not all(
+        v is None or (type(v) in (int, float) and _LEAST_SIZE_M <= v < LARGEST_STORED)
+        for v in drawn
+    ):
         raise UnreadableInput("'limits' are not positive numbers", where=str(path), hint=_RUN_AGAIN)
     return header
 
@@ -308,11 +322,11 @@ def _label(values: Mapping[str, Any]) -> Label:
 
 
 def _state(values: Mapping[str, Any]) -> State:
-    arrays = {name: np.array(values[name], dtype=np.float64) for name in _STATE}
-    sizes_match = all(arrays[name].shape == (size,) for name, size in _STATE.items())
-    if not sizes_match or not all((np.abs(a) < _LARGEST).all() for a in arrays.values()):
+    arrays = {name: np.array(values[name], dtype=np.float64) for name in STATE_SIZES}
+    sizes_match = all(arrays[name].shape == (size,) for name, size in STATE_SIZES.items())
+    if not sizes_match or not all((np.abs(a) < LARGEST_STORED).all() for a in arrays.values()):
         raise ValueError("a state of another shape")
-    if any(abs(np.linalg.norm(arrays[name]) - 1.0) > _UNIT for name in ("q_ab", "q_bc")):
+    if any(abs(np.linalg.norm(arrays[name]) - 1.0) > _UNIT_NORM_ERROR for name in ("q_ab", "q_bc")):
         raise ValueError("a quaternion that is not of unit length")
     if np.abs(arrays["sigma"]).max() >= 1.0:
         raise ValueError("an inertia ratio that is not below 1")
@@ -332,7 +346,7 @@ def read_tum(path: str | Path) -> PoseTable:
         UnreadableInput: the file cannot be read, or a line is no pose; the message names the line.
     """
     hint = "name a TUM trajectory"
-    text = read_limited(Path(path), _MAX_TUM, hint).decode("utf-8", "backslashreplace")
+    text = read_limited(Path(path), _MAX_TUM_BYTES, hint).decode("utf-8", "backslashreplace")
     out = PoseTable()
     for number, line in enumerate(io.StringIO(text), 1):
         if line.strip() and not line.startswith("#"):
@@ -362,13 +376,13 @@ def _stamped(line: str, where: str) -> StampedPose:
         x, y, z, *q = values = [float(v) for v in words]
         seconds = Decimal(stamp)
         if (
-            not abs(seconds) < _LONGEST_S
+            not abs(seconds) < _MAX_TIME_S
             or len(q) != 4
-            or not all(abs(v) < _LARGEST for v in values)
+            or not all(abs(v) < LARGEST_STORED for v in values)
         ):
             raise ValueError("a pose out of range")
-        t_ns = int((seconds * 1_000_000_000).to_integral_value(ROUND_DOWN))
-        if not abs(math.hypot(*q) - 1.0) <= _UNIT:
+        t_ns = int((seconds * NS_PER_S).to_integral_value(ROUND_DOWN))
+        if not abs(math.hypot(*q) - 1.0) <= _UNIT_NORM_ERROR:
             raise ValueError("not a unit quaternion")
         return t_ns, Pose(q, [x, y, z])  # type: ignore[arg-type]
     except (ValueError, ArithmeticError):

@@ -40,8 +40,8 @@ BLOCK_BANDS = {
     3: (0.2158, 9.3484),
 }  # the same points with 2 and 3 degrees of freedom
 NEES_BAND = (9.5908, 34.1696)  # the same points with 20 degrees of freedom
-_ADAPTED = 30  # used scans to which the noise is adapted (default of estimator.window)
-_LEAST_LATER = 20  # used scans after them of whose innovations shares are stated
+_ADAPTING_SCANS = 30  # used scans to which the noise is adapted (default of estimator.window)
+_LEAST_SCANS_AFTER = 20  # used scans after them of whose innovations shares are stated
 _BY_STATE = (
     "pos_err_m",
     "rot_err_deg",
@@ -264,8 +264,8 @@ def _adapted(known: NDArray[np.bool_], healthy: NDArray[np.bool_]) -> NDArray[np
 
     Before, the innovations show how good the noise was that was assumed, and not the estimate.
     """
-    later = known & (np.cumsum(healthy) > _ADAPTED)
-    return later if np.count_nonzero(later & healthy) >= _LEAST_LATER else known
+    later = known & (np.cumsum(healthy) > _ADAPTING_SCANS)
+    return later if np.count_nonzero(later & healthy) >= _LEAST_SCANS_AFTER else known
 
 
 def _since_convergence(converged: Sequence[bool]) -> NDArray[np.bool_]:

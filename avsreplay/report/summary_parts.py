@@ -21,7 +21,7 @@ from avsreplay.tables import column_of
 
 # changes of the velocity from which a motion is not called free: a free target is pushed, or
 # manoeuvres, once or twice in a log; one that is towed, on a cable or in strong drag changes always
-_NOT_FREE = 3
+_LEAST_DRIVEN_CHANGES = 3
 
 
 @value_class(eq=True)
@@ -141,7 +141,11 @@ def length_text(metres: float) -> str:
 
 
 def times(count: int) -> str:
-    """Return a number of events in words: never, once, 2 times."""
+    """Return a number of events in words: never, once, 2 times.
+
+    Args:
+        count: the number.
+    """
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 
@@ -158,7 +162,7 @@ def events(
     if manoeuvres:
         clearest = max(manoeuvres, key=lambda m: m.significance)
         count = "" if len(manoeuvres) == 1 else f" {times(len(manoeuvres))}, most significantly"
-        often = len(manoeuvres) >= _NOT_FREE
+        often = len(manoeuvres) >= _LEAST_DRIVEN_CHANGES
         whose = "the target does not move freely: its" if often else "the target's"
         yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:

@@ -23,10 +23,8 @@ from avsreplay.errors import printable, value_class
 from avsreplay.rows import Column, Row, columns
 from avsreplay.tables import column_of
 
-PLAIN_WIDTH, _WRAPPED = (
-    80,
-    12,
-)  # the latter: least width of a column of wrapped text, with its margin
+PLAIN_WIDTH_CHARACTERS = 80
+_WRAPPED_CHARACTERS = 12  # least width of a column of wrapped text, with its margin
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
@@ -46,7 +44,11 @@ class TableCell:
     scan: int | None = None
 
     def signed(self, *, ascii_only: bool = False) -> str:
-        """Return the text after the sign of its mark."""
+        """Return the text after the sign of its mark.
+
+        Args:
+            ascii_only: whether the sign is ASCII.
+        """
         sign = _SIGNS[self.mark][ascii_only] if self.mark else ""
         return " ".join(part for part in (sign, self.text) if part)
 
@@ -87,7 +89,10 @@ def as_cell(cell: str | TableCell) -> TableCell:
 
 
 def make_console(
-    stream: IO[str] | None = None, *, width: int | None = None, plain_width: int = PLAIN_WIDTH
+    stream: IO[str] | None = None,
+    *,
+    width: int | None = None,
+    plain_width: int = PLAIN_WIDTH_CHARACTERS,
 ) -> Console:
     """Return a console that interprets no markup.
 
@@ -139,7 +144,7 @@ def _least_width(table: Table, gap: int) -> int:
         table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True
     )
     return sum(
-        _WRAPPED
+        _WRAPPED_CHARACTERS
         if gap > 1 and table.letter(k) == "l"
         else gap + max(map(cell_len, "\n".join(texts).split("\n")))
         for k, texts in enumerate(columns_of_text)
@@ -147,7 +152,12 @@ def _least_width(table: Table, gap: int) -> int:
 
 
 def print_line(console: Console, text: str) -> None:
-    """Print one line of text as it is."""
+    """Print one line of text as it is.
+
+    Args:
+        console: where it is printed.
+        text: the line.
+    """
     console.print(Text(printable(text, "\n")))
 
 
@@ -204,25 +214,41 @@ def escaped(text: str) -> str:
 
 
 def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
-    """Return a table of names and values."""
+    """Return a table of names and values.
+
+    Args:
+        title: title of the table.
+        facts: name and value of each line.
+    """
     return Table(title, ("what", "value"), tuple(facts), align="l")
 
 
 def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
-    """Return a number as text, or ``none`` where there is no value."""
+    """Return a number as text, or ``none`` where there is no value.
+
+    Args:
+        value: the number.
+        spec: its format specification.
+        none: the text for None.
+    """
     return none if value is None else format(value, spec)
 
 
 def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
     """Return the number of decimals, from ``least`` to 8, that show ``figures`` significant figures
     of the middle value.
+
+    Args:
+        values: the numbers of a column.
+        least: fewest decimals.
+        figures: significant figures of the middle value.
     """
     sizes: Sequence[float] = sorted(abs(v) for v in values if v)
     wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2])) if sizes else least
     return min(max(least, wanted), 8)
 
 
-FEW = 24
+SHOWN_ROWS = 24  # rows of a table that are shown unless more are requested
 _HEADS = {  # a line end stands where the heading may break
     "seq": "scan",
     "t_s": "time",
@@ -271,14 +297,19 @@ def choose_rows(
 
     With neither flag: every k-th row so that about 24 are left, the last one, and those at which
         gamma changes.
+
+    Args:
+        rows: the rows of a run.
+        every: show every k-th row; None leaves the choice to the function.
+        show_all: whether all rows are shown.
     """
-    if show_all or (every is None and len(rows) <= FEW):
+    if show_all or (every is None and len(rows) <= SHOWN_ROWS):
         return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
     if every is not None:
         return list(rows[:: max(every, 1)]), f"every {_ordinal(max(every, 1))} of {len(rows)} scans"
-    step = -(-len(rows) // FEW)
+    step = -(-len(rows) // SHOWN_ROWS)
     turns = {k for k, (a, b) in enumerate(pairwise(column_of(rows, "gamma")), 1) if a != b}
-    turns = turns if len(turns) <= FEW else set()
+    turns = turns if len(turns) <= SHOWN_ROWS else set()
     kept = sorted(set(range(0, len(rows), step)) | {len(rows) - 1} | turns)
     words = f"every {_ordinal(step)} of {len(rows)} scans" + (
         " and where gamma changes" if turns else ""
@@ -296,6 +327,12 @@ def scan_table(
 ) -> Table:
     """Return the table of the chosen rows; columns that do not fit the console are left out and
     named in the note.
+
+    Args:
+        console: where it is printed.
+        rows: the rows of a run.
+        every: show every k-th row; None leaves the choice to the function.
+        show_all: whether all rows are shown.
     """
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
     plain = ascii_only(console)
@@ -326,6 +363,10 @@ def scan_table(
 def head(column: Column, shown: str = "") -> str:
     """Return a heading of whole words with the unit on the last line; ``shown`` is the unit of the
     printed numbers.
+
+    Args:
+        column: the column.
+        shown: unit of the printed numbers.
     """
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
     name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
@@ -376,6 +417,10 @@ def _cell(value: Any, fmt: str) -> TableCell:
 def state_cell(gamma: int, reason: str) -> TableCell:
     """Return the cell of a state: healthy, coasting because there was no scan, or flagged with the
     reason.
+
+    Args:
+        gamma: 1 for a healthy scan, 0 for another one.
+        reason: why a scan is not healthy.
     """
     if gamma == 1:
         return TableCell("ok", "good")
@@ -391,19 +436,24 @@ def _fit(widths: dict[str, int], width: int) -> list[str]:
     return [name for name in widths if name in kept]
 
 
-LEAST_WIDTH = 100
-_BLOCKS = "▁▂▃▄▅▆▇█"
-_LABEL = 32
+LEAST_WIDTH_CHARACTERS = 100
+_SPARK_BLOCKS = "▁▂▃▄▅▆▇█"
+_LABEL_CHARACTERS = 32
 
 
 def spark(values: Sequence[float | None], width: int) -> str:
     """Return at most ``width`` blocks, whose heights from 0 to the largest value show the largest
     value of each part; a blank where a part has none.
+
+    Args:
+        values: the values in order, None where there is none.
+        width: largest number of blocks.
     """
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)
     return "".join(
-        _BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " " for p in parts
+        _SPARK_BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " "
+        for p in parts
     )
 
 
@@ -413,10 +463,15 @@ def _parts(count: int, width: int) -> list[tuple[int, int]]:
 
 
 def print_sparks(console: Console, rows: Sequence[Row]) -> None:
-    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
-    if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
+    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode.
+
+    Args:
+        console: where it is printed.
+        rows: the rows of a run.
+    """
+    if not console.is_terminal or console.width < LEAST_WIDTH_CHARACTERS or ascii_only(console):
         return
-    width = console.width - _LABEL
+    width = console.width - _LABEL_CHARACTERS
     shown = (
         ("position error", "mm", "pos_err_m", 1000.0),
         ("attitude error", "deg", "rot_err_deg", 1.0),
@@ -425,8 +480,10 @@ def print_sparks(console: Console, rows: Sequence[Row]) -> None:
         values = [None if v is None else scale * v for v in column_of(rows, wanted)]
         if known := [v for v in values if v is not None]:
             label = f"{name} to {max(known):.3g} {unit}"
-            console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
+            console.print(
+                Text(f"{label:{_LABEL_CHARACTERS}}").append(spark(values, width), style="#0072B2")
+            )
     gammas = column_of(rows, "gamma")
     flags = "".join("✗" if 0 in gammas[a:b] else "·" for a, b in _parts(len(rows), width))
-    console.print(Text(f"{'flagged':{_LABEL}}").append(flags, style="#D55E00"))
+    console.print(Text(f"{'flagged':{_LABEL_CHARACTERS}}").append(flags, style="#D55E00"))
     console.print()

@@ -23,28 +23,28 @@ from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
 from avsreplay.tables import chosen, column_of, numbers, used_rows
 
-USED_FAIL, USED_CHECK = (
-    0.5,
-    0.9,
-)  # share of the scans without an injected harmful fault that updated the filter
-INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
-FALSE_ALARMS = 0.05  # share of the scans without a fault
-ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
-TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
+# Share of the scans without an injected harmful fault that updated the filter.
+USED_SHARE_FAIL = 0.5
+USED_SHARE_CHECK = 0.9
+LEAST_SHARE_INSIDE = 0.8  # share of NIS or NEES inside the 95 % band
+MAX_FALSE_ALARM_SHARE = 0.05  # share of the scans without a fault
+# Median position error over the model's extent, all scans.
+POSITION_ERROR_FAIL_OF_EXTENT = 0.05
+POSITION_ERROR_CHECK_OF_EXTENT = 0.02
+# Median attitude error, all scans.
+ATTITUDE_ERROR_FAIL_DEG = 15.0
+ATTITUDE_ERROR_CHECK_DEG = 5.0
 SHORT_LAPSE_S = 2.0  # a single doubtful scan withdraws convergence for less than this
-GROWTH, GROWTH_SCANS = (
-    3.0,
-    30,
-)  # ratio of the median errors of the last and the first third of the used scans; scans
-GROWN_LEAST, TURNED_LEAST = (
-    0.001,
-    0.25,
-)  # smallest median of the last third, over the extent, and [deg]
+GROWTH_RATIO = 3.0  # of the median errors of the last and the first third of the used scans
+GROWTH_SCANS = 30  # fewest scans of a third
+# Smallest median of the last third.
+LEAST_GROWN_OF_EXTENT = 0.001
+LEAST_GROWN_DEG = 0.25
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
-SAME_ERROR = 0.2
-ALIASED = 0.1  # share of the scans whose poses two angular rates explain
-SURE_EVENT = 6.0  # log odds of an event of the whole log from which it is stated
-FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
+SAME_ERROR_SPREAD = 0.2
+ALIASED_SHARE = 0.1  # share of the scans whose poses two angular rates explain
+SURE_EVENT_LOG_ODDS = 6.0  # of an event of the whole log from which it is stated
+FIT_CHECK_OF_EXTENT = 0.02  # median rms distance of the inliers over the model's extent
 
 
 class Grade(Enum):
@@ -194,8 +194,8 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
-    if share < USED_CHECK:
-        grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
+    if share < USED_SHARE_CHECK:
+        grade = Grade.FAIL if share < USED_SHARE_FAIL else Grade.CHECK
         text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {plain(common)})"
         yield Concern(grade, text)
     last = int(np.flatnonzero(numbers(rows, "gamma") == 1.0).max(initial=0))
@@ -211,8 +211,8 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     position = median_of(numbers(rows, "pos_err_m")) or 0.0
     turn = median_of(numbers(rows, "rot_err_deg")) or 0.0
     share = position / extent_m if extent_m else 0.0
-    of_position = _graded(share, ERROR_CHECK, ERROR_FAIL)
-    of_turn = _graded(turn, TURN_CHECK, TURN_FAIL)
+    of_position = _graded(share, POSITION_ERROR_CHECK_OF_EXTENT, POSITION_ERROR_FAIL_OF_EXTENT)
+    of_turn = _graded(turn, ATTITUDE_ERROR_CHECK_DEG, ATTITUDE_ERROR_FAIL_DEG)
     grades = [grade for grade in (of_position, of_turn) if grade]
     if grades:
         yield from _frame(rows, extent_m, Grade.FAIL if Grade.FAIL in grades else Grade.CHECK)
@@ -222,7 +222,7 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     if of_turn:
         yield Concern(of_turn, f"the median attitude error of all scans is {turn:.3g} deg")
     fit = median_of(numbers(used_rows(rows), "rms_m"))
-    if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
+    if fit is not None and extent_m and fit > FIT_CHECK_OF_EXTENT * extent_m:
         share = 100 * fit / extent_m
         text = (
             f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its"
@@ -252,11 +252,11 @@ def _frame(rows: Sequence[Row], extent_m: float | None, grade: Grade) -> Iterato
         return
     same, small = list[bool](), list[bool]()
     for column, limit in (
-        ("pos_err_m", ERROR_CHECK * (extent_m or 0.0)),
-        ("rot_err_deg", TURN_CHECK),
+        ("pos_err_m", POSITION_ERROR_CHECK_OF_EXTENT * (extent_m or 0.0)),
+        ("rot_err_deg", ATTITUDE_ERROR_CHECK_DEG),
     ):
         low, middle, high = np.quantile(numbers(used, column), (0.05, 0.5, 0.95))
-        same.append(bool(middle > limit and high - low < SAME_ERROR * middle))
+        same.append(bool(middle > limit and high - low < SAME_ERROR_SPREAD * middle))
         small.append(bool(middle <= limit))
     if any(same) and all(a or b for a, b in zip(same, small, strict=True)):
         text = (
@@ -273,11 +273,11 @@ def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     if third < GROWTH_SCANS:
         return
     for column, name, least in (
-        ("pos_err_m", "position", GROWN_LEAST * (extent_m or 0.0)),
-        ("rot_err_deg", "attitude", TURNED_LEAST),
+        ("pos_err_m", "position", LEAST_GROWN_OF_EXTENT * (extent_m or 0.0)),
+        ("rot_err_deg", "attitude", LEAST_GROWN_DEG),
     ):
         first, last = (median_of(numbers(part, column)) for part in (used[:third], used[-third:]))
-        if first is None or last is None or not least or last < max(GROWTH * first, least):
+        if first is None or last is None or not least or last < max(GROWTH_RATIO * first, least):
             continue
         sizes = [length_text(v) if column == "pos_err_m" else f"{v:.3g} deg" for v in (first, last)]
         text = (
@@ -290,8 +290,8 @@ def _growth(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
 def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
     faults = summary.faults
     used = max((e.peak_used.pos_err_m or 0.0 for e in faults.episodes if e.harmful), default=0.0)
-    if extent_m and used > ERROR_CHECK * extent_m:
-        grade = Grade.FAIL if used > ERROR_FAIL * extent_m else Grade.CHECK
+    if extent_m and used > POSITION_ERROR_CHECK_OF_EXTENT * extent_m:
+        grade = Grade.FAIL if used > POSITION_ERROR_FAIL_OF_EXTENT * extent_m else Grade.CHECK
         text = (
             f"{faults.missed_scans} of {faults.harmful_scans} scans that faults make unusable"
             " were used"
@@ -311,7 +311,7 @@ def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
             Grade.FAIL,
             f"the estimate did not recover from {plain(lost.kind)} at {lost.start_s:.1f} s",
         )
-    if faults.known and faults.false_alarm_rate > FALSE_ALARMS:
+    if faults.known and faults.false_alarm_rate > MAX_FALSE_ALARM_SHARE:
         share = 100 * faults.false_alarm_rate
         yield Concern(
             Grade.CHECK,
@@ -336,7 +336,7 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 def _aliases(rows: Sequence[Row]) -> Iterator[Concern]:
     """Two angular rates that explain the poses alike."""
     named = [row for row in rows if row.alias_fast_radps is not None]
-    if len(named) > ALIASED * len(rows):
+    if len(named) > ALIASED_SHARE * len(rows):
         slow, fast = named[-1].alias_slow_radps, named[-1].alias_fast_radps
         yield Concern(
             Grade.CHECK,
@@ -352,7 +352,7 @@ def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             continue
         # a small NIS shows a noise that was assumed too large, which is safe
         good = share.inside if name == "NEES" else 1.0 - share.above
-        if good < INSIDE_LEAST:
+        if good < LEAST_SHARE_INSIDE:
             low = (
                 "too small (overconfident)"
                 if share.median > share.high
@@ -383,7 +383,7 @@ def _by_all_poses(header: Mapping[str, Any]) -> Iterator[Concern]:
     record = header.get("smoothed")
     found = record.get("events") if isinstance(record, Mapping) else None
     for event in found if isinstance(found, list) else ():
-        sure = isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT
+        sure = isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT_LOG_ODDS
         if sure and event.get("first_known_s") is None:
             yield Concern(Grade.CHECK, f"by all poses of the log: {event.get('words', '')}")
 
@@ -473,7 +473,12 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
 
 
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
-    """Return in words where the first pose came from."""
+    """Return in words where the first pose came from.
+
+    Args:
+        rows: the rows of a run.
+        header: the record of the run, ``run.json``.
+    """
     if not rows:
         return "no scan"
     config = header.get("config") or {}

@@ -23,12 +23,12 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.report.charts import pack
 from avsreplay.rows import Row
-from avsreplay.spool import Spool, SpoolFile, write_npz
+from avsreplay.spool import LARGEST_STORED, Spool, SpoolFile, write_npz
 from avsreplay.tables import column_of, numbers
 
-CLOUD_POINTS = 300
-MOST_FACES = 4000
-_MOST_BYTES, _LARGEST = 1 << 30, 1e15
+MAX_CLOUD_POINTS = 300
+MAX_FACES = 4000
+_MAX_VIEW_BYTES = 1 << 30
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     **dict.fromkeys(("vertices", "cloud_points", "path_points"), ("f4", (3,))),
     **dict.fromkeys(("cloud_seq", "cloud_size", "path_t_ns", "path_size"), ("i8", ())),
@@ -149,7 +149,7 @@ def thin_cloud(
     residual_m: ArrayLike | None = None,
     intensity: ArrayLike | None = None,
     *,
-    most: int = CLOUD_POINTS,
+    most: int = MAX_CLOUD_POINTS,
 ) -> CloudView:
     """Thin a cloud to an even stride of its points.
 
@@ -170,9 +170,13 @@ def thin_cloud(
     return CloudView(seq, np.asarray(points[chosen], dtype=np.float32), residual, seen)
 
 
-def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
+def thin_surface(surface: Surface, *, most: int = MAX_FACES) -> tuple[Floats, Faces]:
     """Thin a model to at most ``most`` faces (vertices, for a model without faces): vertices are
     merged on a grid that is made coarser until this holds.
+
+    Args:
+        surface: the model of the target.
+        most: largest number of faces or vertices.
     """
     vertices, faces = surface.vertices, surface.faces
     size = surface.extent / 256.0 or 1.0
@@ -213,7 +217,12 @@ def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def write_view(path: str | Path, view: View) -> None:
-    """Write one npz file atomically; the same view gives the same bytes."""
+    """Write one npz file atomically; the same view gives the same bytes.
+
+    Args:
+        path: the file.
+        view: the model, clouds and paths.
+    """
     clouds = view.clouds if isinstance(view.clouds, CloudTable) else CloudTable(view.clouds)
     misses = [np.nan if p.miss_m is None else p.miss_m for p in view.paths]
     arrays: dict[str, NDArray[Any] | Spool] = {
@@ -245,11 +254,16 @@ def _each_point(parts: Sequence[tuple[CloudView, Floats | None]]) -> Floats:
 def read_view(path: str | Path) -> View:
     """Read a view.
 
+    Args:
+        path: the file.
+
     Raises:
         UnreadableInput: the file is missing or is not a view.
     """
     path, hint = Path(path), "run again with -o"
-    arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint, optional=("cloud_intensity",))
+    arrays = read_npz(
+        path, _ARRAYS, limit=_MAX_VIEW_BYTES, hint=hint, optional=("cloud_intensity",)
+    )
     try:
         return _view(arrays)
     except ValueError as error:
@@ -262,7 +276,7 @@ def _view(arrays: dict[str, Spool]) -> View:
         for block in arrays["cloud_residual"].blocks():
             arrays["cloud_intensity"].extend(np.full(len(block), np.nan, np.float32))
     for name in ("vertices", "cloud_points", "path_points"):
-        if not all((np.abs(block) < _LARGEST).all() for block in arrays[name].blocks()):
+        if not all((np.abs(block) < LARGEST_STORED).all() for block in arrays[name].blocks()):
             raise ValueError("points that are not finite or too far away")
     values = ("cloud_points", "cloud_residual", "cloud_intensity")
     for name, sizes in (*((each, "cloud_size") for each in values), ("path_points", "path_size")):
@@ -304,16 +318,21 @@ def _check_sizes(sizes: Spool, count: int) -> None:
         raise ValueError("sizes do not add up")
 
 
-PAGE_POINTS = 200_000
-MOST_CLOUDS = 700
-MOST_PATHS = 150
-_NO_VALUE = 255
-RING = 48  # lines of a cone
+MAX_PAGE_POINTS = 200_000
+MAX_CLOUDS = 700
+MAX_PATHS = 150
+_NO_VALUE_LEVEL = 255
+CONE_LINES = 48  # lines of a cone
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
     """Return the plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit
     steps about a centre [m].
+
+    Args:
+        rows: the rows of a run.
+        truth: true T_ac by number of the scan.
+        view: the model, clouds and paths; None where there are none.
     """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack(
@@ -325,10 +344,10 @@ def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dic
         "estimate": pack(estimate, "f4"),
         "truth": pack(_true_poses(rows, truth), "f4"),
         "clouds": _clouds(
-            _at_most(view.clouds, MOST_CLOUDS),
+            _at_most(view.clouds, MAX_CLOUDS),
             {seq: k for k, seq in enumerate(column_of(rows, "seq"))},
         ),
-        "paths": _paths(_at_most(view.paths, MOST_PATHS), rows[0].t_ns if rows else 0),
+        "paths": _paths(_at_most(view.paths, MAX_PATHS), rows[0].t_ns if rows else 0),
     }
 
 
@@ -349,7 +368,7 @@ def _at_most(items: Sequence[Any], most: int) -> list[Any]:
 
 def _clouds(clouds: Sequence[CloudView], place: dict[int, int]) -> dict[str, Any]:
     clouds = [c for c in clouds if c.seq in place and len(c.points)]
-    each = PAGE_POINTS // max(len(clouds), 1)
+    each = MAX_PAGE_POINTS // max(len(clouds), 1)
     thinned = [thin_cloud(c.seq, c.points, c.residual_m, c.intensity, most=each) for c in clouds]
     cap = _cap([c.residual_m for c in thinned if c.residual_m is not None])
     brightest = _brightest([c.intensity for c in thinned if c.intensity is not None])
@@ -396,7 +415,9 @@ def _brightest(seen: Sequence[NDArray[np.float32]]) -> float | None:
 def _levels(parts: Sequence[tuple[CloudView, Floats | None]], top: float | None) -> dict[str, Any]:
     """Levels 0 to 254 of the values from 0 to ``top``; 255 where there is none."""
     share = _each_point(parts) / (top or 1.0)
-    levels = np.where(np.isfinite(share), np.round(np.clip(share, 0.0, 1.0) * 254.0), _NO_VALUE)
+    levels = np.where(
+        np.isfinite(share), np.round(np.clip(share, 0.0, 1.0) * 254.0), _NO_VALUE_LEVEL
+    )
     return pack(levels, "u1")
 
 
@@ -420,7 +441,7 @@ def cone_lines(axis: Array, degrees: float, length: float, mouth: float) -> Arra
         mouth: Radius at the grasp point [m].
     """
     side = geometry.across(axis)
-    turn = np.linspace(0.0, 2.0 * math.pi, RING + 1)
+    turn = np.linspace(0.0, 2.0 * math.pi, CONE_LINES + 1)
     ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
     slope = math.tan(math.radians(degrees))
     a, b = 1.0 + slope * slope, slope * mouth  # along^2 + (mouth + slope along)^2 = length^2

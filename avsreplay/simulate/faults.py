@@ -23,14 +23,13 @@ import numpy as np
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.parts import FAULTS
-from avsreplay.records import Label
+from avsreplay.records import NS_PER_S, Label
 from avsreplay.settings import NoParameters, SettingError, Settings, declared_of, setting
 from avsreplay.simulate.scanner import Returns
 
-NS = 1_000_000_000
-LONGEST_S = 1e8  # longest log or window: its stamps fit the 31 bits of seconds of a ROS 2 time
-MOST_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
-MOST_CLUTTER = 100.0  # points added for each point of the scan
+MAX_WINDOW_S = 1e8  # longest log or window: its stamps fit the 31 bits of seconds of a ROS 2 time
+MAX_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
+MAX_CLUTTER_RATIO = 100.0  # points added for each point of the scan
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))
@@ -38,7 +37,7 @@ PLATE_TILT = math.tan(math.radians(15.0))
 CLUTTER_RADIUS_RATIO = 1.2
 OUTLIER_RANGES = 0.5, 1.5  # limits of the range of an outlier, over the median range of the scan
 # cosine to the mean direction of the points, below which a point is not in front of the scanner
-LEAST_AHEAD = 0.05
+LEAST_AHEAD_COSINE = 0.05
 RADIUS_QUANTILE = 0.9  # of the distances from the median point: the radius of an unknown target
 
 
@@ -155,7 +154,7 @@ class Occlusion(Fault):
             return shot
         turn = view_of(shot.returns.directions)
         seen = _turned(shot.returns, turn)
-        ahead = seen.directions[:, 2] > LEAST_AHEAD
+        ahead = seen.directions[:, 2] > LEAST_AHEAD_COSINE
         hidden = occlude(seen.keep(ahead), self.strength, side_rad, rng).joined(seen.keep(~ahead))
         return replace(shot, returns=replace(hidden, directions=hidden.directions @ turn))
 
@@ -203,7 +202,7 @@ class Empty(Fault):
 
 @dataclass(frozen=True, slots=True)
 class _Added(Settings):
-    strength: float = setting(0.5, "added points over returns", above=0.0, high=MOST_CLUTTER)
+    strength: float = setting(0.5, "added points over returns", above=0.0, high=MAX_CLUTTER_RATIO)
 
 
 class Clutter(Fault):
@@ -235,7 +234,7 @@ class Clutter(Fault):
 @dataclass(frozen=True, slots=True)
 class _Bias(Settings):
     strength: float = setting(
-        0.3, "metres added to every range", unit="m", low=-MOST_STRENGTH, high=MOST_STRENGTH
+        0.3, "metres added to every range", unit="m", low=-MAX_STRENGTH, high=MAX_STRENGTH
     )
 
 
@@ -256,7 +255,7 @@ class RangeBias(Fault):
 
 @dataclass(frozen=True, slots=True)
 class _Factor(Settings):
-    strength: float = setting(5.0, "factor on the noise", above=0.0, high=MOST_STRENGTH)
+    strength: float = setting(5.0, "factor on the noise", above=0.0, high=MAX_STRENGTH)
 
 
 class NoiseBurst(Fault):
@@ -289,7 +288,7 @@ class Frozen(Fault):
 @dataclass(frozen=True, slots=True)
 class _Jump(Settings):
     strength: float = setting(
-        30.0, "seconds added to the stamp", unit="s", low=-MOST_STRENGTH, high=MOST_STRENGTH
+        30.0, "seconds added to the stamp", unit="s", low=-MAX_STRENGTH, high=MAX_STRENGTH
     )
 
 
@@ -304,7 +303,7 @@ class StampJump(Fault):
 
     def apply(self, shot: Shot, at: Circumstances, rng: np.random.Generator) -> Shot:  # noqa: ARG002
         """Return the scan with the other stamp."""
-        return replace(shot, stamp_ns=shot.stamp_ns + round(self.strength * NS))
+        return replace(shot, stamp_ns=shot.stamp_ns + round(self.strength * NS_PER_S))
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,9 +383,9 @@ class InjectedFault(Settings):
         doc="Begin of the fault, after the time of the first scan.",
         unit="s",
         low=0.0,
-        high=LONGEST_S,
+        high=MAX_WINDOW_S,
     )
-    duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0, high=LONGEST_S)
+    duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0, high=MAX_WINDOW_S)
     strength: float | None = setting(
         None, "Strength; its meaning and range depend on the kind.", unset="the default of the kind"
     )
@@ -453,8 +452,8 @@ class InjectedFault(Settings):
         """
         return Label(
             kind=self.kind,
-            start_ns=epoch_ns + round(self.start_s * NS),
-            end_ns=epoch_ns + round((self.start_s + self.duration_s) * NS),
+            start_ns=epoch_ns + round(self.start_s * NS_PER_S),
+            end_ns=epoch_ns + round((self.start_s + self.duration_s) * NS_PER_S),
             harmful=self.type.harmful if self.harmful is None else self.harmful,
             strength=self.known_strength,
         )
@@ -486,7 +485,11 @@ def active(faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int) -> Activ
 
 
 def first_of_each_kind(now: Active) -> Active:
-    """Return the first fault of each kind, in their order."""
+    """Return the first fault of each kind, in their order.
+
+    Args:
+        now: the active faults with their numbers.
+    """
     first: dict[str, tuple[int, InjectedFault]] = {}
     for number, each in now:
         first.setdefault(each.kind, (number, each))
@@ -494,7 +497,11 @@ def first_of_each_kind(now: Active) -> Active:
 
 
 def in_order_of_action(now: Active) -> list[tuple[int, Fault]]:
-    """Return faults in the order in which they act; those of one kind keep their order."""
+    """Return faults in the order in which they act; those of one kind keep their order.
+
+    Args:
+        now: the active faults with their numbers.
+    """
     found = [(number, each.fault()) for number, each in now]
     return sorted(found, key=lambda item: (item[1].stage, item[1].name))
 
@@ -502,6 +509,9 @@ def in_order_of_action(now: Active) -> list[tuple[int, Fault]]:
 def view_of(directions: Array) -> Array:
     """Rotation (3, 3) from the frame of the scan to one whose +z axis is the mean direction of the
     points.
+
+    Args:
+        directions: unit directions (n, 3) of the points in the frame of the scan.
     """
     mean = directions.mean(axis=0)
     z = mean / np.sqrt(mean @ mean) if mean @ mean > 0.0 else np.array([0.0, 0.0, 1.0])

@@ -27,9 +27,10 @@ from avsreplay.records import State
 from avsreplay.settings import Settings, are_orthonormal, is_unit, setting
 from avsreplay.simulate.inertia import Body
 
-ORDER = 22
-STEP_RAD = 0.25
-MOST_STEPS = 100_000  # largest number of steps of the integration, 2 kB each: at least 4000 turns
+TAYLOR_ORDER = 22
+STEP_TURN_RAD = 0.25
+# largest number of steps of the integration, 2 kB each: at least 4000 turns
+MAX_INTEGRATION_STEPS = 100_000
 Vector = tuple[float, ...]
 Rows = Sequence[Sequence[float]]
 
@@ -132,7 +133,11 @@ class MotionParams(Settings):
 
 
 class Motion:
-    """The motion of a body over [0, span_s]."""
+    """The motion of a body over [0, span_s].
+
+    Attributes:
+        step_starts_s: (k,) begin of each step of the integration [s].
+    """
 
     def __init__(
         self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator
@@ -146,7 +151,7 @@ class Motion:
             rng: Generator of the disturbances.
         """
         self._body = body
-        self._starts, self._coefficients = _integrate(body, params, span_s, rng)
+        self.step_starts_s, self._coefficients = _integrate(body, params, span_s, rng)
 
     def states(self, times_s: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """Return attitude, angular rate, position and velocity.
@@ -160,14 +165,16 @@ class Motion:
         """
         times = np.asarray(times_s, dtype=np.float64)
         step = np.clip(
-            np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1
+            np.searchsorted(self.step_starts_s, times, side="right") - 1,
+            0,
+            len(self.step_starts_s) - 1,
         )
-        tau = (times - self._starts[step])[:, None]
+        tau = (times - self.step_starts_s[step])[:, None]
         value = np.zeros((len(times), 13))
         # ``take`` copies the column of all steps that it is given: those of one scan are few.
         first, last = (step.min(), step.max()) if len(step) else (0, 0)
         near = self._coefficients[first : last + 1]
-        for term in range(ORDER, -1, -1):
+        for term in range(TAYLOR_ORDER, -1, -1):
             value = value * tau + near[:, term].take(step - first, axis=0)
         return geometry.normalise(value[:, :4]), value[:, 4:7], value[:, 7:10], value[:, 10:]
 
@@ -224,7 +231,7 @@ class _Instant:
 def _integrate(
     body: Body, params: MotionParams, span_s: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Step starts (k,) and Taylor coefficients (k, ORDER + 1, 13) of [q_ac, w_c, r_a, v_a].
+    """Step starts (k,) and Taylor coefficients (k, TAYLOR_ORDER + 1, 13) of [q_ac, w_c, r_a, v_a].
 
     Raises:
         UsageError: The motion is too fast for its length.
@@ -235,7 +242,7 @@ def _integrate(
         _unit(params.attitude_xyzw), params.rate_radps, params.position_m, params.velocity_mps
     )
     fastest = max(math.hypot(*_times(inertia, now.w)) / least, params.orbit_rate_radps)
-    if span_s * fastest > MOST_STEPS * STEP_RAD:
+    if span_s * fastest > MAX_INTEGRATION_STEPS * STEP_TURN_RAD:
         raise _too_long(span_s)
     starts: list[float] = []
     table: list[Array] = []
@@ -245,20 +252,21 @@ def _integrate(
         t, now = begin, _pushed(now, params.push, begin)
         while t < until:
             momentum = math.sqrt(sum(x * x for x in _times(inertia, now.w)))
-            end = min(until, t + STEP_RAD * least / momentum) if momentum > 0.0 else until
+            end = min(until, t + STEP_TURN_RAD * least / momentum) if momentum > 0.0 else until
             if params.orbit_rate_radps > 0.0:
-                end = min(end, t + STEP_RAD / params.orbit_rate_radps)
+                end = min(end, t + STEP_TURN_RAD / params.orbit_rate_radps)
             terms = _terms(now, inertia, torque, _translation(now, params, t, force))
             starts.append(t)
             table.append(np.array(terms))
-            if len(table) > MOST_STEPS:
+            if len(table) > MAX_INTEGRATION_STEPS:
                 raise _too_long(span_s)
             now, t = _at_end(terms, end - t), end
     return np.array(starts), np.array(table)
 
 
 def _too_long(span_s: float) -> UsageError:
-    what = f"{span_s:g} s of this motion need more than {MOST_STEPS} steps of {STEP_RAD} rad"
+    steps = f"{MAX_INTEGRATION_STEPS} steps of {STEP_TURN_RAD} rad"
+    what = f"{span_s:g} s of this motion need more than {steps}"
     return UsageError(what, where="motion", hint="record a shorter log, or a slower motion")
 
 
@@ -309,7 +317,7 @@ def _pushed(now: _Instant, pushes: Sequence[Push], t: float) -> _Instant:
 def _terms(
     now: _Instant, inertia: Rows, torque: Vector, translation: tuple[list[Vector], list[Vector]]
 ) -> list[Vector]:
-    """Taylor coefficients about ``now``, ORDER + 1 rows of 13."""
+    """Taylor coefficients about ``now``, TAYLOR_ORDER + 1 rows of 13."""
     turning = _turning(now, inertia, _inverse(inertia), torque)
     return [(*q, *w, *r, *v) for (q, w), r, v in zip(turning, *translation, strict=True)]
 
@@ -325,11 +333,11 @@ def _translation(
     """
     zero = (0.0, 0.0, 0.0)
     if params.orbit_rate_radps == 0.0:
-        centre = [now.r, now.v, tuple(0.5 * f for f in force)] + [zero] * (ORDER - 2)
-        return centre, [now.v, force] + [zero] * (ORDER - 1)
+        centre = [now.r, now.v, tuple(0.5 * f for f in force)] + [zero] * (TAYLOR_ORDER - 2)
+        return centre, [now.v, force] + [zero] * (TAYLOR_ORDER - 1)
     gradients = _gravity_gradient(params, t)
     centre, velocity = [now.r], [now.v]
-    for k in range(ORDER):
+    for k in range(TAYLOR_ORDER):
         rates = list(force) if k == 0 else [0.0, 0.0, 0.0]
         for i in range(k + 1):
             rates = [a + b for a, b in zip(rates, _times(gradients[i], centre[k - i]), strict=True)]
@@ -354,7 +362,7 @@ def _gravity_gradient(params: MotionParams, t: float) -> list[Rows]:
 
     found: list[Rows] = []
     scale = 1.0
-    for k in range(ORDER):
+    for k in range(TAYLOR_ORDER):
         phase = 2.0 * n * t + 0.5 * math.pi * k
         c, s = scale * math.cos(phase), scale * math.sin(phase)
         one = 1.0 if k == 0 else 0.0
@@ -370,7 +378,7 @@ def _turning(
     i and k - i.
     """
     qs, ws, hs = [now.q], [now.w], [_times(inertia, now.w)]
-    for k in range(ORDER):
+    for k in range(TAYLOR_ORDER):
         load = [torque[i] if k == 0 else 0.0 for i in range(3)]
         turn = [0.0, 0.0, 0.0, 0.0]
         for i in range(k + 1):

@@ -25,8 +25,8 @@ from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 
-REFLECTANCE = 0.5  # diffuse reflectance where no material is given
-_RING = 6  # rays of a beam around its centre
+DEFAULT_REFLECTANCE = 0.5  # diffuse reflectance where no material is given
+_BEAM_RING_RAYS = 6  # rays of a beam around its centre
 Corners = tuple[float, float, float, float, float, float]
 
 
@@ -48,7 +48,7 @@ class Material(Settings):
         "The faces of this group (g), object (o) or material (usemtl) of an OBJ model; empty: of"
         " any.",
     )
-    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+    reflectance: float = setting(DEFAULT_REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
     specular: float = setting(
         0.0, "Strength of the specular lobe in units of a white diffuse surface.", low=0.0
     )
@@ -94,6 +94,12 @@ class FaceOptics:
     ) -> Array:
         """Intensity (n,) of returns from these faces (n,), by cosine of incidence (n,) and range
         (n,) [m].
+
+        Args:
+            faces: number of the face of each return (n,).
+            cosines: cosine of incidence (n,).
+            ranges: (n,) [m].
+            reference_m: range at which the intensity is the reflectance [m].
         """
         angle = np.arccos(np.minimum(cosines, 1.0))
         lobe = self.specular[faces] * np.exp(-np.square(angle / self.width_rad[faces]))
@@ -134,7 +140,7 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     optics = FaceOptics(
-        np.full(count, REFLECTANCE),
+        np.full(count, DEFAULT_REFLECTANCE),
         zero.copy(),
         np.full(count, 0.1),
         zero.copy(),
@@ -235,7 +241,11 @@ class TracedRays:
         )
 
     def chosen(self, index: NDArray[np.intp]) -> TracedRays:
-        """Return some of the rays."""
+        """Return some of the rays.
+
+        Args:
+            index: their numbers (k,).
+        """
         return TracedRays(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
@@ -256,8 +266,8 @@ def beam(directions: Array, divergence_rad: float) -> Array:
     side /= np.linalg.norm(side, axis=1)[:, None]
     other = np.cross(directions, side)
     rays = [directions]
-    for k in range(_RING):
-        angle = 2.0 * math.pi * k / _RING
+    for k in range(_BEAM_RING_RAYS):
+        angle = 2.0 * math.pi * k / _BEAM_RING_RAYS
         ray = directions + math.tan(ring) * (math.cos(angle) * side + math.sin(angle) * other)
         rays.append(ray / np.linalg.norm(ray, axis=1)[:, None])
     return np.stack(rays)
@@ -312,6 +322,11 @@ def crosstalk(ranges: Array, intensities: Array, ratio: float) -> Array:
 
     The sum of two returns of a continuous-wave instrument has, to first order in their difference,
     the mean of their ranges weighted by intensity.
+
+    Args:
+        ranges: (n,) [m].
+        intensities: (n,) of the returns.
+        ratio: share of the strongest return that is added to every return.
     """
     if not len(ranges):
         return ranges
@@ -344,7 +359,12 @@ def bloomed(
 
 
 def part_of(surface: Surface, faces: NDArray[np.intp]) -> Surface:
-    """Return the mesh with some of its faces only."""
+    """Return the mesh with some of its faces only.
+
+    Args:
+        surface: the mesh.
+        faces: numbers (k,) of the faces.
+    """
     return (
         surface
         if len(faces) == len(surface.faces)

@@ -53,6 +53,14 @@ def ray_grid(
     mirrors, row by row from the top left. A Lissajous figure has as many rays as columns times
     rows. A spinning scanner measures column by column from the left; its rays are uniform in
     azimuth and elevation.
+
+    Args:
+        pattern: order in which the rays are measured.
+        view: shape of the field of view.
+        fov_deg: width and height of the field of view [deg].
+        rays: number of columns and rows.
+        lissajous: frequencies of the figure across and down.
+        scan_s: duration of a scan [s].
     """
     (across, down), (columns, rows) = fov_deg, rays
     halves = [math.radians(0.5 * across), math.radians(0.5 * down)]
@@ -93,7 +101,7 @@ def _steps(n: int) -> list[float]:
     return [(2 * k + 1) / n - 1.0 for k in range(n)]
 
 
-CHUNK = 1 << 20  # ray-triangle pairs held at once by the exact search
+CHUNK_PAIRS = 1 << 20  # ray-triangle pairs held at once by the exact search
 Hits = NDArray[np.int64]
 Search = Callable[[Array, Array], Hits]
 
@@ -188,7 +196,7 @@ def _exact(corners: Array) -> Search:
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
     def search(origins: Array, directions: Array) -> Hits:
-        rows = max(1, CHUNK // max(1, len(a)))
+        rows = max(1, CHUNK_PAIRS // max(1, len(a)))
         parts = [
             _nearest(
                 origins[k : k + rows, None] if len(origins) > 1 else origins[None],

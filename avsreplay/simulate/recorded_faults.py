@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from avsreplay.records import Scan, ScanStatus
+from avsreplay.records import NS_PER_S, Scan, ScanStatus
 from avsreplay.simulate.faults import (
-    NS,
     Circumstances,
     InjectedFault,
     Shot,
@@ -24,9 +23,9 @@ from avsreplay.simulate.faults import (
 )
 from avsreplay.simulate.scanner import Returns
 
-# Neighbours, and most samples, for the estimate of the range noise.
-_NEIGHBOURS = 9
-_NOISE_SAMPLES = 1000
+# For the estimate of the range noise.
+_NOISE_NEIGHBOURS = 9
+_NOISE_SAMPLES = 1000  # at most
 
 
 @dataclass(slots=True)
@@ -66,7 +65,7 @@ class _Disturbance:
 
     def _circumstances(self, scan: Scan, number: int, place: int) -> Circumstances:
         return Circumstances(
-            t_s=(scan.log_ns - self.epoch_ns) / NS,
+            t_s=(scan.log_ns - self.epoch_ns) / NS_PER_S,
             place=place,
             window=lambda: self._rng(0, number, 0),
             along_z=False,
@@ -157,15 +156,17 @@ def range_noise(returns: Returns, rng: np.random.Generator) -> float:
     """
     known = returns.keep(returns.ranges > 0.0)
     count = len(known.ranges)
-    if count <= _NEIGHBOURS:
+    if count <= _NOISE_NEIGHBOURS:
         return 0.0
     chosen = np.sort(rng.choice(count, min(_NOISE_SAMPLES, count), replace=False))
     from scipy.spatial import cKDTree  # takes 0.2 s to import
 
-    _, near = cKDTree(known.directions).query(known.directions[chosen], _NEIGHBOURS)
+    _, near = cKDTree(known.directions).query(known.directions[chosen], _NOISE_NEIGHBOURS)
     ranges, directions = known.ranges[near], known.directions[near]
     inverse = (1.0 / ranges)[:, :, None]
     deviations = (
         (inverse - directions @ (np.linalg.pinv(directions) @ inverse))[:, :, 0] * ranges * ranges
     )
-    return float(np.median(np.sqrt(np.sum(deviations * deviations, axis=1) / (_NEIGHBOURS - 3))))
+    return float(
+        np.median(np.sqrt(np.sum(deviations * deviations, axis=1) / (_NOISE_NEIGHBOURS - 3)))
+    )

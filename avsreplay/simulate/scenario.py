@@ -16,7 +16,7 @@ from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 from avsreplay.settings import Settings, setting
-from avsreplay.simulate.faults import LONGEST_S, InjectedFault
+from avsreplay.simulate.faults import MAX_WINDOW_S, InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.optics import Material
 from avsreplay.simulate.rays import Preset, ScannerParams
@@ -83,7 +83,7 @@ class ScenarioParams(Settings):
 
     name: str = setting("scenario", "Name of the scenario.")
     seed: int = setting(0, "Seed of every random draw.", low=0, below=2**63)
-    duration_s: float = setting(120.0, "Length of the log.", unit="s", above=0.0, high=LONGEST_S)
+    duration_s: float = setting(120.0, "Length of the log.", unit="s", above=0.0, high=MAX_WINDOW_S)
     rate_hz: float = setting(5.0, "Scan rate.", unit="Hz", above=0.0)
     target: TargetParams = setting(TargetParams, "The target.")
     motion: MotionParams = setting(MotionParams, "The target's motion.")
@@ -219,6 +219,12 @@ def _with_preset(document: toml_document.Document) -> toml_document.Document:
 def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator) -> Belief:
     """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20
     error states.
+
+    Args:
+        start: the offsets and the 1 sigma.
+        truth: the true state at the instant.
+        t_ns: the instant [ns].
+        rng: generator of the random numbers.
 
     Raises:
         UsageError: the given offset leads to inertia ratios that no body has.

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.records import Label, Surface
+from avsreplay.records import NS_PER_S, Label, Surface
 from avsreplay.settings import Settings, is_unit, setting
-from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
+from avsreplay.simulate.optics import DEFAULT_REFLECTANCE, FaceOptics, Material, face_optics
 from avsreplay.simulate.rays import Engine, RayCaster
 from avsreplay.simulate.target import adapter, box
 
-NS = 1_000_000_000
-_STATIONS = 64  # points of the sum along a ray through a plume
-_NEAREST_M = 0.1  # distance from the nozzle below which the density of the particles is constant
+_PLUME_STATIONS = 64  # points of the sum along a ray through a plume
+# distance from the nozzle below which the density of the particles is constant
+_NOZZLE_DISTANCE_M = 0.1
 Triple = tuple[float, float, float]
 
 
@@ -60,7 +60,11 @@ class Presence(Settings):
             raise ValueError("it needs a name")
 
     def present(self, t_s: float) -> bool:
-        """Return whether it is present at a time [s after the instant of the first scan]."""
+        """Return whether it is present at a time [s after the instant of the first scan].
+
+        Args:
+            t_s: time [s after the first scan].
+        """
         return self.start_s <= t_s and (
             self.duration_s is None or t_s < self.start_s + self.duration_s
         )
@@ -72,7 +76,7 @@ class Presence(Settings):
         if self.duration_s is None:
             return None
         start, end = (
-            epoch_ns + round(t * NS) for t in (self.start_s, self.start_s + self.duration_s)
+            epoch_ns + round(t * NS_PER_S) for t in (self.start_s, self.start_s + self.duration_s)
         )
         return Label(self.name, start, end, self.harmful)
 
@@ -114,7 +118,7 @@ class SceneObject(Presence):
     rate_radps: Triple = setting(
         (0.0, 0.0, 0.0), "Constant angular rate in the axes of {A}.", unit="rad/s"
     )
-    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+    reflectance: float = setting(DEFAULT_REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
 
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion, or the name is empty."""
@@ -123,7 +127,11 @@ class SceneObject(Presence):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
 
     def poses(self, times_s: Array) -> tuple[Array, Array]:
-        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s]."""
+        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s].
+
+        Args:
+            times_s: (n,) [s after the first scan].
+        """
         turn = geometry.exp(times_s[:, None] * np.array(self.rate_radps))
         R_as = geometry.matrix(
             geometry.multiply(turn, geometry.normalise(np.array([self.attitude_xyzw])))
@@ -162,7 +170,7 @@ class Plume(Presence):
         low=0.0,
     )
     reflectance: float = setting(
-        REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0
+        DEFAULT_REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0
     )
 
     def check(self) -> None:
@@ -180,11 +188,14 @@ class Plume(Presence):
             rng: draws the particles.
         """
         depth_at_hit = rng.exponential(size=len(rays))
-        spacing, axis = ends_m / _STATIONS, np.array(self.direction) / math.hypot(*self.direction)
+        spacing, axis = (
+            ends_m / _PLUME_STATIONS,
+            np.array(self.direction) / math.hypot(*self.direction),
+        )
         depth, found = np.zeros(len(rays)), np.full(len(rays), np.inf)
-        for k in range(_STATIONS):  # the midpoint rule
+        for k in range(_PLUME_STATIONS):  # the midpoint rule
             there = (k + 0.5) * spacing[:, None] * rays - np.array(self.nozzle_m)
-            away = np.maximum(np.linalg.norm(there, axis=1), _NEAREST_M)
+            away = np.maximum(np.linalg.norm(there, axis=1), _NOZZLE_DISTANCE_M)
             angle = np.arccos(np.clip(there @ axis / away, -1.0, 1.0))
             spread = np.exp(-np.square(angle / math.radians(self.half_angle_deg)))
             added = self.particles_per_metre * spread / np.square(away) * spacing
@@ -280,7 +291,12 @@ class Appendage(Settings):
             raise ValueError(f"axis_c = {list(self.axis_c)} is not a unit vector")
 
     def placed(self, target: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:
-        """Poses (n, 3, 3), (n, 3) of the part in {A} from those of the target at times (n,) [s]."""
+        """Poses (n, 3, 3), (n, 3) of the part in {A} from those of the target at times (n,) [s].
+
+        Args:
+            target: rotations (n, 3, 3) and positions (n, 3) of {C} in {A} [m].
+            times_s: (n,) [s after the first scan].
+        """
         R_ac, t_ac = target
         phase = 2.0 * math.pi * self.frequency_hz * times_s + math.radians(self.phase_deg)
         angle = math.radians(self.amplitude_deg) * np.sin(phase)
@@ -294,6 +310,10 @@ class Appendage(Settings):
 def appendage_faces(surface: Surface, appendages: Sequence[Appendage]) -> NDArray[np.int64]:
     """The number of the appendage (m,) to which each face belongs, -1 for the rigid part; of
     several the last.
+
+    Args:
+        surface: the model of the target.
+        appendages: the moving parts.
 
     Raises:
         UsageError: no face lies in the box of an appendage.
@@ -346,6 +366,9 @@ class MovingCamera:
     def poses(self, times_s: Array) -> tuple[Array, Array]:
         """Rotations R_wa (n, 3, 3) and positions (n, 3) in the fixed frame [m] at times (n,)
         [s].
+
+        Args:
+            times_s: (n,) [s after the first scan].
         """
         p = self.params
         swing = np.sin(2.0 * math.pi * p.frequency_hz * times_s[:, None] + self.phases)
@@ -355,12 +378,21 @@ class MovingCamera:
         return R, times_s[:, None] * np.array(p.velocity_mps) + p.vibration_m * swing[:, :3]
 
     def pose(self, t_s: float) -> Pose:
-        """Return the pose T_wa at a time [s]."""
+        """Return the pose T_wa at a time [s].
+
+        Args:
+            t_s: time [s after the first scan].
+        """
         R, t = self.poses(np.array([t_s]))
         return Pose(geometry.quaternion(R[0]), t[0])
 
     def reported(self, t_s: float, rng: np.random.Generator) -> Pose:
-        """Return the pose that the topic reports, with its error."""
+        """Return the pose that the topic reports, with its error.
+
+        Args:
+            t_s: time [s after the first scan].
+            rng: generator of the errors.
+        """
         p, true = self.params, self.pose(t_s)
         error = geometry.exp(math.radians(p.pose_std_deg) * rng.standard_normal(3))
         return Pose(
@@ -382,6 +414,11 @@ def scene_bodies(
 ) -> list[SceneBody]:
     """The objects of a scenario; ``meshes`` has the surface of every ``model`` that one of
     them names.
+
+    Args:
+        objects: the objects.
+        meshes: the surface of every ``model`` that one of them names.
+        engine: what casts the rays.
     """
     bodies = []
     for params in objects:

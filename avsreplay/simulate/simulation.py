@@ -17,7 +17,7 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Pose
-from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.records import NS_PER_S, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
 from avsreplay.simulate.faults import Circumstances, InjectedFault, Shot, Stage
 from avsreplay.simulate.motion import Motion
@@ -29,7 +29,7 @@ from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
 from avsreplay.simulate.target import Shape, body, builtin_surface
 
 __all__ = [
-    "EPOCH_NS",
+    "SIMULATED_EPOCH_NS",
     "Engine",
     "InjectedFault",
     "Scenario",
@@ -44,11 +44,20 @@ __all__ = [
 
 
 # time of the first scan of every simulated log, fixed so that logs are reproducible
-EPOCH_NS = 1_700_000_000_000_000_000
-NS = 1_000_000_000
+SIMULATED_EPOCH_NS = 1_700_000_000_000_000_000
 T = TypeVar("T")
-_NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", "plume", "limb"
-_STREAMS = {name: k for k, name in enumerate(_NAMES)}
+_GENERATOR_NAMES = (
+    "motion",
+    "start",
+    "noise",
+    "fault",
+    "plate",
+    "camera",
+    "camera_pose",
+    "plume",
+    "limb",
+)
+_STREAMS = {name: k for k, name in enumerate(_GENERATOR_NAMES)}
 
 
 @value_class
@@ -79,7 +88,7 @@ class Simulation:
         Args:
             log_ns: Instant on the clock of the log [ns].
         """
-        return self._motion.state((log_ns - EPOCH_NS) / NS)
+        return self._motion.state((log_ns - SIMULATED_EPOCH_NS) / NS_PER_S)
 
     def truth_of(self, scan: Scan) -> Truth:
         """Return the ground truth at one of this simulation's scans: pose, full state and injected
@@ -90,7 +99,7 @@ class Simulation:
         """
         state = self.truth(scan.log_ns)
         kinds = [each.kind for _, each in self._faults(scan.log_ns)]
-        t_s, params = (scan.log_ns - EPOCH_NS) / NS, self._scenario.params
+        t_s, params = (scan.log_ns - SIMULATED_EPOCH_NS) / NS_PER_S, self._scenario.params
         others = [
             each for each in (*params.object, *params.plume, *params.limb) if each.present(t_s)
         ]
@@ -112,21 +121,22 @@ class Simulation:
             return []
         rng, scanner = self._rng("camera_pose", scan.seq), self._scenario.params.scanner
         last = 0.0 if scanner.pattern is Pattern.FLASH else scanner.scan_s
-        after = sorted({round(part * last * NS / 8) for part in range(9)})
+        after = sorted({round(part * last * NS_PER_S / 8) for part in range(9)})
         return [
-            (ns, self._camera.reported((scan.log_ns + ns - EPOCH_NS) / NS, rng)) for ns in after
+            (ns, self._camera.reported((scan.log_ns + ns - SIMULATED_EPOCH_NS) / NS_PER_S, rng))
+            for ns in after
         ]
 
     def _faults(self, log_ns: int) -> faults.Active:
         every = self._scenario.params.fault
-        return faults.first_of_each_kind(faults.active(every, EPOCH_NS, log_ns))
+        return faults.first_of_each_kind(faults.active(every, SIMULATED_EPOCH_NS, log_ns))
 
     def scans(self) -> Iterator[Scan]:
         """The scans in the order of recording; a dropped one leaves a gap in ``seq``."""
         last: Scan | None = None
         places: dict[int, int] = {}  # scans so far in the window of each fault
         for k in range(self.count):
-            log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
+            log_ns = SIMULATED_EPOCH_NS + round(k * NS_PER_S / self._scenario.params.rate_hz)
             now = self._faults(log_ns)
             shot = self._shot(k, log_ns, now, places)
             places.update({number: places.get(number, 0) + 1 for number, _ in now})
@@ -160,7 +170,11 @@ class Simulation:
 
     def _shot(self, k: int, log_ns: int, now: faults.Active, places: Mapping[int, int]) -> Shot:
         """Ray casting, noise and faults, in the order in which they act on the light."""
-        noise, t_s, params = self._rng("noise", k), (log_ns - EPOCH_NS) / NS, self._scenario.params
+        noise, t_s, params = (
+            self._rng("noise", k),
+            (log_ns - SIMULATED_EPOCH_NS) / NS_PER_S,
+            self._scenario.params,
+        )
         bodies = [body for body in self._bodies if body.params.present(t_s)]
         plumes = [each for each in params.plume if each.present(t_s)]
         limbs = [each for each in params.limb if each.present(t_s)]
@@ -230,14 +244,16 @@ def simulate(
     first = motion.state(0.0)
     start = None
     if params.start is not None:
-        start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
-    others = [each.label(EPOCH_NS) for each in (*params.object, *params.plume, *params.limb)]
+        start = belief(params.start, first, SIMULATED_EPOCH_NS, _generator(params.seed, "start", 0))
+    others = [
+        each.label(SIMULATED_EPOCH_NS) for each in (*params.object, *params.plume, *params.limb)
+    ]
     header = LogHeader(
         surface=surface,
         scenario=scenario.text,
         seed=params.seed,
         labels=(
-            *(each.label(EPOCH_NS) for each in params.fault),
+            *(each.label(SIMULATED_EPOCH_NS) for each in params.fault),
             *(label for label in others if label),
         ),
         start=start,

@@ -37,14 +37,14 @@ from avsreplay.rows import Row
 from avsreplay.run import Job, Listener, ReplayedScan, Run
 from avsreplay.saved_result import of_run
 from avsreplay.simulate.scenario import scenario_of
-from avsreplay.sweep.campaign import SCORES, RunResult
+from avsreplay.sweep.campaign import RECORDED_SCORES, RunResult
 from avsreplay.sweep.expansion import Expansion, Point, Task
 from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
 from avsreplay.sweep.page import build_sweep_page
 from avsreplay.sweep.statistics import episode_lines
 from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
 
-BATCH = 5_000  # runs held in memory while results.parquet is written
+RUN_BATCH = 5_000  # runs held in memory while results.parquet is written
 SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written
 _FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
 
@@ -59,7 +59,12 @@ def run_task(task: Task) -> RunResult:
 
 
 def log_of(task: Task, folder: Path) -> Path:
-    """The log of a run: the one it names, or its scenario recorded into ``folder``."""
+    """The log of a run: the one it names, or its scenario recorded into ``folder``.
+
+    Args:
+        task: the run.
+        folder: where a scenario is recorded.
+    """
     if task.log:
         return Path(task.log)
     scenario = scenario_of(toml_document.parse(task.scenario, "scenario"), folder=Path(task.folder))
@@ -133,7 +138,7 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
     alpha = None
     if row.innov_m is not None and row.innov_deg is not None:
         alpha = float(np.hypot(row.innov_m, length_m * np.radians(row.innov_deg)))
-    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in SCORES)
+    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in RECORDED_SCORES)
     return (row.seq, row.fault, harmful, row.gamma, *scores)
 
 
@@ -175,9 +180,9 @@ def _word(name: str) -> str:
     return "".join(c if c.isalnum() or c == "_" else "_" for c in name).strip("_")
 
 
-IN_FLIGHT = 4  # tasks per worker thread that run or wait; limits the tasks at the scheduler
-CONNECT_S = 10  # time limit for the answer of a scheduler [s]
-LOOK_EVERY = 64  # completions between two queries for the number of workers
+TASKS_PER_THREAD = 4  # tasks per worker thread that run or wait; limits the tasks at the scheduler
+CONNECT_TIMEOUT_S = 10  # time limit for the answer of a scheduler [s]
+WORKER_QUERY_PERIOD = 64  # completions between two queries for the number of workers
 
 
 class Identified(Protocol):
@@ -215,7 +220,7 @@ def run_tasks(
     if workers == 0 and scheduler is None:
         yield from _here(tasks, work)
         return
-    with _client(workers, scheduler, dashboard) as client:
+    with connected(workers, scheduler, dashboard) as client:
         yield from _on(client, iter(tasks), work)
 
 
@@ -235,15 +240,25 @@ def _here(tasks: Iterable[T], work: Callable[[T], RunResult]) -> Iterator[RunRes
         for task in tasks:
             future = pool.submit(work, task)
             error = future.exception()
-            yield future.result() if error is None else _crashed(task.id, error)
+            yield future.result() if error is None else crashed(task.id, error)
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+def connected(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+    """Connect to a Dask scheduler, or start one with workers on this machine, as a context.
+
+    Args:
+        workers: number of worker processes, where one is started.
+        scheduler: address of a running scheduler; None starts one.
+        dashboard: address of the dashboard of one that is started.
+
+    Raises:
+        UnreadableInput: the scheduler does not answer.
+    """
     dask = _distributed()
     if scheduler is not None:
         try:
-            with dask.Client(scheduler, timeout=CONNECT_S) as client:
+            with dask.Client(scheduler, timeout=CONNECT_TIMEOUT_S) as client:
                 yield client
         except (OSError, ValueError) as error:
             what = f"the scheduler does not answer: {str(error).splitlines()[0]}"
@@ -289,10 +304,10 @@ def _on(client: Any, tasks: Iterator[T], work: Callable[[T], RunResult]) -> Iter
     on another one.
     """
     running = _distributed().as_completed()
-    held, count, limit = 0, 0, IN_FLIGHT
+    held, count, limit = 0, 0, TASKS_PER_THREAD
     while True:
-        if count % LOOK_EVERY == 0:
-            limit = IN_FLIGHT * max(1, sum(client.nthreads().values()))
+        if count % WORKER_QUERY_PERIOD == 0:
+            limit = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
         while held < limit and (task := next(tasks, None)) is not None:
             running.add(client.submit(work, task, key=f"run-{task.id}", pure=False))
             held += 1
@@ -307,12 +322,16 @@ def _collected(future: Any) -> RunResult:
     if future.status == "finished":
         outcome: RunResult = future.result()
         return outcome
-    return _crashed(str(future.key).removeprefix("run-"), future.exception())
+    return crashed(str(future.key).removeprefix("run-"), future.exception())
 
 
-def _crashed(task_id: str, error: BaseException | None) -> RunResult:
-    """The result of a run that raised: kind and first line of the error, without addresses
-    that differ between runs.
+def crashed(task_id: str, error: BaseException | None) -> RunResult:
+    """Return the result of a run that raised: kind and first line of the error, without addresses,
+    which differ between runs.
+
+    Args:
+        task_id: the run.
+        error: what it raised.
     """
     if type(error).__name__ == "KilledWorker":
         return RunResult(task_id, "crashed", "the worker process died repeatedly")
@@ -422,7 +441,7 @@ def _write_runs(
         return (*place, *(_plain(found.get(name), only[name]) for name in columns))
 
     runs = (row(*found) for found in _finished(plan, journal))
-    write_batches(path, schema, iter(lambda: list(islice(runs, BATCH)), []))
+    write_batches(path, schema, iter(lambda: list(islice(runs, RUN_BATCH)), []))
 
 
 def _plain(value: Any, kind: str) -> Any:

@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 from scipy.signal import lfilter
 
-from avsreplay.report.conclusion import _BLOCKS, _IN_BLOCK
+from avsreplay.report.conclusion import _LEAST_BLOCK_SCANS, _MAX_BLOCKS
 from avsreplay.report.intervals import interval_of_roots
 
 
@@ -24,7 +24,8 @@ def contains_zero(rng: np.random.Generator, count: int, phi: float) -> bool:
     drawn[:, 0] /= np.sqrt(1.0 - phi**2)
     base, other = np.square(0.01 + 0.003 * lfilter([1.0], [1.0, -phi], drawn, axis=1))
     blocks = [
-        np.array_split(squares, min(_BLOCKS, count // _IN_BLOCK)) for squares in (base, other)
+        np.array_split(squares, min(_MAX_BLOCKS, count // _LEAST_BLOCK_SCANS))
+        for squares in (base, other)
     ]
     low, high = interval_of_roots(*(np.array([block.mean() for block in run]) for run in blocks))
     return low <= 0.0 <= high

@@ -289,19 +289,19 @@ def build(folder: Path) -> None:
     scenario.MAX_SCANS = (
         2000  # more are refused as those above the limit are, not recorded for hours
     )
-    log.GrowingLog, log._POLL_S, log._PER_OPENING = WrittenLog, 0.0, 0.0
+    log.GrowingLog, log._POLL_S, log._OPENING_DURATIONS = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {
         "scenario.toml": SCENARIO,
         "rules.toml": RULES,
         "robot.toml": ROBOT,
-        "task.toml": b"[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
+        "task.toml": "[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
         "dense.toml": SCENARIO.replace("[40, 40]", "[80, 80]"),
         "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml")),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
-    collect = run_command._collect
+    collect = run_command.collect
     with (
         contextlib.redirect_stdout(io.StringIO()) as out,
         contextlib.redirect_stderr(io.StringIO()),
@@ -315,10 +315,10 @@ def build(folder: Path) -> None:
         call("record", folder / "dense.toml", "-o", folder / "dense.mcap")
         with cached(folder / "cache"):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "result")
-        run_command._collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
+        run_command.collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
         with contextlib.suppress(click.Abort, KeyboardInterrupt):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "interrupted")
-        run_command._collect = collect
+        run_command.collect = collect
         call("sweep", folder / "campaign.toml", "-o", folder / "sweep", "--workers", "0")
     _files(folder)
 

@@ -223,7 +223,7 @@ def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
     for _ in range(int(rng.integers(1, 9))):
         if out:
             out = bytearray(MUTATIONS[int(rng.integers(len(MUTATIONS)))](out, rng, others))
-    if rng.random() < 0.5 and out[:8] == mcap.MAGIC:
+    if rng.random() < 0.5 and out[:8] == mcap.MCAP_MAGIC:
         _mend(out)
     return bytes(out)
 
@@ -237,7 +237,7 @@ def in_place(data: bytes, rng: np.random.Generator) -> bytes:
         if out:
             size, change = len(out), (_flip, _set, _number)[int(rng.integers(3))]
             out = change(out, rng, [])[:size]
-    if out[:8] == mcap.MAGIC:
+    if out[:8] == mcap.MCAP_MAGIC:
         _mend(out)
     return bytes(out)
 
@@ -322,7 +322,7 @@ def _mend(out: bytearray) -> None:
     while at + 49 <= len(out):
         opcode, length = struct.unpack_from("<BQ", out, at)
         if (
-            opcode == mcap.CHUNK
+            opcode == mcap.Opcode.CHUNK
             and length > 40
             and at + 9 + length <= len(out)
             and out[at + 37 : at + 41] == bytes(4)
@@ -330,7 +330,7 @@ def _mend(out: bytearray) -> None:
             data = bytes(out[at + 49 : at + 9 + length])
             struct.pack_into("<QI", out, at + 25, len(data), zlib.crc32(data))
             struct.pack_into("<Q", out, at + 41, len(data))
-        if opcode == mcap.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
+        if opcode == mcap.Opcode.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
             struct.pack_into(
                 "<I", out, at + 5 + length, zlib.crc32(bytes(out[at + 9 : at + 5 + length]))
             )

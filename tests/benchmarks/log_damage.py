@@ -81,12 +81,14 @@ def frames(data: bytes) -> list[tuple[int, int, int]]:
 def places(data: bytes) -> dict[str, tuple[int, int]]:
     """Byte ranges by name."""
     found = frames(data)
-    chunk = [(b, e) for op, b, e in found if op == mcap.CHUNK]
+    chunk = [(b, e) for op, b, e in found if op == mcap.Opcode.CHUNK]
     index = next(
-        (b, e) for op, b, e in found if op == mcap.MESSAGE_INDEX and b >= chunk[len(chunk) // 2][1]
+        (b, e)
+        for op, b, e in found
+        if op == mcap.Opcode.MESSAGE_INDEX and b >= chunk[len(chunk) // 2][1]
     )
-    end = next(e for op, _, e in found if op == mcap.DATA_END)
-    named = {"header record": mcap.METADATA, "model": mcap.ATTACHMENT}
+    end = next(e for op, _, e in found if op == mcap.Opcode.DATA_END)
+    named = {"header record": mcap.Opcode.METADATA, "model": mcap.Opcode.ATTACHMENT}
     out = {
         name: next((b, e) for op, b, e in found if op == opcode) for name, opcode in named.items()
     }
@@ -100,7 +102,7 @@ def places(data: bytes) -> dict[str, tuple[int, int]]:
 
 def untouched(data: bytes, broken: bytes) -> set[int]:
     """Stamps of the scans in chunks whose record is still there, whole."""
-    chunk = [(b, e) for op, b, e in frames(data) if op == mcap.CHUNK]
+    chunk = [(b, e) for op, b, e in frames(data) if op == mcap.Opcode.CHUNK]
     whole = [data[b:e] in broken for b, e in chunk]
     return {CLOUDS[i].t_ns for i in range(len(CLOUDS)) if whole[i // 2]}
 

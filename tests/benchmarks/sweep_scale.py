@@ -27,7 +27,7 @@ from pathlib import Path
 from sweep_speed import CAMPAIGN
 
 from avsreplay.sweep.campaign import load_campaign
-from avsreplay.sweep.execute import IN_FLIGHT, RunResult, run_task
+from avsreplay.sweep.execute import TASKS_PER_THREAD, RunResult, run_task
 from avsreplay.sweep.expansion import expand
 from avsreplay.sweep.journal import Journal
 
@@ -109,7 +109,7 @@ def whole_cost(workers: int, tasks: int) -> float:
         client.gather(client.map(abs, range(workers), pure=False))
         start, running = time.process_time(), as_completed()
         sent = iter(range(tasks))
-        for number, _ in zip(sent, range(IN_FLIGHT * workers), strict=False):
+        for number, _ in zip(sent, range(TASKS_PER_THREAD * workers), strict=False):
             running.add(client.submit(abs, number, pure=False))
         for _ in running:
             if (number := next(sent, None)) is not None:
@@ -129,7 +129,7 @@ async def simulated(
     events: list[tuple[float, str, str]] = []
     waiting = runs
     while waiting:
-        while sent < runs and len(state.scheduler.tasks) < IN_FLIGHT * workers:
+        while sent < runs and len(state.scheduler.tasks) < TASKS_PER_THREAD * workers:
             state.submit(sent)
             sent += 1
         held = max(held, len(state.scheduler.tasks))
