@@ -68,6 +68,9 @@ class ReadBudget:
         Args:
             count: number of bytes.
             what: what they are for, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.bytes:
             raise OverBudget(f"{what} of {_mib(count)}; {_mib(self.bytes)} are left for this file")
@@ -79,6 +82,9 @@ class ReadBudget:
         Args:
             count: number of records.
             what: what they are, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file has more than its size allows.
         """
         if count > self.records:
             raise OverBudget(f"{count} {what}; at most {self.records} are read")
@@ -90,6 +96,9 @@ class ReadBudget:
         Args:
             count: number of steps, about one for each value that is touched.
             what: what is parsed, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.work:
             raise OverBudget(f"{what} would take more than {self.work} steps to read")

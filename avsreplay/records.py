@@ -202,7 +202,11 @@ class State:
 
     @classmethod
     def of(cls, flat: Array) -> State:
-        """Return the state of its 22 numbers, which become read-only."""
+        """Return the state of its 22 numbers, which become read-only.
+
+        Args:
+            flat: (22,) q_ab, w_b, r_a, v_a, sigma, c_b, q_bc.
+        """
         return cls.__new__(cls)._view(flat)
 
     def _view(self, flat: Array) -> State:

@@ -245,7 +245,14 @@ class ViewWriter:
         self._plans: list[PathView] = [] if before is None else list(before.paths)
 
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
+        """Take one scan: the points that are shown; times and positions of a new flight, if any.
+
+        Args:
+            scan: the scan with its row.
+            cloud: the points of the scan that are shown, with their residuals.
+            path: times (n,) [s] and positions (n, 3) in {A} [m] of a new flight; None where there
+                is none.
+        """
         self._clouds.append(thin_cloud(cloud.seq, cloud.points, cloud.residual_m, cloud.intensity))
         if path is not None:
             self._plans.append(
@@ -324,7 +331,11 @@ class ResultDirectory:
         beliefs.table.write(self._part / "beliefs.npz")
 
     def file(self, name: str) -> Path:
-        """Return where a further file of the result is to be written, inside the ``with`` block."""
+        """Return where a further file of the result is to be written, inside the ``with`` block.
+
+        Args:
+            name: its name.
+        """
         return self._part / name
 
 

@@ -371,7 +371,7 @@ _REASON_WORDS = {
     "frozen": "The sensor repeats the scan before, although the target moves.",
     "not_aligned": "The registration found no overlap, failed, or is ambiguous.",
     "not_converged": "The registration did not converge.",
-    "few_inliers": "Too few points, or too small a share of them, are close to the model.",
+    "few_inliers": "Too few points are close to the model.",
     "fit_error": "The distance of the inliers from the model is too large.",
     "halves_differ": (
         "The poses from two halves of the scan differ by more than their errors explain."

@@ -199,7 +199,7 @@ class Run:
         Raises:
             UsageError: there are fewer than four healthy poses.
         """
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         poses, instants = HealthyPoses(ready.estimator), set[int]()
         for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
@@ -441,16 +441,18 @@ class Run:
             ),
         }
 
-    def _new_stages(self) -> Stages:
+    def _new_stages(self, plans: bool = True) -> Stages:
         clock = self.source.first_ns, self.source.clock.period_s * self.source.options.every
-        return stages(self.config, self.header, self.surface, self.registrar, self._true, clock)
+        plan = replace(self.config.plan, enabled=plans and self.config.plan.enabled)
+        config = replace(self.config, plan=plan)
+        return stages(config, self.header, self.surface, self.registrar, self._true, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
         """Fit the acceleration to the measured poses of a first pass if this is set, and use it."""
         if not self.config.estimator.fit_acceleration:
             return None
         self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         outcomes = [
             outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
         ]

@@ -94,6 +94,9 @@ class NewPaths:
     def of(self, state: PipelineState) -> tuple[Array, Array] | None:
         """Times (n,) [s] and positions (n, 3) [m] of a flight not seen before, None where there is
         none.
+
+        Args:
+            state: the state after a scan.
         """
         segment = planned_segment(state)
         if segment is None or segment is self._known or segment.path is None:
@@ -115,6 +118,11 @@ class ResultLogWriter:
     def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int] = ()) -> None:
         """Take over the messages of an earlier log of the same run, with the columns of the rows
         that have changed.
+
+        Args:
+            written: the earlier log.
+            rows: the rows so far.
+            changed: numbers of the rows that have changed.
         """
         self._log.copy(written, rows[-1].reason, {k: _numbers(rows[k]) for k in changed})
 
@@ -123,7 +131,14 @@ class ResultLogWriter:
         self._log.close()
 
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
+        """Take one scan: the points that are shown; times and positions of a new flight, if any.
+
+        Args:
+            scan: the scan with its row.
+            cloud: the points of the scan that are shown, with their residuals.
+            path: times (n,) [s] and positions (n, 3) in {A} [m] of a new flight; None where there
+                is none.
+        """
         row, outcome = scan.row, scan.outcome
         values = {
             name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None
@@ -230,7 +245,12 @@ class RerunStream:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
     def correct(self, rows: Sequence[Row], changed: Iterable[int]) -> None:
-        """Send the columns of rows again that had other values when their scans were shown."""
+        """Send the columns of rows again that had other values when their scans were shown.
+
+        Args:
+            rows: the rows so far.
+            changed: numbers of the rows that have changed.
+        """
         for row in (rows[k] for k in changed):
             self._rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
             self._show(row)

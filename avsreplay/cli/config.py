@@ -359,6 +359,7 @@ FREQUENT_OPTIONS = {
     "robot.accel_max_mps2": "state what the robot can do",
     "limits.final_deg": "approach through a corridor",
     "limits.clearance_m": "keep clear of the target",
+    "plan.enabled": "tune registration or estimation without plans, in about half of the time",
 }  # key of a setting of a run or of reading a log: what it is used for
 
 SECTIONS = (

@@ -95,7 +95,9 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
     from avsreplay.toml_document import Assignment, toml_value
 
     init, assignments = flags.pop("init"), flags.pop("assignments")
-    more = (Assignment(f"init={toml_value(init)}", f"--init {init}"),) if init is not None else ()
+    more: tuple[str, ...] = ("plan.enabled=false",)
+    if init is not None:
+        more = (Assignment(f"init={toml_value(init)}", f"--init {init}"), *more)
     return Job(source=log, options=read_options(flags), assignments=(*assignments, *more))
 
 

@@ -119,7 +119,11 @@ def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
 
 
 def measure(state: Gramian) -> Observability:
-    """Return the rank and the condition numbers."""
+    """Return the rank and the condition numbers.
+
+    Args:
+        state: the Gramian.
+    """
     n = state.scale.size
     told = np.linalg.svd(state.white * state.scale, compute_uv=False)
     if (rank := int(np.count_nonzero(told > 1.0))) < n:

@@ -86,7 +86,11 @@ _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
 def derived(rows: Sequence[Row]) -> Columns:
-    """Return every column (n,) that a chart draws, by name, without those that have no value."""
+    """Return every column (n,) that a chart draws, by name, without those that have no value.
+
+    Args:
+        rows: the rows of a run.
+    """
     out = {name: numbers(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (

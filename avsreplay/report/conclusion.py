@@ -356,7 +356,11 @@ def _said(change: Change) -> str:
 
 
 def settings_table(conclusion: Conclusion) -> Table:
-    """Return the table of the settings in which a run differs from the baseline."""
+    """Return the table of the settings in which a run differs from the baseline.
+
+    Args:
+        conclusion: the comparison with the baseline.
+    """
     texts = conclusion.settings or ("none",)
     return facts_table(
         f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts]

@@ -41,7 +41,12 @@ _FILE_COLUMNS = {
 
 
 def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | None:
-    """Return the estimated or the registered pose of a row, None where there is none."""
+    """Return the estimated or the registered pose of a row, None where there is none.
+
+    Args:
+        row: the row.
+        which: which of the two poses.
+    """
     attitude, position = _FILE_COLUMNS[which]
     q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
     return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
@@ -50,12 +55,21 @@ def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | Non
 def row_poses(
     rows: Iterable[Row], which: Literal["estimate", "registration"]
 ) -> Iterator[StampedPose]:
-    """Return the estimated or the registered poses of the rows that have one."""
+    """Return the estimated or the registered poses of the rows that have one.
+
+    Args:
+        rows: the rows of a run.
+        which: which of the two poses.
+    """
     return ((row.t_ns, pose) for row in rows if (pose := row_pose(row, which)) is not None)
 
 
 def stamp_text(t_ns: int) -> str:
-    """Return a time stamp [ns] as seconds with nine decimals, exactly."""
+    """Return a time stamp [ns] as seconds with nine decimals, exactly.
+
+    Args:
+        t_ns: the instant [ns].
+    """
     sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
     return f"{sign}{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}"
 
@@ -63,6 +77,10 @@ def stamp_text(t_ns: int) -> str:
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
     """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return
     their number.
+
+    Args:
+        path: the file.
+        poses: T_ac with their stamps.
     """
     return _write_lines(
         path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses)
@@ -72,6 +90,10 @@ def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
 def write_kitti(path: str | Path, poses: Iterable[Pose]) -> int:
     """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per pose [m]; return the
     number of poses.
+
+    Args:
+        path: the file.
+        poses: T_ac in order.
     """
     return _write_lines(path, (_text(pose.matrix[:3].ravel()) for pose in poses))
 
@@ -92,6 +114,10 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
     """Write all columns as CSV. The first line has their names, which end with the unit; null is an
     empty cell.
+
+    Args:
+        path: the file.
+        rows: the rows of a run.
     """
     names = [c.name for c in columns()]
     with output_text(path) as stream:
@@ -110,6 +136,10 @@ def _cell(value: Any) -> str:
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
     """Write all columns with their types; the metadata of each field have its unit and meaning.
+
+    Args:
+        path: the file.
+        rows: the rows of a run.
 
     Raises:
         MissingBackend: pyarrow is not installed.
@@ -190,6 +220,9 @@ def _strict(value: Any) -> Any:
 def write_layout(path: str | Path) -> None:
     """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view,
     plots, diagnostics.
+
+    Args:
+        path: the file.
     """
     with output_text(path) as stream:
         stream.write(

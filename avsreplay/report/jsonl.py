@@ -103,6 +103,9 @@ def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
     The columns are not checked, but every name is printable text and every value is null, a bool, a
     number of 64 bits or printable text.
 
+    Args:
+        path: a rows.jsonl file.
+
     Raises:
         UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
     """
@@ -171,6 +174,10 @@ def _is_cell(value: Any) -> bool:
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
     """Build a row from its JSON object; a text column and one that may be null may be missing.
+
+    Args:
+        record: the object.
+        where: file and line, for messages.
 
     Raises:
         UnreadableInput: a column is unknown or missing, or a value has the wrong type.
@@ -327,6 +334,10 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
 
 def read_json(path: Path, *, hint: str) -> Any:
     """Return the value of a JSON file, see ``parse_json``.
+
+    Args:
+        path: the file.
+        hint: what to do where it cannot be read.
 
     Raises:
         UnreadableInput: the file cannot be read, or is no such JSON.

@@ -124,6 +124,11 @@ def facts_record(
 ) -> dict[str, Any]:
     """Return what ``Summary.fold`` received beside the rows as JSON values, for the key ``facts``
     of ``run.json``.
+
+    Args:
+        labels: labels of the log; None where it has none.
+        truth: true state at the last scan.
+        counts: further counts by name.
     """
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
@@ -153,6 +158,9 @@ def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file.
+
+    Args:
+        path: the file.
 
     Raises:
         OSError: it cannot be read.

@@ -63,7 +63,11 @@ class Returns:
     dropouts: Array
 
     def keep(self, chosen: NDArray[Any]) -> Returns:
-        """Return the returns that a mask (n,) or indices select."""
+        """Return the returns that a mask (n,) or indices select.
+
+        Args:
+            chosen: mask (n,) or numbers (k,).
+        """
         index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         return Returns(*(getattr(self, field.name).take(index, axis=0) for field in fields(self)))
 
@@ -188,6 +192,10 @@ class Scanner:
         """Factor on the 1 sigma of the ranges by stray light of the Earth at a time [s].
 
         The variance grows in proportion to the share of the beams that look at it.
+
+        Args:
+            t_s: time [s after the first scan].
+            limbs: the limbs of the Earth.
         """
         times = np.array([t_s])
         return math.sqrt(
@@ -304,7 +312,13 @@ class Scanner:
     def disturb(
         self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0
     ) -> Returns:
-        """Add range noise and outliers, remove dropouts, and quantise the ranges."""
+        """Add range noise and outliers, remove dropouts, and quantise the ranges.
+
+        Args:
+            returns: the returns without errors.
+            rng: generator of the random numbers.
+            noise_factor: factor of the 1 sigma of the ranges.
+        """
         p, n = self.params, len(returns.ranges)
         noise_m = noise_factor * p.noise_m * np.ones(n)
         if p.noise_growth > 0.0:

@@ -59,7 +59,12 @@ def run_task(task: Task) -> RunResult:
 
 
 def log_of(task: Task, folder: Path) -> Path:
-    """The log of a run: the one it names, or its scenario recorded into ``folder``."""
+    """The log of a run: the one it names, or its scenario recorded into ``folder``.
+
+    Args:
+        task: the run.
+        folder: where a scenario is recorded.
+    """
     if task.log:
         return Path(task.log)
     scenario = scenario_of(toml_document.parse(task.scenario, "scenario"), folder=Path(task.folder))

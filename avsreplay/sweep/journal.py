@@ -68,7 +68,13 @@ def write_scans(path: Path, rows: Sequence[tuple[Any, ...]]) -> None:
 
 
 def write_batches(path: Path, schema: Any, batches: Iterable[Sequence[tuple[Any, ...]]]) -> None:
-    """Write rows in batches to a file that appears once it is complete."""
+    """Write rows in batches to a file that appears once it is complete.
+
+    Args:
+        path: the file.
+        schema: the pyarrow schema of a row.
+        batches: rows as tuples in the order of the schema.
+    """
     pa, pq = arrow()
     with (
         output_path(path) as part,

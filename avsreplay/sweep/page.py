@@ -88,6 +88,10 @@ def build_sweep_page(summary: SweepSummary) -> str:
 def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
     """A row per run that did not end well or has the largest errors, with ``digits`` of its id (all
     if None).
+
+    Args:
+        worst: the runs, worst first.
+        digits: characters of an id; None: all.
     """
     rows = tuple(
         (
@@ -110,7 +114,11 @@ def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
 
 
 def words(values: Mapping[str, Any]) -> str:
-    """A combination in words, without the prefixes of its keys."""
+    """A combination in words, without the prefixes of its keys.
+
+    Args:
+        values: key and value of each axis.
+    """
     pairs = (
         f"{key.removeprefix('scenario.').removeprefix('run.')}={value}"
         for key, value in values.items()
@@ -128,7 +136,11 @@ def _status_line(summary: SweepSummary) -> str:
 
 
 def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
-    """A row per combination: what was set, runs done, NEES at their ends."""
+    """A row per combination: what was set, runs done, NEES at their ends.
+
+    Args:
+        cells: number and content of each combination.
+    """
     rows = []
     for number, cell in cells:
         nees = cell.nees
@@ -141,7 +153,11 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
 
 def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
-    """A row per combination: share of the runs that meet each criterion, with its 95 % interval."""
+    """A row per combination: share of the runs that meet each criterion, with its 95 % interval.
+
+    Args:
+        cells: number and content of each combination.
+    """
     names = list(cells[0][1].rates) if cells else []
     rows = tuple(
         (_named(number, cell), *(_share(cell.rates[name]) for name in names))
@@ -151,7 +167,12 @@ def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
 
 def cell_table(number: int, cell: Cell) -> Table:
-    """Metrics and success rates of one combination."""
+    """Metrics and success rates of one combination.
+
+    Args:
+        number: number of the combination.
+        cell: its runs.
+    """
     rows: list[tuple[str, ...]] = []
     for name, found in cell.metrics.items():
         if found is not None:
@@ -187,7 +208,11 @@ def cell_table(number: int, cell: Cell) -> Table:
 
 
 def detector_table(detector: Detector) -> Table:
-    """The rule in force, and each score as the only test at 1 % false alarms."""
+    """The rule in force, and each score as the only test at 1 % false alarms.
+
+    Args:
+        detector: the fault detector of a campaign.
+    """
     rows = []
     if detector.detected is not None and detector.false is not None:
         rows.append(("rule in force", _share(detector.detected), _share(detector.false), "", ""))
@@ -324,6 +349,9 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
     Times are in s; errors are position [mm] and rotation [deg] of the estimate. The rows of kind
     "none" come first: flagged scans in these rows are false alarms.
+
+    Args:
+        cells: number and content of each combination.
     """
     title = (
         "By kind of fault: times in s, errors in mm and deg; ~: usable by its label; none:"
@@ -334,7 +362,12 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
 
 def columns_of(table: Table, kept: Sequence[int]) -> Table:
-    """Some columns of a table."""
+    """Some columns of a table.
+
+    Args:
+        table: the table.
+        kept: numbers of the columns, in order.
+    """
     heads, align = tuple(table.heads[k] for k in kept), "".join(table.letter(k) for k in kept)
     return replace(
         table,

@@ -43,6 +43,9 @@ class Quantiles:
 def quantiles(values: Sequence[float]) -> Quantiles | None:
     """Quantiles by linear interpolation, the interval of the median by order statistics; None
     without a value.
+
+    Args:
+        values: the values of the runs.
     """
     if not len(values):
         return None
@@ -68,7 +71,11 @@ class Typical:
 
 
 def typical(values: Sequence[float]) -> Typical | None:
-    """Median and largest value; None without a value."""
+    """Median and largest value; None without a value.
+
+    Args:
+        values: the values of the runs.
+    """
     return (
         Typical(len(values), float(np.median(values)), float(max(values))) if len(values) else None
     )
@@ -86,7 +93,12 @@ class Rate:
 
 
 def rate(successes: int, count: int) -> Rate | None:
-    """The share of successes with Wilson's score interval; None for no run."""
+    """The share of successes with Wilson's score interval; None for no run.
+
+    Args:
+        successes: number of successes.
+        count: number of runs.
+    """
     if count == 0:
         return None
     if count == 1:
@@ -109,7 +121,12 @@ class RunConsistency:
 
 
 def consistency(nees: Sequence[float], dof: int) -> RunConsistency | None:
-    """The consistency of one NEES of ``dof`` states per run; None without a value."""
+    """The consistency of one NEES of ``dof`` states per run; None without a value.
+
+    Args:
+        nees: normalised errors squared at the ends of the runs.
+        dof: number of states in each.
+    """
     if not len(nees):
         return None
     from scipy.stats import chi2
@@ -154,7 +171,12 @@ class ScoreHistogram:
         self._counts = np.zeros((2, len(self.EDGES) + 1), dtype=np.int64)
 
     def add(self, score: float | None, harmful: bool) -> None:
-        """Count one scan; a larger score is worse."""
+        """Count one scan; a larger score is worse.
+
+        Args:
+            score: the score; None where the scan has none.
+            harmful: whether a harmful fault was injected.
+        """
         place = (
             len(self.EDGES)
             if score is None or math.isnan(score)
@@ -249,7 +271,11 @@ class FaultKind:
 
 
 def episode_lines(episodes: Iterable[Episode]) -> tuple[tuple[Any, ...], ...]:
-    """One tuple of plain values per window, in the order of EPISODE_COLUMNS."""
+    """One tuple of plain values per window, in the order of EPISODE_COLUMNS.
+
+    Args:
+        episodes: the windows of injected faults.
+    """
     return tuple(tuple(_at(settings.dump(e), name) for name in EPISODE_COLUMNS) for e in episodes)
 
 

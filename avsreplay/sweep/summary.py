@@ -134,7 +134,12 @@ class CampaignFold:
         self._worst: list[tuple[tuple[float, ...], WorstRun]] = []
 
     def add(self, point: Point, result: RunResult) -> None:
-        """Add one finished run."""
+        """Add one finished run.
+
+        Args:
+            point: the combination of the run.
+            result: its result.
+        """
         self._cells[point.cell].add(result, self._criteria)
         badness, reason = _badness(result)
         run = WorstRun(result.id, point.cell, point.repeat, point.seed, result.status, reason)
@@ -144,7 +149,11 @@ class CampaignFold:
                 heapq.heappop(self._worst)
 
     def result(self, detector: Detector | None) -> SweepSummary:
-        """The summary of the runs added."""
+        """The summary of the runs added.
+
+        Args:
+            detector: the curves of the detector; None where no scans are kept.
+        """
         status = sum((cell.status for cell in self._cells), Counter[str]())
         return SweepSummary(
             name=self._plan.loaded.campaign.name,
