@@ -250,6 +250,9 @@ def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessm
         "basis": "flight over the log",
         "asked": "grasp point" not in task.assumed,
     }
+    if not setup.guidance.params.enabled:
+        known |= {"asked": False, "limit": "no plans are made (plan.enabled = false)"}
+        return Assessment(chance=Chance.NOT_ASSESSED, **known)
     if task.problem:
         return Assessment(
             chance=Chance.NOT_ASSESSED, limit=task.problem, change=setup.advice, **known

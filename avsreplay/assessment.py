@@ -86,8 +86,8 @@ class Assessment:
     def lowers_grade(self) -> bool:
         """Whether a run with this assessment has a reason for concern beside the tracking.
 
-        A capture that is not assessed because the assumed grasp point cannot be used is none:
-        nobody asked for it.
+        A capture that is not assessed, because the assumed grasp point cannot be used or plans are
+        switched off, is none.
         """
         return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 

@@ -85,7 +85,7 @@ def stages(
         guess=config.guess,
         deskew=config.deskew,
         reacquire=config.reacquire,
-        initialise=_initialise(config, header, truth_of),
+        initialise=first_pose_source(config, header, truth_of),
         region=Region(np.array(config.region_start()), low, high) if config.region else None,
         tracker=_tracker(config, 0.5 * (low + high), surface.extent),
     )
@@ -183,11 +183,19 @@ def first_state(ready: Stages) -> PipelineState:
     return PipelineState(ready.monitors.initial(prior_1s))
 
 
-def _initialise(
+def first_pose_source(
     config: RunConfig, header: LogHeader, truth_of: Callable[[Scan], Truth]
 ) -> Callable[[Scan], tuple[Pose | None, str]]:
-    """Where the first pose comes from: first scan -> T_ac (None: search without a guess) and
-    the name of its source.
+    """Return where the first pose of a replay comes from.
+
+    Args:
+        config: the configuration; ``init`` names the source.
+        header: the header of the log, which may hold an initial state.
+        truth_of: the ground truth of a scan; called only with ``init`` "truth".
+
+    Returns:
+        A function that gives for the first scan the pose of {C} in {A} (None: search without a
+        guess) and the name of its source. It raises UsageError where there is no true pose.
     """
     start = header.start
     if config.init == "truth":

@@ -55,7 +55,7 @@ _MAPPINGS: dict[str, Callable[[Iterable[tuple[Any, Any]]], Any]] = {
     "Counter": lambda pairs: Counter(dict(pairs)),
 }
 _NUMBERS = {"f8": float, "i8": int}  # lists of these alone are stored as arrays
-_KINDS = ("f8", "f4", "f2", "i8", "i4", "i2", "i1", "u8", "u4", "u2", "u1", "b1")
+_ARRAY_KINDS = ("f8", "f4", "f2", "i8", "i4", "i2", "i1", "u8", "u4", "u2", "u1", "b1")
 
 
 def pack(value: Any, named: Mapping[str, object]) -> bytes:
@@ -165,7 +165,7 @@ class _Packer:
         """Type, place among the numbers of the type, shape, order and whether it may be changed."""
         array = np.asarray(value)
         kind = array.dtype.str[1:]
-        if kind not in _KINDS:
+        if kind not in _ARRAY_KINDS:
             raise TypeError(f"an array of {array.dtype} cannot be stored in a checkpoint")
         order: Literal["F", "C"] = (
             "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
@@ -223,7 +223,9 @@ class _Reader:
         self._arrays = {
             kind: array.view("?") if kind == "b1" else array for kind, array in members.items()
         }
-        if any(kind not in _KINDS or a.dtype.str[1:] != kind for kind, a in self._arrays.items()):
+        if any(
+            kind not in _ARRAY_KINDS or a.dtype.str[1:] != kind for kind, a in self._arrays.items()
+        ):
             raise BadFile("an array of another type")
         self._root, self._nodes = document["root"], document["nodes"]
         self._values: list[Any] = []
@@ -377,7 +379,7 @@ def _alike(found: type, like: type) -> bool:
     return found is like or (issubclass(found, numbers) and issubclass(like, numbers))
 
 
-_NUMERIC: dict[Any, tuple[type, ...]] = {
+_NUMBER_CLASSES: dict[Any, tuple[type, ...]] = {
     float: (float, int, np.floating, np.integer),
     int: (int, np.integer),
     bool: (bool, np.bool_),
@@ -394,8 +396,10 @@ def _fits(value: Any, hint: Any) -> bool:
     kind = origin or hint
     if kind is tuple and isinstance(value, tuple):
         return _tuple_fits(value, args)
-    if kind in _NUMERIC:
-        return isinstance(value, _NUMERIC[kind]) and isinstance(value, bool) <= (kind is bool)
+    if kind in _NUMBER_CLASSES:
+        return isinstance(value, _NUMBER_CLASSES[kind]) and isinstance(value, bool) <= (
+            kind is bool
+        )
     if kind is None or kind is type(None):
         return value is None
     if kind is Any or not isinstance(kind, type) or getattr(kind, "_is_protocol", False):

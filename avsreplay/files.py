@@ -33,6 +33,9 @@ _COUNTER = itertools.count()
 def is_stream(path: Path) -> bool:
     """Return whether an output is written directly: ``-``, a device or a FIFO, also behind a
     symbolic link.
+
+    Args:
+        path: the output.
     """
     if path == STDOUT:
         return True

@@ -120,6 +120,9 @@ def _product(
 def conjugate(q_ab: ArrayLike) -> Array:
     """Return the conjugates ``q_ba`` (..., 4) of quaternions (..., 4): the inverse rotations
     of unit quaternions.
+
+    Args:
+        q_ab: quaternions (..., 4) ``[x y z w]``.
     """
     return np.asarray(q_ab, dtype=np.float64) * _CONJUGATE
 
@@ -220,6 +223,9 @@ def _multiple(*R: float) -> tuple[float, ...]:
 def exp(rotvec: ArrayLike) -> Array:
     """Return the unit quaternions (..., 4) ``[x y z w]`` of rotation vectors (..., 3) (full angle)
     [rad].
+
+    Args:
+        rotvec: rotation vectors (..., 3), full angle [rad].
     """
     v = np.asarray(rotvec, dtype=np.float64)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
@@ -255,7 +261,12 @@ def angle(q: ArrayLike) -> Array:
 
 
 def angle_between(q_ab: ArrayLike, q_ac: ArrayLike) -> Array:
-    """Return the angles (...) in [0, pi] [rad] between attitudes (..., 4)."""
+    """Return the angles (...) in [0, pi] [rad] between attitudes (..., 4).
+
+    Args:
+        q_ab: unit quaternions (..., 4).
+        q_ac: unit quaternions (..., 4).
+    """
     return angle(multiply(conjugate(q_ab), q_ac))
 
 
@@ -358,7 +369,14 @@ class Pose:
 
     @classmethod
     def composed(cls, q_ab: Array, t_ab: Array, q_bc: Array, t_bc: Array) -> Pose:
-        """Return T_ac of unit quaternions (4,) and origins (3,) [m]: of b in a and of c in b."""
+        """Return T_ac of unit quaternions (4,) and origins (3,) [m]: of b in a and of c in b.
+
+        Args:
+            q_ab: attitude (4,) of b in a.
+            t_ab: origin (3,) of b in a [m].
+            q_bc: attitude (4,) of c in b.
+            t_bc: origin (3,) of c in b [m].
+        """
         q, (x, y, z), t = q_ab.tolist(), t_bc.tolist(), t_ab.tolist()
         moved = [a * x + b * y + c * z + o for (a, b, c), o in zip(_rows(*q), t, strict=True)]
         return cls._of(_product(*q, *q_bc.tolist()), moved)

@@ -21,6 +21,10 @@ def lock(part: Path, *, wait: bool = False) -> int | None:
     """Lock a temporary file or folder until this process ends; None if the system cannot.
 
     ``wait`` for another lock.
+
+    Args:
+        part: the temporary file or folder.
+        wait: wait for the lock of another process.
     """
     if os.name == "nt":  # an open file cannot be removed there
         return None

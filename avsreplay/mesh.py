@@ -225,7 +225,7 @@ def _openings(
     length = np.linalg.norm(
         vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1
     )
-    loop = _components(int(corners.max()) + 1, start, end)[start]
+    loop = components(int(corners.max()) + 1, start, end)[start]
     key, number = np.unique(np.column_stack([of[face], loop]), axis=0, return_inverse=True)
     around = np.bincount(number.ravel(), length, len(key))
     return np.asarray(
@@ -313,9 +313,9 @@ def _parts(edges: _Edges) -> _Parts:
     a, b = edges.pairs.T // 3
     same = edges.sign[edges.pairs[:, 0]] == edges.sign[edges.pairs[:, 1]]
     if not same.any():
-        of, reversed_ = _components(m, a, b), np.zeros(m, bool)
+        of, reversed_ = components(m, a, b), np.zeros(m, bool)
     else:
-        nodes = _components(
+        nodes = components(
             2 * m, np.append(a, a + m), np.append(b + same * m, b + ~same * m)
         ).reshape(2, m)
         _, of = np.unique(nodes.min(axis=0), return_inverse=True)
@@ -328,11 +328,16 @@ def _parts(edges: _Edges) -> _Parts:
     return _Parts(of, reversed_, _share(paired, of) >= PAIRED_EDGE_SHARE)
 
 
-def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of the connected component of each node, in the order of the first nodes; edges from
-    ``a`` to ``b``.
+def components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number (nodes,) of the connected component of each node, in the order of the first
+    nodes.
 
     Each node is linked to one of a lower number in its component until all are linked to the first.
+
+    Args:
+        nodes: number of nodes.
+        a: nodes (n,) where the edges begin.
+        b: nodes (n,) where they end.
     """
     first = np.arange(nodes)
     while len(a):

@@ -43,7 +43,14 @@ class LawResult:
 
 
 class Parts:
-    """The parts of one kind, by name."""
+    """The parts of one kind, by name.
+
+    Attributes:
+        group: entry-point group in which packages register parts.
+        what: name of the kind in error messages.
+        where: option or key that names such a part, for error messages.
+        built_in: classes that need no entry point, by name.
+    """
 
     def __init__(
         self, group: str, what: str, where: str = "", built_in: Sequence[Any] = ()
@@ -57,11 +64,11 @@ class Parts:
             built_in: classes that need no entry point; they come first, in this order.
         """
         self.group, self.what, self.where = group, what, where
-        self._built_in = {part.name: part for part in built_in}
+        self.built_in = {part.name: part for part in built_in}
 
     def names(self) -> tuple[str, ...]:
         """Return every name once: those without an entry point, then the others, sorted."""
-        return (*self._built_in, *sorted(set(_entry_points(self.group)) - set(self._built_in)))
+        return (*self.built_in, *sorted(set(installed(self.group)) - set(self.built_in)))
 
     def load(self, name: str) -> Any:
         """Return the class of a part.
@@ -73,9 +80,9 @@ class Parts:
             UsageError: no part has this name.
             ImportError: its module cannot be imported.
         """
-        if name in self._built_in:
-            return self._built_in[name]
-        found = _entry_points(self.group).get(name)
+        if name in self.built_in:
+            return self.built_in[name]
+        found = installed(self.group).get(name)
         if found is None:
             known = ", ".join(self.names())
             hint = f"one of: {known}" if known else "install avsreplay ('pip install .')"
@@ -95,8 +102,14 @@ class Parts:
 
 
 @cache
-def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
-    """The entry points of a group; of two with one name the first by value, in every run."""
+def installed(group: str) -> dict[str, metadata.EntryPoint]:
+    """Return the entry points of a group by name; of two with one name the first by value.
+
+    They are read once; ``installed.cache_clear()`` forgets them.
+
+    Args:
+        group: the group, such as ``avsreplay.backends``.
+    """
     found = sorted(metadata.entry_points(group=group), key=lambda entry: entry.value, reverse=True)
     return {entry.name: entry for entry in found}
 

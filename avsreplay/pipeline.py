@@ -116,6 +116,29 @@ class PlannedTime:
 
 
 @value_class
+class MonitorInput:
+    """What a scan gave to the monitors.
+
+    Attributes:
+        prior: prediction at the scan.
+        alignment: of the scan.
+        innovation: of the measurement; None where nothing was measured.
+        gamma: 1 if the fault detector accepts the measurement, else 0.
+        track: estimate after the scan.
+        belief: what is published of it.
+        grasp_c: (3,) grasp point in {C} [m].
+    """
+
+    prior: Prediction
+    alignment: Alignment
+    innovation: Innovation | None
+    gamma: int
+    track: Track
+    belief: Belief
+    grasp_c: Array
+
+
+@value_class
 class Monitors:
     """Observability, consistency and convergence; they do not change the estimate."""
 
@@ -133,50 +156,34 @@ class Monitors:
         )
 
     def observe(
-        self,
-        state: MonitorState,
-        estimator: AnyEstimator,
-        prior: Prediction,
-        alignment: Alignment,
-        innovation: Innovation | None,
-        gamma: int,
-        track: Track,
-        belief: Belief,
-        planned: PlannedTime,
-        grasp_c: Array,
+        self, state: MonitorState, estimator: AnyEstimator, seen: MonitorInput, planned: PlannedTime
     ) -> tuple[MonitorState, MonitorReport]:
         """Process one scan.
 
         Args:
             state: state of the monitors before the scan.
             estimator: estimator of the run.
-            prior: prediction at the scan.
-            alignment: of the scan.
-            innovation: of the measurement; None where nothing was measured.
-            gamma: 1 if the fault detector accepts the measurement, else 0.
-            track: estimate after the scan.
-            belief: what is published of it.
+            seen: what the scan gave.
             planned: time to the planned capture.
-            grasp_c: (3,) grasp point in {C} [m].
         """
-        healthy, seen = (
-            innovation if gamma else None,
-            self.consistency.observe(state.consistency, innovation, gamma),
-        )
-        motion, gramian = self._gramian(state, estimator, prior, healthy, track)
-        rank, window = measure(gramian), self.consistency.judge(seen, max(track.levels.common))
-        found = estimator.residual_after(track, prior, healthy) if healthy else None
+        track, belief = seen.track, seen.belief
+        healthy = seen.innovation if seen.gamma else None
+        tested = self.consistency.observe(state.consistency, seen.innovation, seen.gamma)
+        motion, gramian = self._gramian(state, estimator, seen.prior, healthy, track)
+        rank, window = measure(gramian), self.consistency.judge(tested, max(track.levels.common))
+        found = estimator.residual_after(track, seen.prior, healthy) if healthy else None
         failed = violations(track.belief, *found) if found else ()
         consistent = window.consistent and not (
             track.window.many_outliers or in_doubt(track) or failed
         )
-        forecast = estimator.track_forecast(track, np.zeros(1), grasp_c)
+        forecast = estimator.track_forecast(track, np.zeros(1), seen.grasp_c)
         if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
-            forecast = estimator.track_forecast(track, np.array([planned.after_s()]), grasp_c)
+            after_s = np.array([planned.after_s()])
+            forecast = estimator.track_forecast(track, after_s, seen.grasp_c)
         possible = with_change(forecast, belief, track.change_P)
         turns = state.turns
-        if alignment.measured:
-            turns = turns.after(belief.t_ns, alignment.T_ac.q)
+        if seen.alignment.measured:
+            turns = turns.after(belief.t_ns, seen.alignment.T_ac.q)
         alias = two_rates(turns)
         judged = self.convergence.judge(
             state.convergence,
@@ -202,7 +209,7 @@ class Monitors:
             forecast=forecast,
         )
         violated = state.violations + len(failed)
-        return MonitorState(gramian, seen, judged, violated, motion, turns), report
+        return MonitorState(gramian, tested, judged, violated, motion, turns), report
 
     def _gramian(
         self,
@@ -352,12 +359,18 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         prior, innovation = _seen(stages, state, scan, measurement) or (prior, innovation)
     belief = stages.estimator.published(track)
     planned = _planned_time(stages, state.guidance, belief)
-    seen = innovation, gamma, track, belief, planned, stages.grasp_c
-    monitors, report = stages.monitors.observe(
-        state.monitors, stages.estimator, prior, measurement.alignment, *seen
+    seen = MonitorInput(
+        prior=prior,
+        alignment=measurement.alignment,
+        innovation=innovation,
+        gamma=gamma,
+        track=track,
+        belief=belief,
+        grasp_c=stages.grasp_c,
     )
+    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, seen, planned)
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
-    if guidance.captured_ns is None:
+    if stages.guidance.params.enabled and guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
         aim = at_grasp(belief, stages.grasp_c)
         known = planner_input(
@@ -494,7 +507,13 @@ def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief
 def fold(
     stages: Stages, state: PipelineState, scans: Iterable[Scan]
 ) -> Iterator[tuple[PipelineState, Outcome]]:
-    """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log."""
+    """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log.
+
+    Args:
+        stages: the stages.
+        state: the state before the first scan.
+        scans: the scans in order.
+    """
     for scan in scans:
         state, outcome = step(stages, state, scan)
         yield state, outcome
@@ -720,6 +739,12 @@ def target_scene(
 ) -> Scene:
     """Return the predicted target after a belief about the grasp point, as the planner uses it:
     estimate and forecast, never the truth.
+
+    Args:
+        estimator: predicts the motion.
+        belief: the estimate.
+        target: geometry of the target about the grasp point.
+        forecast: predicts the belief at a later instant.
     """
 
     def sigma(times_s: Array) -> tuple[Array, Array]:
@@ -744,7 +769,16 @@ def planner_input(
     converged: bool,
     forecast: Forecaster,
 ) -> PlannerInput:
-    """Return the input of guidance after a scan."""
+    """Return the input of guidance after a scan.
+
+    Args:
+        estimator: predicts the motion.
+        belief: the estimate after the scan.
+        target: geometry of the target about the grasp point.
+        gamma: 1 for a healthy scan, 0 for a faulty one.
+        converged: whether the estimate has converged.
+        forecast: predicts the belief at a later instant.
+    """
     return PlannerInput(
         belief.t_ns, gamma, converged, target_scene(estimator, belief, target, forecast), forecast
     )

@@ -43,6 +43,7 @@ class ReadBudget:
         most_bytes: int | None = None,
         records: int | None = None,
         depth: int = MAX_DEPTH,
+        per_byte: int = BYTES_PER_BYTE,
     ) -> None:
         """Create the budget of an input.
 
@@ -51,8 +52,9 @@ class ReadBudget:
             most_bytes: largest memory of its content [bytes], None for the default.
             records: largest number of its records, None for the default.
             depth: largest depth of nesting.
+            per_byte: memory of its content for each of its bytes [bytes].
         """
-        allowed = LEAST_BUDGET_BYTES + BYTES_PER_BYTE * size
+        allowed = LEAST_BUDGET_BYTES + per_byte * size
         self.bytes = allowed if most_bytes is None else min(allowed, most_bytes)
         self.records = (
             LEAST_BUDGET_RECORDS + RECORDS_PER_BYTE * size if records is None else records
@@ -66,6 +68,9 @@ class ReadBudget:
         Args:
             count: number of bytes.
             what: what they are for, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.bytes:
             raise OverBudget(f"{what} of {_mib(count)}; {_mib(self.bytes)} are left for this file")
@@ -77,6 +82,9 @@ class ReadBudget:
         Args:
             count: number of records.
             what: what they are, in the plural, for the message.
+
+        Raises:
+            OverBudget: the file has more than its size allows.
         """
         if count > self.records:
             raise OverBudget(f"{count} {what}; at most {self.records} are read")
@@ -88,6 +96,9 @@ class ReadBudget:
         Args:
             count: number of steps, about one for each value that is touched.
             what: what is parsed, for the message.
+
+        Raises:
+            OverBudget: the file needs more than its size allows.
         """
         if count > self.work:
             raise OverBudget(f"{what} would take more than {self.work} steps to read")

@@ -174,7 +174,7 @@ def record_scenario(
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, SIMULATED_EPOCH_NS)
-        tally = _fold(
+        tally = write_scans(
             pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses
         )
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
@@ -230,7 +230,7 @@ def record_source(
             # poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
-            tally = _fold(
+            tally = write_scans(
                 pairs,
                 opened.truth_of,
                 writer,
@@ -291,17 +291,21 @@ class _Tally:
         return label.kind, start, end, label.harmful
 
 
-def _fold(
+def write_scans(
     pairs: Iterable[tuple[Scan, Scan | None]],
     truth_of: Callable[[Scan], Truth],
     writer: LogWriter,
     true_clock: bool,
     camera_of: Callable[[Scan], list[tuple[int, Pose]]],
 ) -> _Tally:
-    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or
-    None).
+    """Write scans with the truth at each scan as it was; damaged scans are counted.
 
-    ``camera_of`` gives the poses of a moving camera, each with the time after the stamp [ns].
+    Args:
+        pairs: a scan as it was, and the scan to write; None where it is left out.
+        truth_of: the ground truth of a scan.
+        writer: the log that is written.
+        true_clock: whether truth is stamped with the log clock.
+        camera_of: poses of a moving camera at a scan, each with its time after the stamp [ns].
     """
     tally = _Tally()
     for before, scan in pairs:

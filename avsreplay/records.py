@@ -43,7 +43,8 @@ STATES: int = max(block.stop for block in BLOCKS.values())  # number of error st
 # 99.99 % points of chi-square by degrees of freedom: a squared normalised error above it is not by
 # chance. Of the three of a vector, and of the six of a pose.
 UNLIKELY = {3: 21.1, 6: 27.86}
-_SIZES = {
+# The parts of a state in order, with their sizes.
+STATE_SIZES: Mapping[str, int] = {
     "q_ab": 4,
     "w_b": 3,
     "r_a": 3,
@@ -51,10 +52,10 @@ _SIZES = {
     "sigma": 2,
     "c_b": 3,
     "q_bc": 4,
-}  # parts of a state
-_STATE = {
+}
+_STATE_SLICES = {
     name: (end - n, end)
-    for (name, n), end in zip(_SIZES.items(), accumulate(_SIZES.values()), strict=True)
+    for (name, n), end in zip(STATE_SIZES.items(), accumulate(STATE_SIZES.values()), strict=True)
 }
 
 
@@ -194,19 +195,25 @@ class State:
 
     def __post_init__(self) -> None:
         self._view(
-            np.concatenate([frozen(getattr(self, name), b - a) for name, (a, b) in _STATE.items()])
+            np.concatenate(
+                [frozen(getattr(self, name), b - a) for name, (a, b) in _STATE_SLICES.items()]
+            )
         )
 
     @classmethod
     def of(cls, flat: Array) -> State:
-        """Return the state of its 22 numbers, which become read-only."""
+        """Return the state of its 22 numbers, which become read-only.
+
+        Args:
+            flat: (22,) q_ab, w_b, r_a, v_a, sigma, c_b, q_bc.
+        """
         return cls.__new__(cls)._view(flat)
 
     def _view(self, flat: Array) -> State:
         flat.setflags(write=False)
         object.__setattr__(self, "flat", flat)
         object.__setattr__(self, "_T_ac", None)
-        for name, (a, b) in _STATE.items():
+        for name, (a, b) in _STATE_SLICES.items():
             object.__setattr__(self, name, flat[a:b])
         return self
 

@@ -26,7 +26,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, State, Surface
+from avsreplay.records import STATE_SIZES, Belief, State, Surface
 from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.result import load_result, write_manifest
@@ -47,7 +47,7 @@ from avsreplay.tables import PoseTable, column_of
 from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
 CHECKPOINT = "resume.npz"  # checkpoint of an interrupted run
-OWN = frozenset(
+OWN_FILES = frozenset(
     {
         "rows.jsonl",
         "estimate.tum",
@@ -64,8 +64,7 @@ OWN = frozenset(
     }
 )
 _MAX_BELIEF_BYTES = 1 << 30
-_BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
-MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
+MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in STATE_SIZES.items() for k in range(size))
 _DRIVEN = (
     "driven",
     "u",
@@ -117,7 +116,7 @@ class BeliefTable(Sequence[Belief]):
         if isinstance(place, slice):
             return [self[k] for k in range(*place.indices(len(self)))]
         t_ns, x, P = (self._parts[name][place] for name in ("t_ns", "x", "P"))
-        ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
+        ends = np.cumsum([0, *STATE_SIZES.values()])
         plain = Belief(int(t_ns), State(*(x[a:b] for a, b in pairwise(ends))), P)
         driven, at = self._parts["driven"], range(len(self))[place]
         k = bisect_left(range(len(driven)), at, key=lambda each: int(driven[each]))
@@ -246,7 +245,14 @@ class ViewWriter:
         self._plans: list[PathView] = [] if before is None else list(before.paths)
 
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
+        """Take one scan: the points that are shown; times and positions of a new flight, if any.
+
+        Args:
+            scan: the scan with its row.
+            cloud: the points of the scan that are shown, with their residuals.
+            path: times (n,) [s] and positions (n, 3) in {A} [m] of a new flight; None where there
+                is none.
+        """
         self._clouds.append(thin_cloud(cloud.seq, cloud.points, cloud.residual_m, cloud.intensity))
         if path is not None:
             self._plans.append(
@@ -274,8 +280,8 @@ class ResultDirectory:
 
         Args:
             path: the folder.
-            overwrite: whether an existing result may be replaced; files that are not ``OWN`` are
-                kept.
+            overwrite: whether an existing result may be replaced; files that are not ``OWN_FILES``
+                are kept.
             inputs: files that the run reads; none of them may be a file of the result.
 
         Raises:
@@ -293,13 +299,13 @@ class ResultDirectory:
                 "is not a result directory", where=str(path), hint="name another; it is left alone"
             )
         for each in inputs:
-            if each.resolve().parent == path.resolve() and each.name in OWN:
+            if each.resolve().parent == path.resolve() and each.name in OWN_FILES:
                 raise UsageError(
                     "contains an input of this run", where=str(path), hint="name another output"
                 )
 
     def __enter__(self) -> ResultDirectory:
-        self._part = self._stack.enter_context(output_folder(self.path, OWN))
+        self._part = self._stack.enter_context(output_folder(self.path, OWN_FILES))
         return self
 
     def __exit__(
@@ -325,7 +331,11 @@ class ResultDirectory:
         beliefs.table.write(self._part / "beliefs.npz")
 
     def file(self, name: str) -> Path:
-        """Return where a further file of the result is to be written, inside the ``with`` block."""
+        """Return where a further file of the result is to be written, inside the ``with`` block.
+
+        Args:
+            name: its name.
+        """
         return self._part / name
 
 

@@ -129,7 +129,7 @@ def _exact(value: Value[T], text: str, **more: Any) -> T:
     return column(value, text, **more)
 
 
-_XYZ = ("x", "y", "z")
+_VECTOR_AXES = ("x", "y", "z")
 _XYZW = ("x", "y", "z", "w")
 _ENTRIES = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))  # the six entries of a symmetric matrix
 
@@ -139,7 +139,7 @@ def _block(
     make: Callable[[Value[float | None], str], float | None],
     text: str,
     first: str = "",
-    names: Sequence[str] = _XYZ,
+    names: Sequence[str] = _VECTOR_AXES,
 ) -> list[float | None]:
     """Declare the columns of one vector.
 
@@ -371,7 +371,7 @@ _REASON_WORDS = {
     "frozen": "The sensor repeats the scan before, although the target moves.",
     "not_aligned": "The registration found no overlap, failed, or is ambiguous.",
     "not_converged": "The registration did not converge.",
-    "few_inliers": "Too few points, or too small a share of them, are close to the model.",
+    "few_inliers": "Too few points are close to the model.",
     "fit_error": "The distance of the inliers from the model is too large.",
     "halves_differ": (
         "The poses from two halves of the scan differ by more than their errors explain."
@@ -1074,7 +1074,7 @@ class Row:
             score: its comparison with the ground truth.
         """
         return cls(
-            *[value(outcome, score) for value in _VALUES]
+            *[value(outcome, score) for value in _COLUMN_VALUES]
         )  # by place: 150 names take as long as the values
 
     def rescored(self, score: Score) -> Row:
@@ -1091,7 +1091,7 @@ class Row:
         return dataclasses.replace(self, **values)
 
 
-_VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
+_COLUMN_VALUES = tuple(f.metadata["value"] for f in dataclasses.fields(Row))
 
 
 def columns() -> tuple[Column, ...]:

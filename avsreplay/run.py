@@ -92,6 +92,7 @@ class Run:
         config: the effective configuration.
         surface: the model of the target.
         registrar: registers scans against that model.
+        stages: the stages of the pipeline.
         model_check: result of the check of the model by the rows so far.
         done: number of scans processed so far.
         taken: the rows of these scans.
@@ -143,8 +144,8 @@ class Run:
             self.model_check = ModelCheck(self.registrar, self.surface)
             self.task, self._target = task_and_target(self.config, self.surface)
             self.acceleration = self._fitted_acceleration()
-            self._stages = self._new_stages()
-            self.estimator = self._stages.estimator
+            self.stages = self._new_stages()
+            self.estimator = self.stages.estimator
         except BaseException:
             self.source.close()
             raise
@@ -156,7 +157,7 @@ class Run:
         self._fitted = HealthyPoses(self.estimator)  # poses of the reference motion
         self._smoothed: tuple[int, Reference | None] | None = None
         self._reference_instants: list[int] = []
-        self._state, self.done = first_state(self._stages), 0
+        self._state, self.done = first_state(self.stages), 0
         self._scored: Scorer | None = None
         self._image: Pose | None = None  # of {C}, which the run follows
         self._end: tuple[Belief, State] | None = None
@@ -198,7 +199,7 @@ class Run:
         Raises:
             UsageError: there are fewer than four healthy poses.
         """
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         poses, instants = HealthyPoses(ready.estimator), set[int]()
         for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
@@ -230,7 +231,7 @@ class Run:
         if self.config.reference is Against.FIT and self._reference is None:
             self.fit_reference(progress)
         listeners, self._scored = tuple(listeners), self._scored or self._scorer()
-        outcomes = self._outcomes(self._stages, progress, "replaying", self._state, self.done)
+        outcomes = self._outcomes(self.stages, progress, "replaying", self._state, self.done)
         if (
             self.job.prefetch
         ):  # the pipeline has a thread of its own; scoring and writing stay in this one
@@ -349,7 +350,7 @@ class Run:
     @property
     def approach(self) -> Limits:
         """Constraints of every plan of this run, with all lengths."""
-        return self._stages.guidance.limits
+        return self.stages.guidance.limits
 
     def summary(self) -> Summary:
         """Summarise the rows taken so far."""
@@ -386,12 +387,12 @@ class Run:
         setup = Setup(
             task=self.task,
             estimator=self._predictor(),
-            guidance=self._stages.guidance,
+            guidance=self.stages.guidance,
             target=self._target,
             solid=len(surface.faces) > 0,
             extent_m=surface.extent,
             since_ns=first_ns,
-            thrust_noise_mps2=robot.thrust_noise * self._stages.guidance.params.a_max_mps2,
+            thrust_noise_mps2=robot.thrust_noise * self.stages.guidance.params.a_max_mps2,
             noise=self.flight.noise,
             advice=grasp_advice(self.task, surface),
         )
@@ -440,16 +441,18 @@ class Run:
             ),
         }
 
-    def _new_stages(self) -> Stages:
+    def _new_stages(self, plans: bool = True) -> Stages:
         clock = self.source.first_ns, self.source.clock.period_s * self.source.options.every
-        return stages(self.config, self.header, self.surface, self.registrar, self._true, clock)
+        plan = replace(self.config.plan, enabled=plans and self.config.plan.enabled)
+        config = replace(self.config, plan=plan)
+        return stages(config, self.header, self.surface, self.registrar, self._true, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
         """Fit the acceleration to the measured poses of a first pass if this is set, and use it."""
         if not self.config.estimator.fit_acceleration:
             return None
         self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))
-        ready = self._new_stages()
+        ready = self._new_stages(plans=False)
         outcomes = [
             outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
         ]

@@ -140,7 +140,12 @@ class SettingError(ValueError):
 
 
 def is_unit(values: Sequence[float], tolerance: float = 1e-3) -> bool:
-    """Return whether a vector or a quaternion has the length 1 within ``tolerance``."""
+    """Return whether a vector or a quaternion has the length 1 within ``tolerance``.
+
+    Args:
+        values: (n,) components.
+        tolerance: largest difference of the length from 1.
+    """
     return math.isclose(math.hypot(*values), 1.0, abs_tol=tolerance)
 
 
@@ -149,6 +154,11 @@ def are_orthonormal(
 ) -> bool:
     """Return whether two vectors have the length 1 and are perpendicular, each within
     ``tolerance``.
+
+    Args:
+        first: components of one vector.
+        other: components of the other vector.
+        tolerance: largest difference of lengths from 1 and of the scalar product from 0.
     """
     cosine = sum(a * b for a, b in zip(first, other, strict=True))
     return is_unit(first, tolerance) and is_unit(other, tolerance) and abs(cosine) <= tolerance

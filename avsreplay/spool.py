@@ -55,6 +55,9 @@ class SpoolFile:
         Args:
             offset: of the first byte.
             out: the array, contiguous.
+
+        Raises:
+            UnreadableInput: the temporary file was truncated.
         """
         assert self._stream is not None
         self._stream.seek(offset)

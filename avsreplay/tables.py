@@ -19,8 +19,8 @@ from avsreplay.geometry import Pose
 from avsreplay.rows import Row, field_types
 from avsreplay.spool import Spool, SpoolFile
 
-_TYPES: dict[type, str] = {float: "f8", int: "i8", bool: "?", str: "u4"}
-_KNOWN = " known"  # field of the flags that say which columns have a value
+_COLUMN_TYPES: dict[type, str] = {float: "f8", int: "i8", bool: "?", str: "u4"}
+_KNOWN_FIELD = " known"  # field of the flags that say which columns have a value
 
 
 class _Rows(Sequence[Row]):
@@ -97,7 +97,7 @@ class RowTable(_Rows):
             values = block[name].tolist()
             if kind is str:
                 values = [self._texts[code] if code < len(self._texts) else "" for code in values]
-            known = block[_KNOWN][:, place]
+            known = block[_KNOWN_FIELD][:, place]
             if not known.all():
                 values = [v if k else None for v, k in zip(values, known.tolist(), strict=True)]
             out += values
@@ -113,7 +113,7 @@ class RowTable(_Rows):
         for block in self._records.blocks():
             part = out[end : end + len(block)]
             part[:] = block[name]
-            part[~block[_KNOWN][:, place]] = np.nan
+            part[~block[_KNOWN_FIELD][:, place]] = np.nan
             end += len(block)
         return out
 
@@ -133,7 +133,7 @@ class RowTable(_Rows):
 
     def _rows(self, block: NDArray[Any]) -> Iterator[Row]:
         texts, places = self._texts, _text_places()
-        for (*values, _), known in zip(block.tolist(), block[_KNOWN].tolist(), strict=True):
+        for (*values, _), known in zip(block.tolist(), block[_KNOWN_FIELD].tolist(), strict=True):
             for place in places:
                 if known[place]:
                     values[place] = texts[values[place]]
@@ -173,8 +173,8 @@ class _ChosenRows(_Rows):
 @cache
 def _record() -> np.dtype[Any]:
     types = field_types()
-    fields: list[Any] = [(name, _TYPES[kind]) for name, (kind, _) in types.items()]
-    return np.dtype([*fields, (_KNOWN, "?", (len(types),))])
+    fields: list[Any] = [(name, _COLUMN_TYPES[kind]) for name, (kind, _) in types.items()]
+    return np.dtype([*fields, (_KNOWN_FIELD, "?", (len(types),))])
 
 
 @cache

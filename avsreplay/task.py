@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -274,21 +274,20 @@ def task_of(
     point, out = frozen(np.array(grasp, float), 3), np.array(axis, float)
     out = frozen(out / np.linalg.norm(out), 3)
     clearance = radius if limits is None else (limits.clearance_m or 0.0) + radius
-    half, mouth, begin, problem = _access(
-        point, out, surface, closest, params.opening_m, tolerance.position_m, clearance, extent
-    )
-    corridor = _CORRIDOR_RATIO * begin
+    needed = _Room(params.opening_m, tolerance.position_m, clearance)
+    access = _access(point, out, surface, closest, needed, extent)
+    corridor = _CORRIDOR_RATIO * access.clear_m
     return Task(
         point,
         out,
         tolerance,
-        params.opening_m or 2.0 * half,
+        params.opening_m or 2.0 * access.half_m,
         radius,
-        mouth,
+        access.mouth_m,
         math.inf if params.deadline_s is None else params.deadline_s,
         corridor if corridor > _LEAST_CORRIDOR_OF_EXTENT * extent else 0.0,
         _assumed(params, supervisor, robot),
-        problem,
+        access.problem,
     )
 
 
@@ -316,34 +315,43 @@ def _assumed(
     return tuple(name for name, value in values.items() if value is None)
 
 
-def _access(
-    point: Array,
-    axis: Array,
-    surface: Surface,
-    closest: Closest,
-    opening_m: float | None,
-    tolerance_m: float,
-    clearance_m: float,
-    extent: float,
-) -> tuple[float, float, float, str]:
-    """Half of the opening, distance at which a part at the grasp point ends and at which the
+class _Room(NamedTuple):
+    """What a gripper needs around the grasp point: its opening (None: not given), the error of its
+    position and the distance from the body [m].
+    """
+
+    opening_m: float | None
+    tolerance_m: float
+    clearance_m: float
+
+
+class _Access(NamedTuple):
+    """Half of the opening, distances at which a part at the grasp point ends and at which the
     clearance begins [m], and why the point cannot be used.
     """
+
+    half_m: float
+    mouth_m: float
+    clear_m: float
+    problem: str
+
+
+def _access(
+    point: Array, axis: Array, surface: Surface, closest: Closest, needed: _Room, extent: float
+) -> _Access:
+    """How a straight approach along an axis reaches a grasp point of a body with this diameter."""
     along = np.linspace(0.0, extent, _LINE_POINTS)
     foot, gap = closest(point + along[:, None] * axis)
     off = float(np.linalg.norm(foot[0] - point))
-    allowed = _MAX_OPENING_OF_EXTENT * extent if opening_m is None else 0.5 * opening_m
+    given_m, tolerance_m = needed.opening_m, needed.tolerance_m
+    allowed = _MAX_OPENING_OF_EXTENT * extent if given_m is None else 0.5 * given_m
     if not len(surface.faces):
-        problem = (
-            f"the grasp point is {off:.3g} m from the nearest point of the model"
-            if off > max(allowed, tolerance_m)
-            else ""
-        )
-        return tolerance_m, 0.0, 0.0, problem
+        far = f"the grasp point is {off:.3g} m from the nearest point of the model"
+        return _Access(tolerance_m, 0.0, 0.0, far if off > max(allowed, tolerance_m) else "")
     inside = gap < -1e-9 * extent
     depth = float(max(-gap.min(), 0.0))
     mouth = float(along[np.flatnonzero(inside)[-1]]) if inside.any() else 0.0
-    near = np.flatnonzero(gap < clearance_m)
+    near = np.flatnonzero(gap < needed.clearance_m)
     begin = float(along[near[-1]]) if len(near) else 0.0
     problem = ""
     if gap[0] < 0.0 and off > allowed:
@@ -355,7 +363,7 @@ def _access(
             f"the approach along its axis passes through the body, up to {depth:.3g} m deep, within"
             f" {mouth:.3g} m of the grasp point"
         )
-    return depth + tolerance_m, mouth, begin, problem
+    return _Access(depth + tolerance_m, mouth, begin, problem)
 
 
 def patches(surface: Surface, closest: Closest) -> tuple[Patch, ...]:
@@ -369,10 +377,9 @@ def patches(surface: Surface, closest: Closest) -> tuple[Patch, ...]:
         return ()
     found = sorted(_flat(surface), key=lambda each: -each[2])
     out: list[Patch] = []
+    needed = _Room(opening_m=1e-9, tolerance_m=1e-4 * surface.extent, clearance_m=0.0)
     for point, normal, area in found:
-        sizes = 1e-4 * surface.extent, 0.0, surface.extent
-        problem = _access(point, normal, surface, closest, 1e-9, *sizes)[3]
-        if not problem:
+        if not _access(point, normal, surface, closest, needed, surface.extent).problem:
             x, y, z = (round(float(v), 5) for v in point)
             axis = (float(normal[0]), float(normal[1]), float(normal[2]))
             out.append(Patch(f"flat-{len(out) + 1}", (x, y, z), axis, area))

@@ -31,9 +31,9 @@ _MAX_COMPARED_CHARACTERS = 200  # characters of an unknown key that are compared
 _BYTES_PER_CHARACTER = 8  # memory of parsed TOML for each character of its text
 # Three and more keys joined by dots; each part is tried at one place, so that the time is linear.
 _MAX_FLOAT_INTEGER = 1 << 1023  # that is taken for a float
-_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+")
-_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
+_KEY_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![A-Za-z0-9_-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{2,}}+")
+_TABLE_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
 
@@ -374,7 +374,7 @@ def _line_of(text: str, path: Sequence[str | int]) -> int | None:
     table: tuple[str | int, ...] = ()
     counts: dict[tuple[str | int, ...], int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        header, key = _HEADER.match(line), _KEY.match(line)
+        header, key = _TABLE_HEADER.match(line), _KEY.match(line)
         if header:
             table = tuple(p.strip().strip("\"'") for p in header[2].split("."))
             if header[1] == "[[":

@@ -36,18 +36,20 @@ PATH_POINTS = 41
 MAX_SHOWN_POINTS = 2000
 MAX_RESIDUAL_OF_EXTENT = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
-_POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_ROW_POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _IN_MESSAGES = {
     "seq",
     "t_ns",
-    *_POSE_COLUMNS,
-    *(f"reg_{name}" for name in _POSE_COLUMNS),
+    *_ROW_POSE_COLUMNS,
+    *(f"reg_{name}" for name in _ROW_POSE_COLUMNS),
 }  # what other messages hold
-_NUMERIC = ("float", "int", "bool")  # types of columns, as declared, without "| None"
-_COLUMNS = tuple(
-    f.name for f in fields(Row) if str(f.type).split()[0] in _NUMERIC and f.name not in _IN_MESSAGES
+_NUMBER_TYPES = ("float", "int", "bool")  # types of columns, as declared, without "| None"
+_NUMBER_COLUMNS = tuple(
+    f.name
+    for f in fields(Row)
+    if str(f.type).split()[0] in _NUMBER_TYPES and f.name not in _IN_MESSAGES
 )
-_VALUES = attrgetter(*_COLUMNS)
+_NUMBER_VALUES = attrgetter(*_NUMBER_COLUMNS)
 RERUN_PORT = 9876  # port of a Rerun viewer
 
 
@@ -92,6 +94,9 @@ class NewPaths:
     def of(self, state: PipelineState) -> tuple[Array, Array] | None:
         """Times (n,) [s] and positions (n, 3) [m] of a flight not seen before, None where there is
         none.
+
+        Args:
+            state: the state after a scan.
         """
         segment = planned_segment(state)
         if segment is None or segment is self._known or segment.path is None:
@@ -108,11 +113,16 @@ class ResultLogWriter:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
         facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
-        self._log = ResultLog(path, run.surface, facts, approach_cones(run), _COLUMNS)
+        self._log = ResultLog(path, run.surface, facts, approach_cones(run), _NUMBER_COLUMNS)
 
     def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int] = ()) -> None:
         """Take over the messages of an earlier log of the same run, with the columns of the rows
         that have changed.
+
+        Args:
+            written: the earlier log.
+            rows: the rows so far.
+            changed: numbers of the rows that have changed.
         """
         self._log.copy(written, rows[-1].reason, {k: _numbers(rows[k]) for k in changed})
 
@@ -121,7 +131,14 @@ class ResultLogWriter:
         self._log.close()
 
     def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
+        """Take one scan: the points that are shown; times and positions of a new flight, if any.
+
+        Args:
+            scan: the scan with its row.
+            cloud: the points of the scan that are shown, with their residuals.
+            path: times (n,) [s] and positions (n, 3) in {A} [m] of a new flight; None where there
+                is none.
+        """
         row, outcome = scan.row, scan.outcome
         values = {
             name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None
@@ -147,7 +164,7 @@ class ResultLogWriter:
 
 def _numbers(row: Row) -> list[float]:
     """The numeric columns of a row; NaN without a value."""
-    return [math.nan if value is None else value for value in _VALUES(row)]
+    return [math.nan if value is None else value for value in _NUMBER_VALUES(row)]
 
 
 def approach_cones(run: Run) -> Array | None:
@@ -228,7 +245,12 @@ class RerunStream:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
     def correct(self, rows: Sequence[Row], changed: Iterable[int]) -> None:
-        """Send the columns of rows again that had other values when their scans were shown."""
+        """Send the columns of rows again that had other values when their scans were shown.
+
+        Args:
+            rows: the rows so far.
+            changed: numbers of the rows that have changed.
+        """
         for row in (rows[k] for k in changed):
             self._rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
             self._show(row)
@@ -239,7 +261,7 @@ class RerunStream:
 
     def _show(self, row: Row) -> None:
         """Send the numeric columns of a row that have a value."""
-        for name, value in zip(_COLUMNS, _VALUES(row), strict=True):
+        for name, value in zip(_NUMBER_COLUMNS, _NUMBER_VALUES(row), strict=True):
             if value is not None:
                 self._rr.log(f"rows/{name}", self._rr.Scalars(float(value)))
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 # wheel: the clone, which "python -m" puts on the path, has no compiled extensions.
 sys.path[:] = [entry for entry in sys.path if Path(entry or os.curdir).resolve() != ROOT]
 os.environ["PYTHONSAFEPATH"] = "1"
+# A shell ignores Ctrl-C in its background jobs, which the processes of the tests would inherit.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from command_server import CommandServer  # noqa: E402
 

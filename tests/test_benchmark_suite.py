@@ -52,6 +52,11 @@ def test_only_selects_groups_and_scenarios_in_the_order_of_the_suite(suite):
         suite.select(["clear"])
 
 
+def test_the_quick_part_has_a_scenario_of_each_group(suite):
+    quick = suite.select(suite.params.quick)
+    assert sorted(each.group for each in quick) == sorted(GROUPS)
+
+
 def test_an_unknown_suite_is_named():
     with pytest.raises(UsageError, match="capture-0"):
         load_suite("capture-0")

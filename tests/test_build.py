@@ -24,7 +24,9 @@ TRUE = Pose(IDENTITY_QUAT, np.array([1.0, 2.0, 3.0]))
 
 
 def _first_pose(init, truth):
-    return build._initialise(RunConfig(init=init), LogHeader(), lambda scan: Truth(truth))(SCAN)
+    return build.first_pose_source(RunConfig(init=init), LogHeader(), lambda scan: Truth(truth))(
+        SCAN
+    )
 
 
 def test_a_true_pose_in_the_log_does_not_begin_the_replay():
@@ -53,7 +55,7 @@ def test_a_log_without_a_start_is_searched_and_the_rows_say_so():
             Job(source=LOG, options=SourceOptions(n_scans=1), assignments=(f"init={init}",))
         ) as run:
             header = replace(run.source.header, start=None)
-            run._stages = build.stages(
+            run.stages = build.stages(
                 run.config, header, run.surface, run.registrar, run.source.truth_of
             )
             (rows[init],) = run.rows()

@@ -20,7 +20,7 @@ import pytest
 
 import avsreplay
 from avsreplay.checkpoint import pack, unpack
-from avsreplay.cli.run import _collect
+from avsreplay.cli.run import collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions
@@ -146,7 +146,7 @@ def test_ctrl_c_takes_effect_between_two_scans(make_rows):
 
     kept = []
     handler = signal.getsignal(signal.SIGINT)
-    assert _collect(rows(), kept)
+    assert collect(rows(), kept)
     assert (len(kept), finished) == (3, ["the work of this scan"])
     assert signal.getsignal(signal.SIGINT) is handler
 
@@ -381,7 +381,7 @@ def test_a_second_ctrl_c_leaves_no_part_of_a_scan(fixtures_folder, tmp_path, mon
                 type(run.estimator), "published", lambda _, track: twice() or published(track)
             )
         rows = run.taken
-        assert _collect(run.rows(listeners), rows)
+        assert collect(run.rows(listeners), rows)
         assert len(rows) == (5 if place == "a listener" else 4)
         monkeypatch.undo()
         writer.finish({**run.facts(), "rows so far": len(rows)}, resumable=True)

@@ -97,7 +97,7 @@ def test_sigterm_ends_a_command_that_ignores_ctrl_c(fixtures_folder, tmp_path, i
     time.sleep(0.2)
     assert process.poll() is None
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=60)
+    process.communicate()
     assert process.returncode == 143
 
 

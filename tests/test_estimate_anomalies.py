@@ -141,6 +141,29 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     assert moments == pytest.approx(want, rel=1e-8, abs=1e-8 * np.abs(want).max())
 
 
+def test_the_moments_of_a_possible_change_are_no_less_than_zero() -> None:
+    """Also where the scans hardly determine some directions, so that their gains are large and
+    nearly the same direction of the state is all that remains of a change.
+    """
+    for seed in range(10):
+        rng = np.random.Generator(np.random.PCG64(seed))
+        towards, by = rng.normal(size=20), rng.normal(size=6)
+        used = []
+        for _ in range(5):
+            Phi, H = np.eye(20), np.zeros((6, 20))
+            Phi[:3, 3:6] = Phi[6:9, 9:12] = 0.4 * np.eye(3)
+            H[:3, 6:9] = H[3:, :3] = np.eye(3)
+            H[:, 12:] = 0.3 * rng.normal(size=(6, 8))
+            info = 10.0 ** rng.uniform(0.0, 7.0, size=6)
+            alpha = rng.normal(size=6) / np.sqrt(info)
+            gain = 300.0 * np.outer(by, towards) + 0.1 * rng.normal(size=(6, 20))
+            parts = Phi, H, alpha, np.diag(info), gain
+            used.append(np.concatenate([each.ravel() for each in parts]))
+        _, moments = _motion.change(np.array(used), (0.05, 0.02), [1.0, 0.1], 1.0, 0.0)
+        eigenvalues = np.linalg.eigvalsh(moments)
+        assert eigenvalues[0] >= -1e-12 * eigenvalues[-1]
+
+
 def test_nothing_is_found_on_a_clean_log() -> None:
     result = surprises.run(CLEAN, 3)
     assert result.track is not None

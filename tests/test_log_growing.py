@@ -116,15 +116,17 @@ def test_a_clock_that_steps_later_makes_the_rows_outdated(tmp_path):
             points = rng.standard_normal((50, 3)).astype(np.float32)
             writer.write(Scan(k, 0 if k < 3 else stamp(k), points, log_ns=(10 + k) * 10**9))
     growing = grown(path, tmp_path, 300)
-    growing.open(SourceOptions())
+    first = growing.open(SourceOptions())
+    clock, used = (first.first_ns, first.clock.period_s), []
     for scan in growing.scans():
+        used.append(scan.t_ns)
         growing.take(scan, growing.source.truth_of(scan))
     outdated = growing.outdated()
     with open_source(path) as whole:
-        same = [scan.t_ns for scan in whole.scans()] == [used.t_ns for used, _ in growing._used]
+        same = [scan.t_ns for scan in whole.scans()] == used
         # the stages were made from the scans of the first opening, whose number depends on the
         # writer
-        same = same and growing._clock == (whole.first_ns, whole.clock.period_s)
+        same = same and clock == (whole.first_ns, whole.clock.period_s)
     assert outdated != same
 
 
@@ -138,11 +140,11 @@ class Written(GrowingLog):
         path.write_bytes(self.pieces.pop(0))
         super().__init__(path)
 
-    def _advance(self):
+    def advance(self):
         if self.pieces:
             with self.path.open("ab") as file:
                 file.write(self.pieces.pop(0))
-        return super()._advance()
+        return super().advance()
 
 
 def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay(

@@ -187,7 +187,7 @@ def test_without_a_summary_nothing_is_lost(whole: dict[str, Path], tmp_path: Pat
     data = whole["zstd"].read_bytes()
     footer = struct.pack("<BQQQI", mcap.Opcode.FOOTER, 20, 0, 0, 0)
     (tmp_path / "x.mcap").write_bytes(
-        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MAGIC
+        data[: data_end_of(data, chunks(whole["zstd"])[-1][1])] + footer + mcap.MCAP_MAGIC
     )
     found, losses = read(tmp_path / "x.mcap")
     assert len(found) == len(CLOUDS)
@@ -252,18 +252,39 @@ def test_a_decompression_bomb_is_rejected(tmp_path: Path, compression: str) -> N
         assert losses[0].chunks == 1
 
 
-def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -> None:
-    """A chunk of 32 MiB of zeros is 3.7 million records; compressed it takes 1 kB of the file."""
-    import tracemalloc
-
+def chunk_of(content: bytes) -> bytes:
+    """A chunk record, compressed with zstd."""
     import zstandard
 
-    size = 32 << 20
-    packed = zstandard.compress(bytes(size))
-    chunk = (
-        struct.pack("<QQQII", 0, 1, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
-    )
-    record = struct.pack("<BQ", mcap.Opcode.CHUNK, len(chunk)) + chunk
+    packed = zstandard.compress(content)
+    head = struct.pack("<QQQII", 0, 1, len(content), 0, 4) + b"zstd"
+    chunk = head + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", mcap.Opcode.CHUNK, len(chunk)) + chunk
+
+
+@pytest.mark.parametrize("count", [0, 3, 40])
+def test_the_chunks_of_a_file_declare_no_more_than_its_bytes_can_hold(
+    tmp_path: Path, count: int
+) -> None:
+    """Messages of zeros of an unknown channel, 4 MiB each and valid; a few are no attack."""
+    write(tmp_path / "good.mcap", LogHeader(), CLOUDS[:4])
+    data, first = (tmp_path / "good.mcap").read_bytes(), chunks(tmp_path / "good.mcap")[0][0]
+    zeros = chunk_of(struct.pack("<BQ", mcap.Opcode.MESSAGE, (4 << 20) - 9) + bytes((4 << 20) - 9))
+    (tmp_path / "zeros.mcap").write_bytes(data[:first] + zeros * count + data[first:])
+    found, losses = read(tmp_path / "zeros.mcap")
+    refused = [loss for loss in losses if "left for this file" in loss.what]
+    most = ((16 << 20) + 1000 * (len(data) + len(zeros) * count)) // (4 << 20)
+    assert len(found) == 4
+    assert sum(loss.chunks for loss in refused) >= max(0, count - most)
+    assert bool(refused) == (count == 40)
+
+
+def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -> None:
+    """A chunk of 12 MiB of zeros is 1.4 million records; compressed it takes 400 bytes."""
+    import tracemalloc
+
+    size = 12 << 20
+    record = chunk_of(bytes(size))
     intact = tmp_path / "good.mcap"
     write(intact, LogHeader(), CLOUDS[:4])
     data, first = intact.read_bytes(), chunks(intact)[0][0]
@@ -381,7 +402,7 @@ def test_the_work_for_hostile_bytes_grows_with_their_number(tmp_path: Path, what
         .integers(0, 256, 4096, dtype=np.uint8)
         .tobytes(),
     }
-    assert_linear(tmp_path / "x.mcap", mcap.MAGIC, pieces[what])
+    assert_linear(tmp_path / "x.mcap", mcap.MCAP_MAGIC, pieces[what])
 
 
 @pytest.mark.parametrize("what", ["chunk marks", "bad chunks", "noise"])

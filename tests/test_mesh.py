@@ -36,7 +36,7 @@ def test_components_are_numbered_in_the_order_of_their_first_nodes(nodes: int, e
     graph = np.random.default_rng(edges).integers(nodes, size=(2, edges))
     pairs = coo_array((np.ones(edges), tuple(graph)), shape=(nodes, nodes))
     assert np.array_equal(
-        mesh._components(nodes, *graph), connected_components(pairs, directed=False)[1]
+        mesh.components(nodes, *graph), connected_components(pairs, directed=False)[1]
     )
 
 

@@ -37,9 +37,9 @@ def own(tmp_path, monkeypatch):
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.syspath_prepend(str(EXAMPLE))
-    parts._entry_points.cache_clear()
+    parts.installed.cache_clear()
     yield
-    parts._entry_points.cache_clear()
+    parts.installed.cache_clear()
     sys.modules.pop("own_backend", None)
 
 
@@ -126,7 +126,7 @@ def test_names_are_sorted_and_one_of_two_equal_names_is_taken(tmp_path):
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
     (info / "entry_points.txt").write_text("[avsreplay.backends]\nown = another:Other\n")
-    parts._entry_points.cache_clear()
+    parts.installed.cache_clear()
     names = BACKENDS.names()
     assert list(names) == sorted(set(names))
     values = {e.value for e in metadata.entry_points(group="avsreplay.backends") if e.name == "own"}

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from avsreplay.cli.compare import compare_command
 from avsreplay.errors import UsageError
 from avsreplay.report.compare import METRICS
-from avsreplay.report.conclusion import HEADLINES, changes_table, conclude, settings_table
+from avsreplay.report.conclusion import COMPARED_METRICS, changes_table, conclude, settings_table
 from avsreplay.report.intervals import interval_of_roots
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.summary import Summary
@@ -269,7 +269,7 @@ def test_a_problem_that_disappears_is_not_a_lost_figure(make_rows):
 
 
 def test_headlines_are_metrics():
-    assert set(HEADLINES) <= {m.name for m in METRICS}
+    assert set(COMPARED_METRICS) <= {m.name for m in METRICS}
 
 
 def test_settings_that_differ_are_named(make_rows):

@@ -8,6 +8,7 @@ import json
 import math
 import sys
 import tempfile
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +21,14 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
-from avsreplay.report import jsonl
+from avsreplay.report import export, jsonl
 from avsreplay.report.export import (
-    FREQUENT,
+    FREQUENT_COLUMNS,
     columns_page,
-    dump_document,
+    document_parts,
     row_poses,
     row_schema,
     row_schema_text,
-    run_document,
     stamp_text,
     write_csv,
     write_kitti,
@@ -161,9 +161,10 @@ def _rows_or_error(path: Path) -> list[Row] | str:
 
 def test_blocks_are_decoded_at_once_and_lines_counted_across_them(tmp_path, monkeypatch):
     text = (ROOT / "fixtures" / "tumble.rows.jsonl").read_bytes()
-    assert jsonl._checked_at_once(text, 35) == read_rows(ROOT / "fixtures" / "tumble.rows.jsonl")
+    one_by_one = [parse_row(json.loads(line), "") for line in text.splitlines()]
+    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == one_by_one
     monkeypatch.setattr(jsonl, "_READ_BYTES", 5000)  # about one row
-    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == jsonl._checked_at_once(text, 35)
+    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == one_by_one
     lines = text.splitlines()
     lines[20] = lines[20].replace(b'"seq": 20', b'"seq": 19')
     (tmp_path / "a.jsonl").write_bytes(b"\n\n" + b"\n".join(lines))
@@ -237,9 +238,10 @@ def test_parquet_without_its_extra_is_one_line(tmp_path, make_rows, monkeypatch)
 def test_the_document_is_strict_json(make_rows):
     rows = make_rows(30, rms_m=math.nan)
     summary = Summary.fold(rows)
-    text = dump_document(rows, summary, {"seed": 7, "empty": {}})
+    text = "".join(document_parts(rows, summary, {"seed": 7, "empty": {}}))
     whole = json.loads(text, parse_constant=pytest.fail)
-    assert whole == run_document(rows, summary, {"seed": 7, "empty": {}})
+    assert whole["header"] == {"seed": 7, "empty": {}}
+    assert whole["summary"]["scans"] == len(rows)
     assert list(whole) == ["format", "verdict", "header", "summary", "rows"]
     assert [parse_row(r, "x") for r in whole["rows"]] == [
         dataclasses.replace(r, rms_m=None) for r in rows
@@ -247,13 +249,38 @@ def test_the_document_is_strict_json(make_rows):
 
 
 def test_the_document_of_no_rows_is_json_too():
-    assert json.loads(dump_document([], Summary.fold([])))["rows"] == []
+    assert json.loads("".join(document_parts([], Summary.fold([]))))["rows"] == []
+
+
+@pytest.mark.parametrize("kind", ["json", "parquet"])
+def test_a_run_is_written_in_the_memory_of_some_of_its_rows(tmp_path, make_rows, kind, monkeypatch):
+    """What is held beside the rows does not grow with their number."""
+    monkeypatch.setattr(export, "GROUP_ROWS", 10)
+    peaks = []
+    for count in (20, 160):
+        rows = make_rows(count)
+        summary = Summary.fold(rows)
+        tracemalloc.start()
+        if kind == "json":
+            parts = document_parts(rows, summary)
+            next(parts)
+            tracemalloc.reset_peak()
+            for _ in parts:
+                pass
+        else:
+            pytest.importorskip("pyarrow")
+            write_parquet(tmp_path / f"{count}.parquet", rows)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 2.0 * peaks[0] + 100_000
 
 
 def test_the_column_list_of_the_docs_is_current():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
     assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
-    assert {name for names in FREQUENT.values() for name in names} <= {c.name for c in columns()}
+    assert {name for names in FREQUENT_COLUMNS.values() for name in names} <= {
+        c.name for c in columns()
+    }
 
 
 def test_every_column_and_every_word_of_a_column_is_described():

@@ -872,13 +872,13 @@ def test_a_bar_has_a_tooltip_and_hovering_moves_the_3d_view(opened):
 def test_the_tables_and_figures_of_a_campaign_can_be_read_at_every_width(browser, tmp_path):
     from avsreplay.sweep.page import build_sweep_page
     from avsreplay.sweep.statistics import quantiles, rate
-    from avsreplay.sweep.summary import HEADLINES, Cell, SweepSummary, WorstRun
+    from avsreplay.sweep.summary import CAMPAIGN_METRICS, Cell, SweepSummary, WorstRun
 
     rates = {
         name: rate(3, 9)
         for name in ("converged", "capture planned", "no fault missed", "no false alarm")
     }
-    metrics = {name: quantiles([0.1 * k for k in range(9)]) for name in HEADLINES}
+    metrics = {name: quantiles([0.1 * k for k in range(9)]) for name in CAMPAIGN_METRICS}
     cells = tuple(
         Cell({"scenario.scanner.noise_m": noise}, 9, {"ok": 9}, metrics, rates, None)
         for noise in (0.004, 0.008)

@@ -421,12 +421,12 @@ def test_moments_follow_from_the_inertia_ratios() -> None:
     from itertools import permutations
 
     from avsreplay.records import State
-    from avsreplay.report.parameters import _moments
+    from avsreplay.report.parameters import relative_moments
 
     for xx, yy, zz in permutations((4.0, 8.0, 5.0)):
         sigma = np.array([(yy - zz) / xx, (zz - xx) / yy])
         x = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0])
-        assert _moments(x) == pytest.approx(np.array([xx, yy, zz]) / 17.0)
+        assert relative_moments(x) == pytest.approx(np.array([xx, yy, zz]) / 17.0)
 
 
 def test_each_manoeuvre_is_listed_as_last_reported(make_rows):

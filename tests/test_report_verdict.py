@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from avsreplay.records import Label
-from avsreplay.report.export import dump_document
+from avsreplay.report.export import document_parts
 from avsreplay.report.moments import worst_moments
 from avsreplay.report.page import build_page
 from avsreplay.report.summary import Summary
@@ -392,7 +392,7 @@ def test_json_and_page_carry_the_verdict_first(make_rows):
     rows = _good(make_rows, reinitialised=1)
     summary = Summary.fold(rows, labels=_labels(rows))
     header = {**HEADER, "changed_settings": ['faults.policy = "all" (default "any")']}
-    document = json.loads(dump_document(rows, summary, header))
+    document = json.loads("".join(document_parts(rows, summary, header)))
     assert list(document)[:2] == ["format", "verdict"]
     assert document["verdict"]["grade"] == "CHECK"
     assert document["verdict"]["changed_settings"] == header["changed_settings"]

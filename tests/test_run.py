@@ -374,7 +374,51 @@ def test_a_prediction_that_leaves_no_room_to_approach_is_named(cli, fixtures_fol
     assert "a longer observation would help" in said
 
 
+WALL = """
+duration_s = 3.0
+rate_hz = 2.5
+[scanner]
+fov_deg = [48.0, 48.0]
+rays = [64, 64]
+[[object]]
+name = "wall"
+size_m = [20.0, 20.0, 0.1]
+position_m = [0.0, 0.0, 8.5]
+[motion]
+position_m = [0.0, 0.0, 6.0]
+"""
+
+
 @pytest.mark.slow
+def test_a_wall_with_most_of_the_points_does_not_reject_right_poses(cli, tmp_path):
+    (tmp_path / "wall.toml").write_text(WALL)
+    assert cli("record", tmp_path / "wall.toml", "-o", tmp_path / "wall.mcap").code == 0
+    done = cli(
+        "run", tmp_path / "wall.mcap", "--init", "auto", "--set", "plan.enabled=false", "--json"
+    )
+    rows = json.loads(done.out)["rows"]
+    assert max(row["inlier_ratio"] for row in rows) < 0.3  # most points are on the wall
+    assert all(row["gamma"] == 1 for row in rows)
+    assert max(row["reg_pos_err_m"] for row in rows) < 0.02
+
+
+@pytest.mark.slow  # it plans
+def test_without_plans_poses_are_the_same_and_no_capture_is_assessed(cli, fixtures_folder):
+    log, soon = fixtures_folder / "tumble.mcap", ("--set", "convergence.criterion=covariance")
+    planned, unplanned = (
+        json.loads(cli("run", log, "--json", *soon, "--set", f"plan.enabled={value}").out)
+        for value in ("true", "false")
+    )
+    same = ("gamma", "x_m", "y_m", "z_m", "pos_err_m", "rot_err_deg", "nis")
+    for one, other in zip(planned["rows"], unplanned["rows"], strict=True):
+        assert [one[name] for name in same] == [other[name] for name in same]
+        assert other["capture_time_s"] is None
+    assert any(row["capture_time_s"] is not None for row in planned["rows"])
+    assessment = unplanned["summary"]["assessment"]
+    assert assessment["chance"] == "not assessed"
+    assert "plan.enabled" in assessment["limit"]
+
+
 def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
     early = "limits.clearance_sigmas=1", "task.position_m=0.05"  # a capture is planned in 12 s

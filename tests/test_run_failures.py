@@ -82,7 +82,7 @@ def test_a_wrong_model_is_searched_where_the_scans_show_something_else(tmp_path)
     model = tmp_path / "other.ply"
     trimesh.creation.torus(1.5, 0.5).export(model)
     with Run(Job(source=LOG, options=SourceOptions(n_scans=24, model=model))) as run:
-        run._stages = replace(run._stages, initialise=lambda scan: (None, "acquired"))
+        run.stages = replace(run.stages, initialise=lambda scan: (None, "acquired"))
         rows = list(run.rows())
     points = [row for row in rows if row.points]
     postponed = [row for row in points if row.message == POSTPONED]

@@ -112,7 +112,7 @@ def test_the_mass_centre_drifts_straight(motion):
 
 
 def test_the_dense_output_is_smooth_across_steps(motion):
-    for edge in motion._starts[1:6]:
+    for edge in motion.step_starts_s[1:6]:
         for before, after in zip(
             motion.states([edge - 1e-9]), motion.states([edge + 1e-9]), strict=True
         ):

@@ -191,7 +191,7 @@ def test_a_spinning_scanner_measures_a_column_at_once():
         CLEAN, rays=(20, 16), fov_deg=(60.0, 30.0), pattern=Pattern.SPINNING, scan_s=0.1
     )
     scan = scanner(params, plate(x=(-9, 9), y=(-9, 9)))
-    d, t = scan._rays[0], scan._times
+    d, t = scan.rays[0], scan.times_s
     azimuth = np.degrees(np.arctan2(d[:, 0], d[:, 2]))
     elevation = np.degrees(np.arctan2(d[:, 1], np.hypot(d[:, 0], d[:, 2])))
     assert len(np.unique(t)) == 20
@@ -207,7 +207,7 @@ def test_a_lissajous_figure_closes_and_covers_the_field_of_view():
     params = replace(
         CLEAN, rays=(60, 60), pattern=Pattern.LISSAJOUS, lissajous=(11, 13), scan_s=1.0
     )
-    d = scanner(params, plate())._rays[0]
+    d = scanner(params, plate()).rays[0]
     u, v = (np.degrees(np.arctan2(d[:, k], d[:, 2])) / 20.0 for k in (0, 1))
     assert_allclose(np.abs([u, v]).max(axis=1), 1.0, atol=1e-3)
     crossings = [int((np.diff(np.sign(each)) != 0).sum()) for each in (u, v)]

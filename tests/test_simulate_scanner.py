@@ -181,7 +181,7 @@ def test_a_raster_of_a_still_target_is_a_flash_of_the_same_rays():
     still = MotionParams(attitude_xyzw=SPIN.attitude_xyzw, rate_radps=(0, 0, 0))
     raster = scanner(replace(CLEAN, pattern=Pattern.RASTER, scan_s=1.0), still)
     flash = scanner(CLEAN, still)
-    flash._rays = raster._rays
+    flash.rays = raster.rays
     assert_allclose(raster.cast(0.0).ranges, flash.cast(0.0).ranges, atol=1e-9)
 
 
@@ -195,7 +195,7 @@ def test_the_field_of_view_bounds_every_ray(view, pattern):
         pattern=pattern,
         scan_s=float(pattern is not Pattern.FLASH),
     )
-    d = scanner(params)._rays[0]
+    d = scanner(params).rays[0]
     across, down = (
         np.degrees(np.arctan2(d[:, 0], d[:, 2])),
         np.degrees(np.arctan2(d[:, 1], d[:, 2])),

@@ -15,7 +15,7 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.parts import FAULTS
 from avsreplay.records import ScanStatus
-from avsreplay.report.charts import KINDS
+from avsreplay.report.charts import PLACE_STYLES
 from avsreplay.simulate import faults as kinds
 from avsreplay.simulate.faults import InjectedFault, active
 from avsreplay.simulate.recorded_faults import disturbed
@@ -395,7 +395,7 @@ def test_every_kind_is_registered_under_its_name_and_has_a_colour():
         if issubclass(each, kinds.Fault) and each is not kinds.Fault
     }
     assert own == {name: FAULTS.load(name) for name in FAULTS.names()}
-    assert set(KINDS["injected"]) == set(FAULTS.names())
+    assert set(PLACE_STYLES["injected"]) == set(FAULTS.names())
 
 
 @pytest.mark.parametrize("kind", FAULTS.names())
@@ -425,7 +425,7 @@ def test_a_kind_of_another_package_needs_no_change_here(plain, monkeypatch):
             halved = replace(shot.returns, ranges=0.5 * shot.returns.ranges)
             return replace(shot, returns=halved)
 
-    monkeypatch.setitem(FAULTS._built_in, "shrunk", Shrunk)
+    monkeypatch.setitem(FAULTS.built_in, "shrunk", Shrunk)
     found = scans(fault("shrunk"))
     assert_allclose(found[4].points, 0.5 * plain[4].points, rtol=1e-6)
     assert found[4].fault == "shrunk"

@@ -17,7 +17,7 @@ from avsreplay.sweep.statistics import (
     rate,
     typical,
 )
-from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
+from avsreplay.sweep.summary import CAMPAIGN_METRICS, Cell, Detector, SweepSummary
 
 VOID = {"meta", "link"}
 
@@ -50,7 +50,9 @@ def curve():
 
 @pytest.fixture
 def summary():
-    metrics = dict.fromkeys(HEADLINES) | {"convergence.t1_s": quantiles([1.0, 2.0, 3.0, 4.0])}
+    metrics = dict.fromkeys(CAMPAIGN_METRICS) | {
+        "convergence.t1_s": quantiles([1.0, 2.0, 3.0, 4.0])
+    }
     cells = tuple(
         Cell(
             {"scenario.name": name},

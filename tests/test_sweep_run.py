@@ -19,7 +19,7 @@ from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageErr
 from avsreplay.log import SourceOptions
 from avsreplay.run import Job, Run
 from avsreplay.sweep.campaign import load_campaign
-from avsreplay.sweep.execute import _crashed, run_tasks, write_results
+from avsreplay.sweep.execute import crashed, run_tasks, write_results
 from avsreplay.sweep.expansion import Task, expand
 from avsreplay.sweep.journal import Journal
 
@@ -278,7 +278,7 @@ def test_a_run_that_raises_is_a_row():
     (outcome,) = run_tasks([task], work=broken)
     assert (outcome.status, outcome.error) == ("crashed", "ZeroDivisionError: by nought")
     killed = type("KilledWorker", (Exception,), {})("tcp://10.0.0.1:5000")
-    assert "10.0.0.1" not in _crashed("ab", killed).error
+    assert "10.0.0.1" not in crashed("ab", killed).error
 
 
 @pytest.mark.slow
@@ -427,10 +427,10 @@ def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkey
 def test_dask_listens_on_the_loopback_only():
     psutil = pytest.importorskip("psutil")
     from avsreplay.cli.sweep import sweep_command
-    from avsreplay.sweep.execute import _client
+    from avsreplay.sweep.execute import connected
 
     dashboard = next(param.default for param in sweep_command.params if param.name == "dashboard")
-    with _client(1, None, dashboard) as client:
+    with connected(1, None, dashboard) as client:
         me = psutil.Process()
         found = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections("inet")]
         assert client.dashboard_link.startswith("http://127.0.0.1:")

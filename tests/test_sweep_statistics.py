@@ -114,10 +114,10 @@ def test_scans_without_a_measurement_are_flagged_at_every_threshold():
 
 
 def test_a_summary_holds_no_number_that_json_cannot_say():
-    from avsreplay.sweep.summary import _finite
+    from avsreplay.sweep.summary import without_infinities
 
     assert json.dumps(
-        _finite({"a": [math.inf, math.nan, 1.0], "b": {"c": -math.inf}}), allow_nan=False
+        without_infinities({"a": [math.inf, math.nan, 1.0], "b": {"c": -math.inf}}), allow_nan=False
     )
 
 

@@ -73,6 +73,7 @@ class SuiteParams(Settings):
     name: str = setting(doc="Name and version of the suite.")
     seed: int = setting(doc="Seed of everything that is drawn.", low=0, below=2**63)
     repeats: int = setting(1, "Motions of every simulated scenario.", low=1)
+    quick: tuple[str, ...] = setting((), "Scenarios of the quick part.")
     simulate: Any = setting(dict, "Tables of every scenario file.")
     run: Any = setting(dict, "Settings of the replay of simulated scenarios.")
     scenario: tuple[SuiteScenario, ...] = setting((), "The scenarios.")

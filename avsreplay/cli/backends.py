@@ -144,7 +144,7 @@ def print_plain_table(title: str, heads: tuple[str, ...], rows: Iterable[Iterabl
 
 
 MEMORY_SCANS = 3
-HEADS = (
+BACKEND_HEADS = (
     *(
         "back end",
         "build\n[s]",
@@ -379,5 +379,6 @@ def _print_tallies(summaries: list[dict[str, Any]]) -> None:
         for row in summaries
     )
     print_table(
-        make_console(plain_width=120), Table("Registration back ends on this log", HEADS, rows)
+        make_console(plain_width=120),
+        Table("Registration back ends on this log", BACKEND_HEADS, rows),
     )

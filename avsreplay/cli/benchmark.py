@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 EPILOG = """\b
 Examples:
   avsreplay benchmark --list                               the scenarios
-  avsreplay benchmark --quick -o quick/                    every entry, one motion of each scenario
+  avsreplay benchmark --quick -o quick/                    every entry, one scenario of each group
   avsreplay benchmark -o whole/ --workers 8                again: only what is not finished is run
-  avsreplay benchmark --quick -o mine/ --backend mine --only clean,wrong-wall
+  avsreplay benchmark --repeats 1 -o mine/ --backend mine --only clean,wrong-wall
   avsreplay compare quick/benchmark.json mine/benchmark.json
 
 \b
@@ -43,7 +43,14 @@ def _names(_ctx: click.Context, _param: click.Parameter, text: str) -> tuple[str
 @click.command("benchmark", cls=Command, epilog=EPILOG)
 @click.option("--suite", "suite_name", default="capture-1", show_default=True, help="The suite.")
 @click.option("--list", "listed", is_flag=True, help="Print the scenarios and exit.")
-@click.option("--quick", is_flag=True, help="One motion of each scenario; 15 minutes on two cores.")
+@click.option(
+    "--quick", is_flag=True, help="One motion of one scenario of each group, or of those of --only."
+)
+@click.option(
+    "--repeats",
+    type=click.IntRange(1),
+    help="Motions of each simulated scenario; without it as many as the suite has.",
+)
 @click.option(
     "--backend",
     "backends",
@@ -101,6 +108,7 @@ def benchmark_command(
     suite_name: str,
     listed: bool,
     quick: bool,
+    repeats: int | None,
     backends: tuple[str, ...],
     estimators: tuple[str, ...],
     only: tuple[str, ...],
@@ -131,7 +139,7 @@ def benchmark_command(
     from avsreplay.benchmark.suite import load_suite
 
     suite = load_suite(suite_name)
-    chosen = suite.select(only)
+    chosen = suite.select(only or (suite.params.quick if quick else ()))
     if listed:
         click.echo(_described(suite, chosen))
         return
@@ -145,7 +153,7 @@ def benchmark_command(
         suite=suite,
         scenarios=chosen,
         entries=entries_of(backends, estimators),
-        repeats=1 if quick else suite.params.repeats,
+        repeats=repeats or (1 if quick else suite.params.repeats),
         seed=suite.params.seed if seed is None else seed,
         n_scans=n_scans,
         data=data.absolute(),

@@ -338,7 +338,7 @@ or the log's own `[run]` table. `avsreplay config` prints the effective configur
 `avsreplay config --markdown` makes this page from the declarations in the code.
 """
 
-FREQUENT = {
+FREQUENT_OPTIONS = {
     "topic": "choose the clouds of a bag with several",
     "model": "replay against this CAD file",
     "model_unit": "state the unit of the model",
@@ -359,6 +359,7 @@ FREQUENT = {
     "robot.accel_max_mps2": "state what the robot can do",
     "limits.final_deg": "approach through a corridor",
     "limits.clearance_m": "keep clear of the target",
+    "plan.enabled": "tune registration or estimation without plans, in about half of the time",
 }  # key of a setting of a run or of reading a log: what it is used for
 
 SECTIONS = (
@@ -433,7 +434,8 @@ def reference_page() -> str:
     found = {entry.key: entry for _, _, owner in SECTIONS[:2] for entry in _entries(owner)}
     lines = ["| to | setting | default |", "|---|---|---|"]
     lines += [
-        f"| {purpose} | `{key}` | {_default(found[key])} |" for key, purpose in FREQUENT.items()
+        f"| {purpose} | `{key}` | {_default(found[key])} |"
+        for key, purpose in FREQUENT_OPTIONS.items()
     ]
     introduction = INTRODUCTION.replace("{frequent}", "\n".join(lines))
     return "\n".join([introduction, *_page()]).rstrip("\n") + "\n"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from avsreplay.score import Reference
 
 OBSERVABILITY_WIDTH_CHARACTERS = 100
-HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
+SIGMA_HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
 
 EPILOG = """\b
 Examples:
@@ -95,7 +95,9 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
     from avsreplay.toml_document import Assignment, toml_value
 
     init, assignments = flags.pop("init"), flags.pop("assignments")
-    more = (Assignment(f"init={toml_value(init)}", f"--init {init}"),) if init is not None else ()
+    more: tuple[str, ...] = ("plan.enabled=false",)
+    if init is not None:
+        more = (Assignment(f"init={toml_value(init)}", f"--init {init}"), *more)
     return Job(source=log, options=read_options(flags), assignments=(*assignments, *more))
 
 
@@ -181,9 +183,11 @@ def _print(found: dict[str, Any]) -> None:
 
     motion = f"along one motion fitted to {found['healthy_scans']} scans"
     title = f"Observability Gramian {motion}: rank, log10 of its condition raw and scaled"
-    heads = [head for name in HEADS.values() for head in (f"{name}\nrank", "\nraw", "\nscaled")]
+    heads = [
+        head for name in SIGMA_HEADS.values() for head in (f"{name}\nrank", "\nraw", "\nscaled")
+    ]
     rows = tuple(
-        (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name])))
+        (f"{line['t_s']:.1f}", *(cell for name in SIGMA_HEADS for cell in _cells(line[name])))
         for line in found["lines"]
     )
     console = make_console(plain_width=OBSERVABILITY_WIDTH_CHARACTERS)
@@ -192,7 +196,7 @@ def _print(found: dict[str, Any]) -> None:
         " scan"
     )
     print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
-    for name, head in HEADS.items():
+    for name, head in SIGMA_HEADS.items():
         lacking, weak = found["unobserved"][name], found["weakest"][name]
         if lacking:
             print_line(

@@ -45,7 +45,7 @@ CHANGES = (
     ("plan.a_max_mps2", (2.0, 4.0)),
     ("plan.horizon_s", (2.0, 4.0)),
 )
-LATER_S = (1.0, 3.0, 10.0)
+LATER_BEGINS_S = (1.0, 3.0, 10.0)
 MOST_CHANGES = 3  # largest number of settings that are named
 EPILOG = """\b
 Examples:
@@ -271,7 +271,7 @@ def _changes(
                 option = f"{options[name]} {value}" if name in options else f"--set {key}={value}"
                 out.append(PossibleChange(key, option, saved.rows[index].t_s, made))
                 break
-    for later_s in LATER_S:
+    for later_s in LATER_BEGINS_S:
         at_s = saved.rows[index].t_s + later_s
         known = zip(column_of(saved.rows, "t_s"), column_of(saved.rows, "converged"), strict=True)
         later_ones = (k for k, (t_s, flag) in enumerate(known) if t_s >= at_s and flag)

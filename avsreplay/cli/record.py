@@ -42,7 +42,7 @@ Examples:
   avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
   avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP
   avsreplay record y.mcap -o f.mcap --fault occlusion:10:4 --fault range_bias:20:2:0.05"""
-KINDS = "Kinds of fault with their default strengths (docs/scenario.md describes them):"
+FAULT_KINDS_HELP = "Kinds of fault with their default strengths (docs/scenario.md describes them):"
 
 
 class RecordCommand(Command):
@@ -54,7 +54,7 @@ class RecordCommand(Command):
 
         super().format_epilog(ctx, formatter)
         formatter.write_paragraph()
-        formatter.write_text(KINDS)
+        formatter.write_text(FAULT_KINDS_HELP)
         with formatter.indentation():
             formatter.write_text(kinds_with_strengths())
 

@@ -419,7 +419,7 @@ def _take_scans(
     growing = run.job.growing
     live = growing is not None and live_allowed
     found = run.rows(listeners, None if live else tracked)
-    interrupted = _collect(found, run.taken, growing, live=live, then=then)
+    interrupted = collect(found, run.taken, growing, live=live, then=then)
     if growing and not interrupted and growing.outdated():
         raise Outdated
     changed = run.rescore() if growing else []
@@ -485,7 +485,7 @@ def _untimed_notes(run: Run, rows: Sequence[Row]) -> tuple[str, ...]:
     return (note,) if note else ()
 
 
-def _collect(
+def collect(
     found: Generator[Row],
     rows: Sequence[Row],
     growing: GrowingLog | None = None,
@@ -493,11 +493,22 @@ def _collect(
     live: bool = False,
     then: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Take all rows, which the run keeps, and call ``then``; True if the user interrupted after one
-    or more rows.
+    """Take all rows, which the run keeps, and call ``then``.
 
-    All results hold the same scans: an interrupt takes effect between two of them. With ``live`` a
-    line is printed for each row.
+    All results hold the same scans: an interrupt takes effect between two of them.
+
+    Args:
+        found: the rows as they are made.
+        rows: the rows that the run has kept so far.
+        growing: the log, where it is still written.
+        live: print a line for each row.
+        then: what follows the last row.
+
+    Returns:
+        Whether the user interrupted after one or more rows.
+
+    Raises:
+        KeyboardInterrupt: the user interrupted before the first row.
     """
     from avsreplay.cli.options import interruptible, say_live
 
@@ -570,9 +581,10 @@ def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
 
 def _print(wanted: Wanted, done: _Finished) -> None:
     if wanted.as_json:
-        from avsreplay.report.export import dump_document
+        from avsreplay.report.export import document_parts
 
-        click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
+        for part in document_parts(done.rows, done.summary, done.record):
+            click.echo(part, nl=False)
         return
     from avsreplay.report.summary_tables import TABLES, print_screen, print_tables
     from avsreplay.report.table import make_console

@@ -35,7 +35,7 @@ _JACOBIAN_STEP = 1e-6  # difference of the numeric Jacobian, in units of the foc
 _CONVERGED_ERROR = 1e-9  # error of the inverse in units of the focal length
 _MAX_PIXEL_ERROR = 0.01  # a pixel whose ray is not found to within this [pixel] has no ray
 _MAX_CAMERA_FILE_BYTES = 1 << 20
-_FILES = re.compile(
+_CAMERA_FILE_NAME = re.compile(
     r"(?:scene_)?(?:camera|intrinsics?)(?:_info|_intrinsics?)?\.(?:txt|json|ya?ml)$"
 )
 _TAUGHT = (
@@ -243,7 +243,9 @@ def find_camera(folder: Path, stated: str | None) -> Camera:
     if stated is not None:
         return stated_camera(stated)
     for place in (folder, folder.resolve().parent):
-        found = sorted(p for p in place.iterdir() if _FILES.match(p.name.lower()) and p.is_file())
+        found = sorted(
+            p for p in place.iterdir() if _CAMERA_FILE_NAME.match(p.name.lower()) and p.is_file()
+        )
         if len(found) > 1:
             names = ", ".join(shown(p.name) for p in found)
             raise UnreadableInput(

@@ -290,12 +290,15 @@ def diagnostic(t_ns: int, label: Label, begins: bool) -> bytes:
     return packer.bytes()
 
 
-_TIME = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n")
-_HEADER = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n")
+_TIME_DEFINITION = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n")
+_HEADER_DEFINITION = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n")
 _POINT = ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n")
 _VECTOR3 = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n")
-_QUATERNION = ("geometry_msgs/Quaternion", "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n")
-_POSE = ("geometry_msgs/Pose", "Point position\nQuaternion orientation\n")
+_QUATERNION_DEFINITION = (
+    "geometry_msgs/Quaternion",
+    "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
+)
+_POSE_DEFINITION = ("geometry_msgs/Pose", "Point position\nQuaternion orientation\n")
 _TWIST = ("geometry_msgs/Twist", "Vector3 linear\nVector3 angular\n")
 _FIELD = (
     "sensor_msgs/PointField",
@@ -306,7 +309,7 @@ _FIELD = (
     ),
 )
 _TRANSFORM = ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation\n")
-_STAMPED = (
+_TRANSFORM_DEFINITION = (
     "geometry_msgs/TransformStamped",
     "std_msgs/Header header\nstring child_frame_id\nTransform transform\n",
 )
@@ -327,26 +330,43 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
             "std_msgs/Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool"
             " is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n"
         ),
-        (_HEADER, _TIME, _FIELD),
+        (_HEADER_DEFINITION, _TIME_DEFINITION, _FIELD),
     ),
     "geometry_msgs/msg/PoseStamped": (
         "std_msgs/Header header\nPose pose\n",
-        (_HEADER, _TIME, _POSE, _POINT, _QUATERNION),
+        (_HEADER_DEFINITION, _TIME_DEFINITION, _POSE_DEFINITION, _POINT, _QUATERNION_DEFINITION),
     ),
     "nav_msgs/msg/Odometry": (
         (
             "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
             "geometry_msgs/TwistWithCovariance twist\n"
         ),
-        (_HEADER, _TIME, _POSE_COV, _POSE, _POINT, _QUATERNION, _TWIST_COV, _TWIST, _VECTOR3),
+        (
+            _HEADER_DEFINITION,
+            _TIME_DEFINITION,
+            _POSE_COV,
+            _POSE_DEFINITION,
+            _POINT,
+            _QUATERNION_DEFINITION,
+            _TWIST_COV,
+            _TWIST,
+            _VECTOR3,
+        ),
     ),
     "tf2_msgs/msg/TFMessage": (
         "geometry_msgs/TransformStamped[] transforms\n",
-        (_STAMPED, _HEADER, _TIME, _TRANSFORM, _VECTOR3, _QUATERNION),
+        (
+            _TRANSFORM_DEFINITION,
+            _HEADER_DEFINITION,
+            _TIME_DEFINITION,
+            _TRANSFORM,
+            _VECTOR3,
+            _QUATERNION_DEFINITION,
+        ),
     ),
     "diagnostic_msgs/msg/DiagnosticArray": (
         "std_msgs/Header header\nDiagnosticStatus[] status\n",
-        (_HEADER, _TIME, _DIAGNOSTIC, _KEY_VALUE),
+        (_HEADER_DEFINITION, _TIME_DEFINITION, _DIAGNOSTIC, _KEY_VALUE),
     ),
 }
 

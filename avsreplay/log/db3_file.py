@@ -19,7 +19,7 @@ from avsreplay.log.options import Loss
 _SQLITE = (sqlite3.Error, OverflowError, ValueError)
 _HEADER_BYTES = 64  # the first bytes of a cloud message contain its header stamp
 _SINGLE_STEPS = 4096  # rows tried one by one behind a damaged page before the stride doubles
-_COLUMNS = "SELECT * FROM pragma_table_xinfo(?)"  # the last value of a column: whether hidden
+_COLUMNS_QUERY = "SELECT * FROM pragma_table_xinfo(?)"  # the last value of a column: whether hidden
 _MAX_ROW_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few steps are needed
 
 
@@ -142,7 +142,7 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
         # A virtual table has no pages of its own; a hidden column is computed when it is read.
         found = {
-            str(name): not any(column[6] for column in db.execute(_COLUMNS, (name,)))
+            str(name): not any(column[6] for column in db.execute(_COLUMNS_QUERY, (name,)))
             for (name,) in db.execute(
                 "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
             ).fetchall()

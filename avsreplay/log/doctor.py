@@ -22,7 +22,7 @@ from avsreplay.log.cloud_messages import raw_message
 from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, parse_surface
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_format import Channel, is_mcap
+from avsreplay.log.mcap_format import WRITTEN_CHUNK_BYTES, Channel, is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.source import Source
@@ -33,7 +33,6 @@ _GAP_PERIODS = 3.0  # least gap between two scans, in periods
 _LEAST_GAP_S = 0.5
 _EXAMPLES = 5  # scans, or layouts of points, that a finding names
 _CLOCK_OFFSET_S = 1.0  # offset of header stamps and log clock that is reported
-_CHUNK_BYTES = 1 << 20
 
 
 class Severity(Enum):
@@ -295,7 +294,7 @@ class _Copier:
         from mcap.writer import Writer
 
         self.done = Repaired()
-        self._writer: Any = Writer(stream, _CHUNK_BYTES, enable_data_crcs=True)
+        self._writer: Any = Writer(stream, WRITTEN_CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start(profile=profile, library=LIBRARY)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, int] = {}

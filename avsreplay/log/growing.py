@@ -19,7 +19,7 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log.bytes_io import shown
-from avsreplay.log.mcap_format import MAGIC, Opcode
+from avsreplay.log.mcap_format import MCAP_MAGIC, Opcode
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.source import Source
@@ -71,7 +71,7 @@ class GrowingLog:
             threading.Thread(
                 target=self._copy, args=(feed, copy), name="avsreplay-feed", daemon=True
             ).start()
-        elif not path.is_file() or (path.stat().st_size >= len(MAGIC) and not self._is_mcap()):
+        elif not path.is_file() or (path.stat().st_size >= len(MCAP_MAGIC) and not self._is_mcap()):
             what = "not an MCAP file" if path.exists() else "no such file"
             hint = "leave out --follow; only one MCAP file can be followed"
             raise UsageError(what, where=f"--follow {shown(path)}", hint=hint)
@@ -138,7 +138,7 @@ class GrowingLog:
         """
         before = self._at
         while True:
-            grown = self._advance()
+            grown = self.advance()
             if self.finished or (grown and self._at > before):
                 begun = time.monotonic()
                 try:
@@ -168,13 +168,13 @@ class GrowingLog:
         """Wait for no more data; what is complete is still read."""
         self._stop.set()
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         """Step over the records that are complete by now; return whether there were any."""
         ending, start = self._stop.is_set(), self._at
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
-            if not self._at and size >= len(MAGIC):
-                self._at = len(MAGIC) if self._is_mcap() else 0
+            if not self._at and size >= len(MCAP_MAGIC):
+                self._at = len(MCAP_MAGIC) if self._is_mcap() else 0
             while self._at and self._at + 9 <= size:
                 file.seek(self._at)
                 head = file.read(9)
@@ -190,12 +190,12 @@ class GrowingLog:
 
     def _closed(self, size: int) -> bool:
         with self.path.open("rb") as file:
-            file.seek(size - len(MAGIC))
-            return file.read() == MAGIC
+            file.seek(size - len(MCAP_MAGIC))
+            return file.read() == MCAP_MAGIC
 
     def _is_mcap(self) -> bool:
         with self.path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
+            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
     def _copy(self, feed: BinaryIO, copy: BinaryIO) -> None:
         read = getattr(feed, "read1", feed.read)

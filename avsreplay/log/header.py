@@ -36,14 +36,13 @@ from avsreplay.log.ply import read_ply
 from avsreplay.log.returns import MAX_COORDINATE_M
 from avsreplay.log.scan_files import read_pcd
 from avsreplay.read_budget import BadFile, ReadBudget
-from avsreplay.records import Belief, Label, LogHeader, State, Surface
+from avsreplay.records import STATE_SIZES, Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
 OWN_MODEL = b"comment reconstructed by avsreplay"  # marks a built model
 _OWN_MODEL_BYTES = 1024  # begin of a file in which this mark is searched
 HEADER_FORMAT = "1"
 _MAX_FRAME_CHARACTERS = 256
-_STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
 
 def encode_header(header: LogHeader) -> dict[str, str]:
@@ -106,7 +105,7 @@ def _label(label: Label) -> dict[str, Any]:
 
 
 def _state(state: State | None) -> dict[str, Any] | None:
-    return None if state is None else {name: getattr(state, name).tolist() for name in _STATE}
+    return None if state is None else {name: getattr(state, name).tolist() for name in STATE_SIZES}
 
 
 def _belief(belief: Belief | None) -> dict[str, Any] | None:
@@ -154,7 +153,7 @@ def _to_label(values: Any) -> Label:
 def _to_state(values: Any) -> State | None:
     if values is None:
         return None
-    state = State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
+    state = State(**{name: np.array(values[name], dtype=np.float64) for name in STATE_SIZES})
     lengths = np.linalg.norm(state.q_ab), np.linalg.norm(state.q_bc)
     if not all(abs(length - 1.0) < 1e-6 for length in lengths) or np.abs(state.sigma).max() >= 1.0:
         raise ValueError(
@@ -176,8 +175,8 @@ MAX_MODEL_BYTES = 512 << 20
 _PLACED_VALUE_BYTES = 24  # of a vertex or an index of a placed part of a scene [bytes]
 _PLACED_PART_WORK = 100_000  # that a placed part takes to read, about 2 ms of Python
 LEAST_EXTENT_M = 1e-6  # squares of a part of it must not underflow
-_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
-MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
+_MODEL_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
+MODEL_ENDINGS = tuple(f".{name}" for name in _MODEL_FORMATS)
 # Exceptions that trimesh raises for malformed files.
 _FOREIGN = (
     ArithmeticError,
@@ -298,10 +297,10 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
         raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
     if data.startswith(b"ply"):
         suffix = "ply"
-    if suffix not in _FORMATS:
+    if suffix not in _MODEL_FORMATS:
         hint = (
-            f"give a model as {', '.join(_FORMATS).upper()}; CAD programs export STEP and IGES"
-            " files as STL"
+            f"give a model as {', '.join(_MODEL_FORMATS).upper()}; CAD programs export STEP and"
+            " IGES files as STL"
         )
         raise UnreadableInput(
             f"'{shown(suffix)}' is not a known model format", where=where, hint=hint

@@ -19,6 +19,7 @@ from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.point_cloud2 import Layout
 from avsreplay.log.raw_cloud import RawCloud
+from avsreplay.read_budget import OverBudget, ReadBudget
 from avsreplay.records import MAX_STAMP_S, NS_PER_S
 
 MAX_NS = MAX_STAMP_S * NS_PER_S  # a later time is cut to this
@@ -30,8 +31,9 @@ POSE_NAMES = (
     "geometry_msgs/msg/TransformStamped",
 )
 """Types that hold one stamped pose."""
-_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
+_MCAP_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
 _CACHED_CHUNKS = 2  # decompressed chunks held in memory
+_MOST_EXPANSION = 1000  # decompressed bytes of all chunks per byte of a file; clouds take 1 to 20
 _INDEXED = (*CLOUD_TYPES, *POSE_NAMES, *IMAGE_TYPES, CAMERA_INFO)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
@@ -168,6 +170,7 @@ class ChunkStore:
 
     def __init__(self, file: ByteFile, limit: int) -> None:
         self._file, self._limit = file, limit
+        self._budget = ReadBudget(file.size, per_byte=_MOST_EXPANSION)
         self._offset, self._packed, self._compression, self._size = (array("q") for _ in range(4))
         self._cache: dict[int, bytes] = {}
 
@@ -176,15 +179,20 @@ class ChunkStore:
 
     def compressions(self) -> Counter[str]:
         """Return the number of chunks of each compression."""
-        return Counter(_COMPRESSIONS[k] or "uncompressed" for k in self._compression)
+        return Counter(_MCAP_COMPRESSIONS[k] or "uncompressed" for k in self._compression)
 
     def check(self, at: int, head: ChunkHead) -> bytes:
         """Return the decompressed chunk at offset ``at``.
 
-        Raises BadMessage if it is damaged or over the limit.
+        Raises BadMessage if it is damaged or over the limit, or if the chunks of the file declare
+        more than its bytes can hold.
         """
         if max(head.size, head.data_size) > self._limit:
             raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
+        try:
+            self._budget.take_bytes(head.size if head.compression else 0, "chunks")
+        except OverBudget as error:
+            raise BadMessage(str(error)) from None
         data = inflate(
             self._file.read(at + head.data_at, head.data_size), head.compression, head.size
         )
@@ -197,7 +205,7 @@ class ChunkStore:
         values = (
             at + head.data_at,
             head.data_size,
-            _COMPRESSIONS.index(head.compression),
+            _MCAP_COMPRESSIONS.index(head.compression),
             head.size,
         )
         for column, value in zip(
@@ -216,7 +224,7 @@ class ChunkStore:
                 self._cache.pop(next(iter(self._cache)))
             packed = self._file.read(self._offset[number], self._packed[number])
             self._cache[number] = inflate(
-                packed, _COMPRESSIONS[self._compression[number]], self._size[number]
+                packed, _MCAP_COMPRESSIONS[self._compression[number]], self._size[number]
             )
         return self._cache[number]
 

@@ -30,7 +30,7 @@ from avsreplay.log.mcap_salvage import (
 from avsreplay.log.options import Loss
 from avsreplay.log.record_pass import RecordPass
 
-_TIMES = struct.Struct("<QQ")
+_TIME_PAIR = struct.Struct("<QQ")
 _CHECKSUM_BYTES = 1 << 20  # most bytes whose checksum is taken at once
 _LEAST_CHUNK_BYTES = 49
 _LEAST_MESSAGE_BYTES = 22
@@ -112,7 +112,7 @@ class McapFile(RecordPass):
             raise UnreadableInput(
                 "the file is empty", where=shown(self.path), hint="record it again"
             )
-        if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
+        if self._size < 8 or self._file.read(0, 8) != mcap.MCAP_MAGIC:
             hint = "give an MCAP, a ROS bag or a folder of scans"
             if self.path.suffix.lower() in (".csv", ".tum", ".txt"):
                 hint += "; measured poses in a file need --backend poses (info: --poses)"
@@ -139,8 +139,8 @@ class McapFile(RecordPass):
         while opcode != mcap.Opcode.FOOTER and at + 9 <= self._size:
             head = self._file.read(at, 9)
             opcode, at = head[0], at + 9 + int.from_bytes(head[1:], "little")
-        end = at + len(mcap.MAGIC)
-        if end + 8 <= self._size and self._file.read(end, 8) == mcap.MAGIC:
+        end = at + len(mcap.MCAP_MAGIC)
+        if end + 8 <= self._size and self._file.read(end, 8) == mcap.MCAP_MAGIC:
             self._lose(
                 Loss(
                     "another log follows the end of this one: replay each file by itself",
@@ -228,7 +228,7 @@ class McapFile(RecordPass):
 
     def _take_attachment(self, at: int, end: int) -> None:
         fields = self._content(at, end)
-        times = _TIMES.unpack(fields.take(16))
+        times = _TIME_PAIR.unpack(fields.take(16))
         name, media = fields.text(), fields.text()
         size = fields.number(8)
         start = at + 9 + fields.at

@@ -14,7 +14,8 @@ from typing import Protocol
 from avsreplay.errors import value_class
 from avsreplay.log.bytes_io import BadMessage, ByteFile
 
-MAGIC = b"\x89MCAP0\r\n"
+WRITTEN_CHUNK_BYTES = 1 << 20  # of a chunk that is written
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 class Opcode(IntEnum):
@@ -35,7 +36,7 @@ class Opcode(IntEnum):
 
 # opcode and length, then the longest head of a chunk
 CHUNK_PREFIX_BYTES = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8
-_HEAD = struct.Struct("<BQ")
+_RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _KNOWN_OPCODES = frozenset(range(1, 16))
 # Records of unknown kinds after which a part is not read on: zeros are millions of empty records.
@@ -123,7 +124,7 @@ def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
     """
     at, size, foreign = 0, len(view), 0
     while at + 9 <= size:
-        opcode, length = _HEAD.unpack_from(view, at)
+        opcode, length = _RECORD_HEAD.unpack_from(view, at)
         if length > size - at - 9:
             raise BadMessage("a record ends past its container")
         foreign += opcode not in _KNOWN_OPCODES
@@ -142,7 +143,7 @@ def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> Chun
     """
     if len(view) < 49 or view[0] != Opcode.CHUNK:
         raise BadMessage("not a chunk")
-    _, length = _HEAD.unpack_from(view, 0)
+    _, length = _RECORD_HEAD.unpack_from(view, 0)
     start, end, size, crc, name_size = _CHUNK.unpack_from(view, 9)
     if name_size > 16 or len(view) < 49 + name_size:
         raise BadMessage("a chunk with an unknown compression")
@@ -169,7 +170,7 @@ def is_mcap(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(8) == MAGIC
+        return file.read(8) == MCAP_MAGIC
 
 
 class RecordSink(Protocol):
@@ -224,7 +225,7 @@ def _read(file: ByteFile, limit: int) -> SummarySection:
     if file.size < 8 + TAIL_BYTES:
         raise BadMessage("no footer")
     tail = file.read(file.size - TAIL_BYTES, TAIL_BYTES)
-    if tail[29:] != MAGIC or tail[:9] != _FOOTER_HEAD:
+    if tail[29:] != MCAP_MAGIC or tail[:9] != _FOOTER_HEAD:
         raise BadMessage("no footer")
     start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
     if start == 0:

@@ -61,18 +61,18 @@ class ChannelTable:
             self._table.declare(channel.topic, channel.type, channel.encoding)
 
 
-_POSE = "geometry_msgs/msg/PoseStamped"
-_ODOMETRY = "nav_msgs/msg/Odometry"
+_POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 
 def guess_channel(number: int, payload: memoryview, library: str) -> Channel | None:
     """Return the channel that a message seems to belong to, None if it is unknown."""
     if _is_cloud(payload):
         return Channel(number, f"/lost/channel_{number}", "sensor_msgs/msg/PointCloud2", "cdr")
-    if library == LIBRARY and _is_whole(_POSE, payload, 7):
-        return Channel(number, TRUTH_TOPIC, _POSE, "cdr")
-    if library == LIBRARY and _is_whole(_ODOMETRY, payload, 7 + 36 + 6 + 36):
-        return Channel(number, BODY_TOPIC, _ODOMETRY, "cdr")
+    if library == LIBRARY and _is_whole(_POSE_TYPE, payload, 7):
+        return Channel(number, TRUTH_TOPIC, _POSE_TYPE, "cdr")
+    if library == LIBRARY and _is_whole(_ODOMETRY_TYPE, payload, 7 + 36 + 6 + 36):
+        return Channel(number, BODY_TOPIC, _ODOMETRY_TYPE, "cdr")
     return None
 
 
@@ -90,7 +90,7 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
         read_pose(kind, payload)
         cursor = Cursor(payload)
         cursor.header()
-        if kind == _ODOMETRY:
+        if kind == _ODOMETRY_TYPE:
             cursor.string()
         cursor.f64s(doubles)
     except BadMessage:

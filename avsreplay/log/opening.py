@@ -26,7 +26,7 @@ from avsreplay.log.header import (
 )
 from avsreplay.log.index import Merged, MessageClouds, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_format import MAGIC
+from avsreplay.log.mcap_format import MCAP_MAGIC
 from avsreplay.log.options import Loss, SourceOptions
 from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
 from avsreplay.log.result_log import RUN_RECORD
@@ -235,7 +235,7 @@ def _head(path: Path) -> bytes:
 
 def _is_log(path: Path) -> bool:
     """Return whether a file starts like a log."""
-    return _head(path).startswith((MAGIC, b"#ROSBAG", b"\x28\xb5\x2f\xfd", SQLITE_MAGIC))
+    return _head(path).startswith((MCAP_MAGIC, b"#ROSBAG", b"\x28\xb5\x2f\xfd", SQLITE_MAGIC))
 
 
 def _open_pose_file(path: Path, options: SourceOptions) -> Source:
@@ -309,7 +309,7 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = Non
         raise UnreadableInput(
             "a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d"
         )
-    if not head.startswith(MAGIC) and path.suffix.lower() in (
+    if not head.startswith(MCAP_MAGIC) and path.suffix.lower() in (
         ".ply",
         ".pcd",
         ".bin",
@@ -320,7 +320,7 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = Non
         raise UnreadableInput(
             "a single scan, not a log", where=shown(path), hint="give the folder it is in"
         )
-    if not head.startswith(MAGIC) and path.suffix == ".toml":
+    if not head.startswith(MCAP_MAGIC) and path.suffix == ".toml":
         raise UnreadableInput(
             "a scenario, not a log", where=shown(path), hint="make a log of it: avsreplay record"
         )
@@ -379,7 +379,7 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
 
 
 _TIME_FILE = "times.txt"
-_STAMPED = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
+_STAMP_NAME = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
 
 
 def _open_folder(path: Path, options: SourceOptions) -> Source:
@@ -445,7 +445,7 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
             what = f"{len(times)} times for {len(files)} scans"
             raise UnreadableInput(what, where=shown(listed), hint="one line a scan")
         return times
-    if all(_STAMPED.match(p.stem) for p in files):
+    if all(_STAMP_NAME.match(p.stem) for p in files):
         stamps = [seconds_to_ns(p.stem if "." in p.stem else f"{p.stem}e-9") for p in files]
         return [t_ns or 0 for t_ns in stamps] if None not in stamps else None
     return (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.read_budget import BadFile, ReadBudget
 
-_TYPES = {
+_PLY_TYPES = {
     "char": "i1",
     "int8": "i1",
     "uchar": "u1",
@@ -153,8 +153,8 @@ def _element(words: list[str], limit: int) -> _Element:
 def _property(words: list[str]) -> _Property:
     try:
         if words[1] == "list":
-            return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
-        return _Property(words[2], _TYPES[words[1]])
+            return _Property(words[4], _PLY_TYPES[words[3]], _PLY_TYPES[words[2]])
+        return _Property(words[2], _PLY_TYPES[words[1]])
     except (IndexError, KeyError):
         raise BadFile(f"unreadable line '{' '.join(words)[:60]}'") from None
 

@@ -142,15 +142,15 @@ class TimedPoses:
 
 
 _NOT_A_NAME = re.compile(r"[^a-z0-9]+")
-_TIME = re.compile(
+_TIME_HEADING = re.compile(
     r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ms|msec|us|usec|ns|nsec))?$"
 )
 _POSITION = re.compile(r"(?:p|t|pos|position|translation)?_?([xyz])(?:_?(m|cm|mm))?$")
-_QUATERNION = re.compile(r"(?:q|quat|quaternion|orientation|rot|rotation)_?([xyzw])$")
+_QUATERNION_HEADING = re.compile(r"(?:q|quat|quaternion|orientation|rot|rotation)_?([xyzw])$")
 _EXPONENTS = {"m": "e-3", "u": "e-6", "n": "e-9"}  # by the first letter of a unit of time
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_POSE_COLUMNS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
-_FORMATS = (
+_POSE_NAMES = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+_FORMATS_HELP = (
     "TUM: t tx ty tz qx qy qz qw; KITTI: twelve numbers; EuRoC: t[ns],x,y,z,qw,qx,qy,qz;"
     " CSV with a header: t_s (or t_ms, t_ns), x, y, z, qx, qy, qz, qw in any order"
 )
@@ -183,7 +183,7 @@ def read_poses(path: Path) -> TimedPoses:
             times.append(t_ns)
     if not any(isinstance(pose, MeasuredPose) for pose in poses):
         raise UnreadableInput(
-            f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS
+            f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS_HELP
         )
     if times and len(times) != len(poses):
         raise UnreadableInput(
@@ -228,17 +228,19 @@ def _columns(names: list[str], where: str) -> _Columns:
     """
     found: dict[str, tuple[int, str]] = {}  # place and unit of each
     for place, name in enumerate(_NOT_A_NAME.sub("_", n.lower()).strip("_") for n in names):
-        if time := _TIME.match(name):
+        if time := _TIME_HEADING.match(name):
             found.setdefault("t", (place, time[1] or "s"))
         elif position := _POSITION.match(name):
             found.setdefault(f"p{position[1]}", (place, position[2] or "m"))
-        elif turn := _QUATERNION.match(name):
+        elif turn := _QUATERNION_HEADING.match(name):
             found.setdefault(f"q{turn[1]}", (place, ""))
-    missing = [key for key in ("t", *_POSE_COLUMNS) if key not in found]
+    missing = [key for key in ("t", *_POSE_NAMES) if key not in found]
     if missing:
-        raise UnreadableInput(f"no column for {', '.join(missing)}", where=where, hint=_FORMATS)
+        raise UnreadableInput(
+            f"no column for {', '.join(missing)}", where=where, hint=_FORMATS_HELP
+        )
     place, unit = found["t"]
-    pose = tuple(found[key][0] for key in _POSE_COLUMNS)
+    pose = tuple(found[key][0] for key in _POSE_NAMES)
     return _Columns(place, _EXPONENTS.get(unit[0], ""), pose, _METRES[found["px"][1]])
 
 
@@ -260,7 +262,7 @@ def _measured_line(
             raise ValueError
         return t_ns, _checked([_number(w) for w in words[1:]])
     except (ValueError, OverflowError):
-        raise UnreadableInput("not a pose line", where=where, hint=_FORMATS) from None
+        raise UnreadableInput("not a pose line", where=where, hint=_FORMATS_HELP) from None
 
 
 def _checked(values: list[float]) -> MeasuredPose | str:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
+from avsreplay.log.mcap_format import WRITTEN_CHUNK_BYTES
 from avsreplay.records import Surface
 
 CAMERA = "camera"
@@ -30,7 +31,6 @@ TRUE = "target_true"
 ROOT = "map"
 LIBRARY = "avsreplay"
 RUN_RECORD = "avsreplay-run"  # not the record with which a log can be replayed
-CHUNK_BYTES = 1 << 20
 ROWS = "/rows"
 ROW_TYPE = "avsreplay/msg/Row"
 _TOPICS = {
@@ -134,7 +134,9 @@ class ResultLog:
             raise UnreadableInput(
                 what, where=str(path), hint="check the folder and its rights"
             ) from None
-        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True)
+        self._writer = Writer(
+            self._stream, WRITTEN_CHUNK_BYTES, CompressionType.LZ4, enable_data_crcs=True
+        )
         self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
             self._writer.add_metadata(RUN_RECORD, dict(metadata))

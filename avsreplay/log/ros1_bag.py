@@ -32,9 +32,11 @@ class _Op(IntEnum):
 
 
 # the length of a record's header, and the first of its fields, of which a chunk has three
-_HEAD = re.compile(rb"(?=[\x08-\x80]\x00{3}[\x04-\x40]\x00{3}(?:op=\x05|compression=|size=))")
+_RECORD_HEADER = re.compile(
+    rb"(?=[\x08-\x80]\x00{3}[\x04-\x40]\x00{3}(?:op=\x05|compression=|size=))"
+)
 _MAX_HEADER_BYTES = 1 << 16  # of the header of one record
-_COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
+_BAG_COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 
 @value_class(eq=True)
@@ -147,14 +149,14 @@ class Ros1Bag(RecordPass):
 
     def _take_chunk(self, at: int, record: _Record) -> None:
         name = record.fields.get("compression", b"").decode("ascii", "replace")
-        if name not in _COMPRESSIONS:
+        if name not in _BAG_COMPRESSIONS:
             raise BadMessage("a chunk with an unknown compression")
         head = ChunkHead(
             0,
             0,
             record.number("size"),
             0,
-            _COMPRESSIONS[name],
+            _BAG_COMPRESSIONS[name],
             record.data_at - at,
             record.data_size,
         )
@@ -205,7 +207,7 @@ class Ros1Bag(RecordPass):
             self._file,
             at + 1,
             end,
-            lambda window: (match.start() for match in _HEAD.finditer(window)),
+            lambda window: (match.start() for match in _RECORD_HEADER.finditer(window)),
             lambda place: self._is_chunk(place, end),
         )
         resume = end if found is None else found

@@ -203,7 +203,7 @@ def by_number(name: str) -> tuple[tuple[int, ...], str]:
     return tuple(int(n) for n in _NUMBER.findall(name)), name
 
 
-_KINDS = {"F": "f", "I": "i", "U": "u"}
+_PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 _MAX_PCD_HEADER_BYTES = 1 << 16
 _MAX_EXPANSION_RATIO = 256  # three bytes of LZF decompress to at most 264
 
@@ -281,7 +281,7 @@ def _header(data: bytes) -> _Header:
 
 
 def _kind(type_: str, size: str) -> str:
-    kind = f"{_KINDS.get(type_, '?')}{size}"
+    kind = f"{_PCD_KINDS.get(type_, '?')}{size}"
     if kind not in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"):
         raise BadFile(f"a field of TYPE {type_} and SIZE {size}")
     return kind

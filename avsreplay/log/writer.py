@@ -41,7 +41,7 @@ TARGET_FRAME = "target"
 BODY_FRAME = "target_body"
 ROOT_FRAME = "map"
 LIBRARY = "avsreplay"
-_TYPES = {
+_TOPIC_TYPES = {
     CLOUD_TOPIC: "sensor_msgs/msg/PointCloud2",
     TRUTH_TOPIC: "geometry_msgs/msg/PoseStamped",
     BODY_TOPIC: "nav_msgs/msg/Odometry",
@@ -355,7 +355,7 @@ class LogWriter:
 
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
-            kind = _TYPES[topic]
+            kind = _TOPIC_TYPES[topic]
             schema = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
             qos = {"offered_qos_profiles": _LATCHED if topic == "/tf_static" else ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, qos)

@@ -8,6 +8,11 @@ import math
 def mean_band(dof: int, count: int, level: float) -> tuple[float, float]:
     """Two-sided band of the mean of ``count`` > 2 / ``dof`` chi-square values of ``dof`` degrees of
     freedom each.
+
+    Args:
+        dof: degrees of freedom of each value.
+        count: number of values, above 2 / ``dof``.
+        level: probability inside of the band.
     """
     a, tail = 0.5 * dof * count, 0.5 * (1.0 - level)
     return 2.0 * _gamma_quantile(a, tail) / count, 2.0 * _gamma_quantile(a, 1.0 - tail) / count

@@ -96,23 +96,27 @@ class FaultParams(Settings):
         " above this value.",
         above=0.0,
     )
-    min_inlier_ratio: float = setting(
-        0.3,
-        "Smallest ratio of inliers to points of a healthy scan. A larger value rejects more scans"
-        " with background or clutter.",
-        low=0.0,
-        high=1.0,
-    )
 
 
 def weighted_norm(seen: Innovation, length_m: float) -> float:
-    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle."""
+    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle.
+
+    Args:
+        seen: the innovation.
+        length_m: the length L [m] that weighs the rotation.
+    """
     return math.hypot(seen.distance_m, length_m * seen.angle_rad)
 
 
 def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: float) -> float:
     """The limit on |alpha|_W [m]: ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that
     is more.
+
+    Args:
+        seen: the innovation with its covariance.
+        alpha_max_m: the fixed limit [m].
+        length_m: the length L [m] that weighs the rotation.
+        sigmas: predicted 1 sigma that are allowed.
     """
     variances = np.diagonal(seen.S)
     predicted = math.sqrt(
@@ -222,8 +226,8 @@ def _not_converged(scan: ScanEvidence) -> bool:
 
 
 def _few_inliers(scan: ScanEvidence) -> bool:
-    p, found = scan.limits, scan.alignment
-    return found is None or found.inliers < p.min_inliers or found.inlier_ratio < p.min_inlier_ratio
+    found = scan.alignment
+    return found is None or found.inliers < scan.limits.min_inliers
 
 
 def _halves_differ(scan: ScanEvidence) -> bool:
@@ -328,7 +332,7 @@ MOTION_RULES = (
 """The rules on a scan that none of the others has rejected, with what the estimate and the tracker
 have found; the last one holds always."""
 
-RULES = (*SCAN_RULES, *MOTION_RULES)
+SCAN_AND_MOTION_RULES = (*SCAN_RULES, *MOTION_RULES)
 """All rules in their order; the first that holds decides on gamma and gives the reason."""
 
 

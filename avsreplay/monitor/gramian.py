@@ -22,7 +22,7 @@ from avsreplay.geometry import Array, frozen
 from avsreplay.monitor import _root
 from avsreplay.records import BLOCKS
 
-_WORDS: Mapping[str, str] = {
+_BLOCK_WORDS: Mapping[str, str] = {
     "attitude": "attitude of the principal axes",
     "rate": "angular rate",
     "position": "centre of mass",
@@ -119,7 +119,11 @@ def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
 
 
 def measure(state: Gramian) -> Observability:
-    """Return the rank and the condition numbers."""
+    """Return the rank and the condition numbers.
+
+    Args:
+        state: the Gramian.
+    """
     n = state.scale.size
     told = np.linalg.svd(state.white * state.scale, compute_uv=False)
     if (rank := int(np.count_nonzero(told > 1.0))) < n:
@@ -211,6 +215,7 @@ def _text_of(share: Array, own: int, blocks: Mapping[str, slice]) -> str:
         )
         held = float(np.sum(share[blocks[name]]))
         texts.append(
-            f"{_WORDS.get(name, name)} {axes}" + ("" if len(together) == 1 else f" ({held:.0%})")
+            f"{_BLOCK_WORDS.get(name, name)} {axes}"
+            + ("" if len(together) == 1 else f" ({held:.0%})")
         )
     return " with ".join(texts)

@@ -75,6 +75,11 @@ class PlanParams(Settings):
     robot_velocity_mps: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Velocity of the end-effector in {A} when planning.", unit="m/s"
     )
+    enabled: bool = setting(
+        True,
+        "Plan and fly an approach. Without it no capture is assessed, and a run under constraints"
+        " takes about half of the time.",
+    )
 
     def check(self) -> None:
         """Raise ValueError where the latency is not below the horizon."""

@@ -88,6 +88,12 @@ def refined(
     their neighbours. They serve the fit of the motion only: a wrong pose makes the surface rough
     where it lies, and with such weights in the adjustment of the poses it would stay there.
 
+    Args:
+        views: the views, in order of time.
+        tracked: the poses so far.
+        p: the parameters of the reconstruction.
+        extent: diameter of the target [m].
+
     Returns:
         The views with the better normals and these weights, T_ac by number of the key view, the rms
         of the distances that is left, and the gate that was used for them [m].
@@ -242,7 +248,15 @@ def all_poses(
     p: ReconstructionParams,
     extent: float,
 ) -> dict[int, Pose]:
-    """Every tracked view registered once more, on the refined model of the key views."""
+    """Every tracked view registered once more, on the refined model of the key views.
+
+    Args:
+        views: the views, in order of time.
+        tracked: the poses so far.
+        keys: refined T_ac by number of the key view.
+        p: the parameters of the reconstruction.
+        extent: diameter of the target [m].
+    """
     model = patchwork(views, replace(tracked, poses=keys), 0.6 * p.thin * extent)
     found = dict(keys)
     for k, T in sorted(tracked.poses.items()):
@@ -334,6 +348,10 @@ class Sight:
     def seen_through(self, p_c: Array, spacing_m: float) -> Array:
         """How far behind points (m, 3) of {C} this scan measured a surface in the same direction
         [m]; 0: nothing.
+
+        Args:
+            p_c: points (m, 3) in {C} [m].
+            spacing_m: distance between two directions that are the same, at the points [m].
         """
         return depth_behind(self.T_ac.apply(p_c), self.points, self.camera, spacing_m)
 
@@ -344,6 +362,11 @@ class Sight:
         The nearest line of sight with a return must pass farther away than ``reach_m`` and three
         times the spacing of the points of the scan, so that something in front of a point also
         counts as a return.
+
+        Args:
+            p_c: points (m, 3) in {C} [m].
+            normals: unit normals (m, 3) in {C}.
+            reach_m: least distance of a line of sight with a return [m].
         """
         p, rays = self.T_ac.apply(p_c) - self.camera, self.points - self.camera
         far = np.linalg.norm(p, axis=1)
@@ -367,6 +390,13 @@ def fused(
     have no return from their direction: they belong to something else. Where voxels hold few
     points, their scatter is joined with one square of the noise of a point: half the mean square
     ``rms_m`` of the distances between two scans.
+
+    Args:
+        scans: the scans in order.
+        survey: which scans are used, and their frame.
+        twist: motion of the target by number of the view.
+        size_m: edge of a voxel [m].
+        rms_m: rms of the distances between two scans [m].
     """
     points, normals, owner, sights = [], [], [], list[Sight]()
     apart = max(1, len(twist) // MAX_RAY_SCANS)
@@ -420,6 +450,11 @@ def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wi
 def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
     """Whether at least LEAST_SUPPORT_POINTS of the ten points nearest to each (n, 3) have a similar
     normal and are in its plane.
+
+    Args:
+        p: points (n, 3) [m].
+        n: their unit normals (n, 3).
+        size_m: edge of a voxel [m].
     """
     distances, nearest = point_tree(p).query(p, k=2 * LEAST_SUPPORT_POINTS + 1, most_m=3.0 * size_m)
     d = distances[:, 1:]
@@ -432,6 +467,10 @@ def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
 def turn_and_coverage(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple[float, float]:
     """Largest turn between two poses [rad], and the share of all directions in {C} from which a
     scan was taken.
+
+    Args:
+        views: the views, in order of time.
+        poses: T_ac of each view.
     """
     turns = [turn(poses[0], T) for T in poses]
     seen = sight_lines(views, [T.inverse() for T in poses])

@@ -22,7 +22,7 @@ from avsreplay.reconstruct.views import averaged, point_tree
 from avsreplay.records import BLOCKS, Surface
 
 PATCH_RADIUS_OF_EXTENT = 0.04  # radius of a grasp patch as a share of the extent
-APPROACH = np.cos(
+APPROACH_COSINE = np.cos(
     np.radians(20.0)
 )  # cosine of the half-angle of the cone about the outward normal that must be free
 MAX_REGIONS = 10
@@ -175,7 +175,7 @@ def _reachable(points: Array, extent: float, at: Array, normal: Array) -> bool:
     away = points - at
     distance = np.linalg.norm(away, axis=1)
     inside = (distance > PATCH_RADIUS_OF_EXTENT * extent) & (distance < 0.5 * extent)
-    return not bool(np.any(away[inside] @ _unit(normal) > APPROACH * distance[inside]))
+    return not bool(np.any(away[inside] @ _unit(normal) > APPROACH_COSINE * distance[inside]))
 
 
 def _unit(v: Array) -> Array:

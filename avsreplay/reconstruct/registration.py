@@ -68,6 +68,14 @@ def registered(
 ) -> Match:
     """Point-to-plane ICP of a view on the model, with Tukey's weights whose scale follows the
     residuals.
+
+    Args:
+        view: the view.
+        model: the model so far.
+        guess: T_ac at which the search begins.
+        reach_m: largest distance of corresponding points at first [m].
+        extent: diameter of the target [m].
+        passes: largest number of passes.
     """
     T_ca, gate = guess.inverse(), reach_m
     ratio = rms = weakest = 0.0
@@ -128,7 +136,12 @@ def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
 
 
 def moved(T_ca: Pose, step: Array) -> Pose:
-    """The pose after a step [theta; v] in {C} [rad, m]."""
+    """The pose after a step [theta; v] in {C} [rad, m].
+
+    Args:
+        T_ca: the pose of {A} in {C}.
+        step: rotation vector and displacement (6,) in {C} [rad, m].
+    """
     return Pose(geometry.exp(step[:3]), step[3:]) @ T_ca
 
 
@@ -222,7 +235,13 @@ def _axes() -> list[Array]:
 
 
 def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:
-    """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
+    """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m].
+
+    Args:
+        views: the views, in order of time.
+        poses: T_ac by number of the view.
+        gate: largest distance of corresponding points [m].
+    """
     keys = sorted(poses)
     T_ca = [poses[k].inverse() for k in keys]
     return Pairing([views[k] for k in keys], T_ca, PAIR_POINTS, 0.0).equations(T_ca, gate)[3]

@@ -53,11 +53,19 @@ class FreeMotion:
     rms: tuple[float, float]
 
     def state_at(self, t_ns: int) -> State:
-        """The state at an instant."""
+        """The state at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         return propagate_state(self.state, (t_ns - self.epoch_ns) * 1e-9)[0]
 
     def at(self, t_ns: int) -> Pose:
-        """The pose T_ac at an instant."""
+        """The pose T_ac at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         return self.state_at(t_ns).T_ac
 
     def pose_jacobian(
@@ -84,7 +92,11 @@ class FreeMotion:
         return J, np.diag(prior.one_sigma**-2.0)
 
     def twist_at(self, t_ns: int) -> Twist:
-        """Pose, rate in {C} and velocity of {C} in {A} at an instant."""
+        """Pose, rate in {C} and velocity of {C} in {A} at an instant.
+
+        Args:
+            t_ns: the instant [ns].
+        """
         x = self.state_at(t_ns)
         return Twist(x.T_ac, geometry.matrix(x.q_bc).T @ x.w_b, x.fixture_velocity)
 
@@ -131,6 +143,11 @@ def twists(
 ) -> dict[int, Twist]:
     """Motion of the target at every view that has a pose: of the free motion, else from its
     neighbours' poses.
+
+    Args:
+        t_ns: stamp of each view [ns].
+        poses: T_ac by number of the view.
+        motion: the free motion; None where there is none.
     """
     known = sorted(poses)
     found = {}
@@ -212,6 +229,11 @@ class Tracked:
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
     """Register every view against the model that the key views before it give; then try the
     lost ones once more.
+
+    Args:
+        views: the views, in order of time.
+        p: the parameters of the reconstruction.
+        extent: diameter of the target [m].
     """
     origin = views[0].points.mean(axis=0)
     found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], [], 0, [])
@@ -226,7 +248,12 @@ def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> 
 
 
 def without(found: Tracked, wrong: Sequence[int]) -> Tracked:
-    """The result of tracking without the views that have these numbers."""
+    """The result of tracking without the views that have these numbers.
+
+    Args:
+        found: the result of tracking.
+        wrong: numbers of the views that are left out.
+    """
     poses = {k: T for k, T in found.poses.items() if k not in wrong}
     return replace(found, poses=poses, keys=[k for k in found.keys if k in poses])
 
@@ -395,7 +422,13 @@ def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
 
 
 def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patchwork:
-    """The model that the key views give, averaged over voxels of the given size."""
+    """The model that the key views give, averaged over voxels of the given size.
+
+    Args:
+        views: the views, in order of time.
+        found: the result of tracking.
+        size_m: edge of a voxel [m].
+    """
     each = [(found.poses[k].inverse(), views[k]) for k in found.keys]
     points, normals = (
         [T.apply(view.points) for T, view in each],

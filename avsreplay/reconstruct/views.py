@@ -116,13 +116,23 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
 
 
 def surveyed_scans(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
-    """The scans that are used, in order."""
+    """The scans that are used, in order.
+
+    Args:
+        scans: gives all scans of the log anew.
+        survey: which of them are used.
+    """
     chosen = frozenset(survey.chosen)
     return (scan for place, scan in enumerate(scans()) if place in chosen)
 
 
 def full_cloud(scan: Scan, twist: Twist | None) -> Array:
-    """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp."""
+    """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp.
+
+    Args:
+        scan: the scan.
+        twist: motion of the target during it; None for a target at rest.
+    """
     points = np.asarray(scan.points, dtype=np.float64)
     return _connected(
         points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist)
@@ -165,7 +175,12 @@ def point_tree(points: Array) -> Any:
 
 
 def spacings(tree: Any, points: Array) -> Array:
-    """Distance of each point (n, 3) of a tree to its fourth neighbour (n,) [m]."""
+    """Distance of each point (n, 3) of a tree to its fourth neighbour (n,) [m].
+
+    Args:
+        tree: k-d tree of the points.
+        points: (n, 3) [m].
+    """
     return np.asarray(tree.query(points, k=5)[0][:, 4])
 
 
@@ -229,6 +244,10 @@ def _camera(clouds: Sequence[Array]) -> Array:
 def central_points(points: Array, size_m: float) -> Array:
     """The point nearest to the mean of each voxel: a measured point, because a mean lies
     inside a curved surface.
+
+    Args:
+        points: (n, 3) [m].
+        size_m: edge of a voxel [m].
     """
     cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
@@ -240,6 +259,11 @@ def central_points(points: Array, size_m: float) -> Array:
 def cell_of(points: Array, size_m: float, normals: Array | None = None) -> NDArray[np.intp]:
     """Number (n,) of the occupied voxel of every point; with normals the two sides of a thin
     wall are distinguished.
+
+    Args:
+        points: (n, 3) [m].
+        size_m: edge of a voxel [m].
+        normals: unit normals (n, 3).
     """
     place = np.floor(points / size_m).astype(np.int64)
     place -= place.min(axis=0)
@@ -265,6 +289,11 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
     """Return mean points and unit normals (m, 3) of the voxels, and the voxel (n,) of every point.
 
     The two sides of a thin wall, which have opposite normals, are averaged separately.
+
+    Args:
+        points: (n, 3) [m].
+        normals: unit normals (n, 3).
+        size_m: edge of a voxel [m].
     """
     cell = cell_of(points, size_m, normals)
     mean, normal = means(points, cell), means(normals, cell)
@@ -275,6 +304,11 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
     """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest
     points of the whole scan.
+
+    Args:
+        points: (n, 3) in {A} [m].
+        full: all points (m, 3) of the scan in {A} [m].
+        camera: position (3,) of the camera in {A} [m].
     """
     full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
     normals = point_tree(full).planes(full, full, points, points, NORMAL_NEIGHBOURS)[0]
@@ -284,7 +318,12 @@ def normals_of(points: Array, full: Array, camera: Array) -> Array:
 
 
 def sight_lines(views: Sequence[ScanView], T_ca: Sequence[Pose]) -> Array:
-    """(n, 3) unit vectors in {C} from the scanned surface to the camera."""
+    """(n, 3) unit vectors in {C} from the scanned surface to the camera.
+
+    Args:
+        views: the views, in order of time.
+        T_ca: pose of {A} in {C} at each view.
+    """
     lines = [T.R @ (v.camera - v.points.mean(axis=0)) for v, T in zip(views, T_ca, strict=True)]
     return np.array([line / np.linalg.norm(line) for line in lines])
 
@@ -301,6 +340,13 @@ def depth_behind(
     where none was.
 
     ``tree`` is that over the directions of the measured points, if it is known.
+
+    Args:
+        p: points (m, 3) [m].
+        measured: measured points (n, 3) [m].
+        camera: position (3,) of the camera [m].
+        spacing_m: distance between two directions that are the same, at the points [m].
+        tree: k-d tree of the directions of the measured points, if it is known.
     """
     if not len(p):
         return np.zeros(0)

@@ -255,25 +255,29 @@ def segments(points: Array, extent_m: float) -> Iterator[Array]:
     is one such part.
 
     Connected parts of the scan; parts larger than the target are split by leaving out their largest
-    planes.
+    planes. What is not part of anything larger comes first as a whole: the visible parts of one
+    target need not touch each other.
     """
     least = max(LEAST_POINTS, int(LEAST_SHARE * len(points)))
-    parts = list(_small_parts(points, extent_m, least, PLANES))
-    for part in sorted(parts, key=len, reverse=True):
-        if len(part) < 0.95 * len(points):
+    parts = sorted(_small_parts(points, extent_m, PLANES), key=len, reverse=True)
+    connected = [part for part in parts if len(part) >= STRAY_POINTS]
+    if len(connected) > 1:
+        together = np.concatenate(connected)
+        if geometry.bounding_diagonal(together) <= LARGER * extent_m:
+            parts.insert(0, together)
+    for part in parts:
+        if least <= len(part) < 0.95 * len(points):
             yield part
 
 
-def _small_parts(points: Array, extent_m: float, least: int, planes: int) -> Iterator[Array]:
+def _small_parts(points: Array, extent_m: float, planes: int) -> Iterator[Array]:
     for part in _connected(points, VOXEL_OF_EXTENT * extent_m):
-        if len(part) < least:
-            continue
         if bounding_diagonal(part) <= LARGER * extent_m:
             yield part
         elif planes:
             rest = _without_plane(part, PLANE_OF_EXTENT * extent_m)
             if len(rest) < len(part):
-                yield from _small_parts(rest, extent_m, least, planes - 1)
+                yield from _small_parts(rest, extent_m, planes - 1)
 
 
 def _connected(points: Array, voxel_m: float) -> Iterator[Array]:

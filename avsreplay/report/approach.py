@@ -22,8 +22,8 @@ PANEL_BORDER_PX = 26
 FLOWN = frozenset(
     ("approach", "approach_on_prediction", "capture")
 )  # actions during which the plan is followed
-_POSITION = ("x_m", "y_m", "z_m")
-_ATTITUDE = ("qx", "qy", "qz", "qw")
+_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+_ATTITUDE_COLUMNS = ("qx", "qy", "qz", "qw")
 _BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
@@ -41,7 +41,7 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[tuple[int, Array]]:
     t = np.array(column_of(rows, "t_ns"), np.int64)
     r, q = (
         np.stack([numbers(rows, name) for name in names], axis=1)
-        for names in (_POSITION, _ATTITUDE)
+        for names in (_POSITION_COLUMNS, _ATTITUDE_COLUMNS)
     )
     y, flown = (
         np.full((len(rows), 3), np.nan),

@@ -20,7 +20,7 @@ from avsreplay.report.summary import NEES_BAND, NIS_BAND
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers
 
-_TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
+_ARRAY_TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
 
 
 def pack(array: ArrayLike, kind: str) -> dict[str, str]:
@@ -30,7 +30,7 @@ def pack(array: ArrayLike, kind: str) -> dict[str, str]:
         array: of any shape.
         kind: type of the stored elements: f8, f4, i4, i2, u4 or u1.
     """
-    flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
+    flat = np.ascontiguousarray(np.asarray(array), dtype=_ARRAY_TYPES[kind]).reshape(-1)
     return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
 
 
@@ -54,7 +54,7 @@ _DIRECT = (
 )
 _SPREAD_PLANS = 10
 LOGARITHMIC_RATIO = 20.0  # largest over typical value from which an axis is logarithmic
-KINDS = {  # colour and pattern of each place
+PLACE_STYLES = {  # colour and pattern of each place
     "flagged": (
         *(
             "not_aligned",
@@ -86,7 +86,11 @@ _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
 def derived(rows: Sequence[Row]) -> Columns:
-    """Return every column (n,) that a chart draws, by name, without those that have no value."""
+    """Return every column (n,) that a chart draws, by name, without those that have no value.
+
+    Args:
+        rows: the rows of a run.
+    """
     out = {name: numbers(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (
@@ -251,7 +255,7 @@ def flight_charts(columns: Columns) -> list[Chart]:
     """
     margins = [name for name in columns if name.startswith("margin_")]
     lines = [_line(name, name[7:-2], k, dash=k % 2 == 1) for k, name in enumerate(margins)]
-    thrust = [_line(f"u{a}_mps2", a, k, dash=k == 1) for k, a in _XYZ]
+    thrust = [_line(f"u{a}_mps2", a, k, dash=k == 1) for k, a in _INDEXED_AXES]
     whole = [
         _chart(
             "distance", "Distance to the grasp point", "m", [_line("distance_m", "distance", 0)]
@@ -382,7 +386,7 @@ def _parameter_charts(truth: State | None) -> list[Chart]:
             "Fixture from the mass centre",
             "m",
             arm,
-            bands=[(f"c{a}_m", k) for k, a in _XYZ],
+            bands=[(f"c{a}_m", k) for k, a in _INDEXED_AXES],
             levels=c,
         ),
         _chart(
@@ -390,14 +394,14 @@ def _parameter_charts(truth: State | None) -> list[Chart]:
             "Fixture attitude mu",
             "deg",
             turn,
-            bands=[(f"mu_{a}_deg", k) for k, a in _XYZ],
+            bands=[(f"mu_{a}_deg", k) for k, a in _INDEXED_AXES],
             levels=mu,
         ),
         _chart("rate", "Angular rate", "rad/s", rate),
     ]
 
 
-_XYZ = tuple(enumerate("xyz"))
+_INDEXED_AXES = tuple(enumerate("xyz"))
 
 
 def _truths(truth: State | None) -> list[list[tuple[float, str, int]]]:
@@ -476,7 +480,7 @@ def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[st
 
 def _style(lane: str, word: str) -> dict[str, int]:
     """Colour and pattern of a kind, the same on every page."""
-    known = KINDS[lane]
+    known = PLACE_STYLES[lane]
     place = known.index(word) if word in known else zlib.crc32(word.encode())
     return {"colour": place % 6, "pattern": (place // 6 + _FIRST_PATTERN[lane]) % 6}
 

@@ -244,7 +244,11 @@ METRICS: tuple[Metric, ...] = (
 
 
 def metrics(summary: Summary) -> dict[str, float | None]:
-    """Return the value of every metric by name, None where the run has no value."""
+    """Return the value of every metric by name, None where the run has no value.
+
+    Args:
+        summary: the summary of a run.
+    """
     return {m.name: _finite(m.of(summary)) for m in METRICS}
 
 
@@ -253,7 +257,12 @@ def _finite(value: float | None) -> float | None:
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return a nested table of settings as one table with dotted keys."""
+    """Return a nested table of settings as one table with dotted keys.
+
+    Args:
+        table: the nested table.
+        prefix: what stands before every key.
+    """
     out: dict[str, Any] = {}
     for key, value in table.items():
         out |= (
@@ -346,7 +355,12 @@ def _value(value: Any, unset: str = "not set") -> str:
 
 
 def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:
-    """Return the table of the metrics of a single run."""
+    """Return the table of the metrics of a single run.
+
+    Args:
+        name: name of the run.
+        figures: name and value of each metric.
+    """
     meaning = {m.name: m.doc for m in METRICS}
     rows = tuple(
         (metric, meaning[metric], number(value)) for metric, value in figures if value is not None

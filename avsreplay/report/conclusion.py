@@ -28,7 +28,7 @@ from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 from avsreplay.tables import column_of, numbers
 
-HEADLINES = {  # the metrics of the conclusion: words, unit and factor
+COMPARED_METRICS = {  # the metrics of the conclusion: words, unit and factor
     "healthy_ratio": ("scans used", " %", 100.0),
     "all_pos_rmse_m": ("rms position error of all scans", " mm", 1000.0),
     "all_rot_rmse_deg": ("rms attitude error of all scans", " deg", 1.0),
@@ -41,7 +41,7 @@ HEADLINES = {  # the metrics of the conclusion: words, unit and factor
     "capture_miss_m": ("miss at capture", " mm", 1000.0),
     "losses": ("lost parts of the log", "", 1.0),
 }
-_MORE = {
+_MORE_IS_BETTER = {
     "capture_probability",
     "captured",
     "scans",
@@ -265,7 +265,7 @@ def _word(name: str, differences: Sequence[float], interval: tuple[float, float]
     sure = len(differences) == 1 if interval is None else interval[0] > 0.0 or interval[1] < 0.0
     if not sure:
         return "no evidence"
-    return "better" if (mean > 0.0) == (name in _MORE) else "worse"
+    return "better" if (mean > 0.0) == (name in _MORE_IS_BETTER) else "worse"
 
 
 def _interval(
@@ -313,7 +313,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
             f"no difference; all {rows} rows agree within the tolerances of their columns",
         )
     found = {
-        word: [c for c in changes if c.word == word and c.metric in HEADLINES]
+        word: [c for c in changes if c.word == word and c.metric in COMPARED_METRICS]
         for word in ("worse", "better")
     }
     said = [
@@ -325,7 +325,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
         else "no evidence"
     )
     changed = [
-        c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)
+        c for c in changes if c.metric in COMPARED_METRICS and c.word == "changed" and _mentioned(c)
     ]
     if not paired:
         differ = ", ".join(map(_said, changed))
@@ -349,14 +349,18 @@ def _mentioned(change: Change) -> bool:
 
 
 def _said(change: Change) -> str:
-    words, unit, factor = HEADLINES[change.metric]
+    words, unit, factor = COMPARED_METRICS[change.metric]
     if change.note or change.base is None or change.other is None:
         return f"{words} ({change.note or 'no value'})"
     return f"{words} ({factor * change.base:.4g} to {factor * change.other:.4g}{unit})"
 
 
 def settings_table(conclusion: Conclusion) -> Table:
-    """Return the table of the settings in which a run differs from the baseline."""
+    """Return the table of the settings in which a run differs from the baseline.
+
+    Args:
+        conclusion: the comparison with the baseline.
+    """
     texts = conclusion.settings or ("none",)
     return facts_table(
         f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts]
@@ -373,7 +377,9 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
         show_all: also show the metrics that are equal and not among the main ones.
     """
     shown = [
-        c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"
+        c
+        for c in conclusion.changes
+        if show_all or c.metric in COMPARED_METRICS or c.word != "equal"
     ]
     meaning = {m.name: m.doc for m in METRICS}
     rows = tuple(

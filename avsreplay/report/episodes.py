@@ -149,6 +149,9 @@ class Coast:
 def gaps(t_ns: Sequence[int]) -> list[tuple[int, int]]:
     """Return the instants [ns] before and after every interval longer than ``GAP_STEPS`` times the
     median interval.
+
+    Args:
+        t_ns: stamps of the scans in order [ns].
     """
     steps = [b - a for a, b in pairwise(t_ns) if b > a]
     if not steps:
@@ -333,6 +336,9 @@ def _nexts(labels: Sequence[Label]) -> list[int | None]:
 def coasts(marks: Sequence[Mark]) -> list[Coast]:
     """Return all runs of consecutive scans with gamma 0. The duration of one is the time from the
     last healthy scan before it to its last scan.
+
+    Args:
+        marks: instant and gamma of each scan.
     """
     out: list[Coast] = []
     begin: int | None = None

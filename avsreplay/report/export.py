@@ -9,11 +9,11 @@ docs/rows.schema.json with ``--schema``, from the declaration of ``Row``.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,21 +27,27 @@ from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Column, Row, columns, field_types
 from avsreplay.settings import dump
 
-FORMAT = "avsreplay-run/1"
+EXPORT_FORMAT = "avsreplay-run/1"
+GROUP_ROWS = 4096  # rows of a group of a Parquet file, which are in memory at once
 
 StampedPose = tuple[int, Pose]
 """(t_ns, T_ac): a time and the pose of {C} in {A} at that time."""
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet evaluates text that begins so
-_COLUMNS = {
+_FILE_COLUMNS = {
     "estimate": (("qx", "qy", "qz", "qw"), ("x_m", "y_m", "z_m")),
     "registration": (("reg_qx", "reg_qy", "reg_qz", "reg_qw"), ("reg_x_m", "reg_y_m", "reg_z_m")),
 }
 
 
 def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | None:
-    """Return the estimated or the registered pose of a row, None where there is none."""
-    attitude, position = _COLUMNS[which]
+    """Return the estimated or the registered pose of a row, None where there is none.
+
+    Args:
+        row: the row.
+        which: which of the two poses.
+    """
+    attitude, position = _FILE_COLUMNS[which]
     q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
     return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
 
@@ -49,12 +55,21 @@ def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | Non
 def row_poses(
     rows: Iterable[Row], which: Literal["estimate", "registration"]
 ) -> Iterator[StampedPose]:
-    """Return the estimated or the registered poses of the rows that have one."""
+    """Return the estimated or the registered poses of the rows that have one.
+
+    Args:
+        rows: the rows of a run.
+        which: which of the two poses.
+    """
     return ((row.t_ns, pose) for row in rows if (pose := row_pose(row, which)) is not None)
 
 
 def stamp_text(t_ns: int) -> str:
-    """Return a time stamp [ns] as seconds with nine decimals, exactly."""
+    """Return a time stamp [ns] as seconds with nine decimals, exactly.
+
+    Args:
+        t_ns: the instant [ns].
+    """
     sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
     return f"{sign}{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}"
 
@@ -62,6 +77,10 @@ def stamp_text(t_ns: int) -> str:
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
     """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return
     their number.
+
+    Args:
+        path: the file.
+        poses: T_ac with their stamps.
     """
     return _write_lines(
         path, (f"{stamp_text(t_ns)} {_text(pose.t)} {_text(pose.q)}" for t_ns, pose in poses)
@@ -71,6 +90,10 @@ def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
 def write_kitti(path: str | Path, poses: Iterable[Pose]) -> int:
     """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per pose [m]; return the
     number of poses.
+
+    Args:
+        path: the file.
+        poses: T_ac in order.
     """
     return _write_lines(path, (_text(pose.matrix[:3].ravel()) for pose in poses))
 
@@ -91,6 +114,10 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
     """Write all columns as CSV. The first line has their names, which end with the unit; null is an
     empty cell.
+
+    Args:
+        path: the file.
+        rows: the rows of a run.
     """
     names = [c.name for c in columns()]
     with output_text(path) as stream:
@@ -109,6 +136,10 @@ def _cell(value: Any) -> str:
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
     """Write all columns with their types; the metadata of each field have its unit and meaning.
+
+    Args:
+        path: the file.
+        rows: the rows of a run.
 
     Raises:
         MissingBackend: pyarrow is not installed.
@@ -133,25 +164,41 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
             for c in columns()
         ]
     )
-    table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
-    with output_path(path) as part:
-        pq.write_table(pa.table(table, schema=schema), part)
+    with output_path(path) as part, pq.ParquetWriter(part, schema) as writer:
+        left = iter(rows)
+        while group := list(islice(left, GROUP_ROWS)):
+            table = {name: [plain(getattr(row, name)) for row in group] for name in types}
+            writer.write_table(pa.table(table, schema=schema))
 
 
-def run_document(
+def document_parts(
     rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return a run as plain JSON values, with the keys ``format``, ``verdict``, ``header``,
-    ``summary`` and ``rows``; NaN becomes null.
+) -> Iterator[str]:
+    """Yield the parts of a JSON document of a run, with one line per row and a line end at its end.
+
+    Args:
+        rows: one per scan.
+        summary: the summary of these rows.
+        header: the content of ``run.json``.
+
+    Yields:
+        Text; all parts together are one document with the keys ``format``, ``verdict``, ``header``,
+        ``summary`` and ``rows``, in which NaN is null.
     """
-    names = [f.name for f in dataclasses.fields(Row)]
-    return {
-        "format": FORMAT,
+    whole = {
+        "format": EXPORT_FORMAT,
         "verdict": verdict_of(rows, summary, header).record(),
         "header": _strict(dump(dict(header or {}))),
         "summary": summary_record(summary),
-        "rows": [{name: plain(getattr(row, name)) for name in names} for row in rows],
     }
+    head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
+    yield f'{head[:-2]},\n "rows": [\n'
+    names, end = list(field_types()), ""
+    for row in rows:
+        values = {name: plain(getattr(row, name)) for name in names}
+        yield end + json.dumps(values, ensure_ascii=False, allow_nan=False)
+        end = ",\n"
+    yield "\n ]\n}\n"
 
 
 def summary_record(summary: Summary) -> dict[str, Any]:
@@ -160,18 +207,6 @@ def summary_record(summary: Summary) -> dict[str, Any]:
     record["faults"]["false_alarm_rate"] = summary.faults.false_alarm_rate
     record["faults"]["longest_recovery_s"] = summary.faults.longest_recovery_s
     return record
-
-
-def dump_document(
-    rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None
-) -> str:
-    """The document as text with one line per row, ending in a line end."""
-    whole = run_document(rows, summary, header)
-    lines = ",\n".join(
-        json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows")
-    )
-    head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
-    return f'{head[:-2]},\n "rows": [\n{lines}\n ]\n}}\n'
 
 
 def _strict(value: Any) -> Any:
@@ -185,6 +220,9 @@ def _strict(value: Any) -> Any:
 def write_layout(path: str | Path) -> None:
     """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view,
     plots, diagnostics.
+
+    Args:
+        path: the file.
     """
     with output_text(path) as stream:
         stream.write(
@@ -192,7 +230,7 @@ def write_layout(path: str | Path) -> None:
         )
 
 
-_HEAD = """# What do the columns of a row mean?
+_PAGE_HEAD = """# What do the columns of a row mean?
 
 Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. These are the columns that
 people use; all follow by subject.
@@ -207,7 +245,7 @@ schema of a row.
 `python -m avsreplay.report.export` makes this page, with `--schema` the schema.
 """
 
-FREQUENT = {
+FREQUENT_COLUMNS = {
     "which scan": ("seq", "t_s"),
     "was it used, and why not": ("gamma", "reason", "status", "message"),
     "pose of the target": ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
@@ -225,9 +263,10 @@ def columns_page() -> str:
     """Return the text of docs/columns.md."""
     lines = ["| question | columns |", "|---|---|"]
     lines += [
-        f"| {what} | {', '.join(f'`{n}`' for n in names)} |" for what, names in FREQUENT.items()
+        f"| {what} | {', '.join(f'`{n}`' for n in names)} |"
+        for what, names in FREQUENT_COLUMNS.items()
     ]
-    parts = [_HEAD.replace("{frequent}", "\n".join(lines))]
+    parts = [_PAGE_HEAD.replace("{frequent}", "\n".join(lines))]
     words: list[str] = []
     for each in columns():
         if each.section is not None:

@@ -5,8 +5,9 @@ annotations.
 from __future__ import annotations
 
 import difflib
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +17,17 @@ from avsreplay.report.table import Table, TableCell, number
 from avsreplay.settings import Settings, setting
 from avsreplay.toml_document import build, load
 
-_LIMITS = ("min", "max", "min_ratio", "max_ratio", "max_increase", "max_decrease")
-_RELATIVE = _LIMITS[2:]
+# The lowest and the highest value that each limit of a rule allows, from the limit and the value of
+# the baseline.
+_BOUNDS: Mapping[str, Callable[[float, float], tuple[float, float]]] = {
+    "min": lambda limit, _: (limit, math.inf),
+    "max": lambda limit, _: (-math.inf, limit),
+    "min_ratio": lambda limit, reference: (limit * reference, math.inf),
+    "max_ratio": lambda limit, reference: (-math.inf, limit * reference),
+    "max_increase": lambda limit, reference: (-math.inf, reference + limit),
+    "max_decrease": lambda limit, reference: (reference - limit, math.inf),
+}
+_RELATIVE = frozenset(_BOUNDS) - {"min", "max"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +63,13 @@ class GateRule(Settings):
             raise ValueError(f"unknown metric '{ascii(self.metric)[1:-1][:40]}'; {meant}")
         if not self.limits:
             raise ValueError(
-                f"the rule on '{self.metric}' has no limit; give one of {', '.join(_LIMITS)}"
+                f"the rule on '{self.metric}' has no limit; give one of {', '.join(_BOUNDS)}"
             )
 
     @property
     def limits(self) -> dict[str, float]:
         """Return the limits that the rule has, by name."""
-        return {name: getattr(self, name) for name in _LIMITS if getattr(self, name) is not None}
+        return {name: getattr(self, name) for name in _BOUNDS if getattr(self, name) is not None}
 
     @property
     def relative(self) -> bool:
@@ -101,6 +111,9 @@ class RuleOutcome:
 
 def load_rules(path: str | Path) -> tuple[GateRule, ...]:
     """Read the rules of a TOML file.
+
+    Args:
+        path: the file.
 
     Raises:
         UnreadableInput: the file cannot be read.
@@ -164,44 +177,32 @@ def _outcome(
         return RuleOutcome(
             run, rule, None, False, f"the run has lost the value (baseline {reference:.6g})"
         )
-    if value is None:
+    if value is None or (rule.relative and reference is None):
+        whose = "the run" if value is None else "the baseline"
         return RuleOutcome(
-            run, rule, None, rule.optional, "" if rule.optional else "the run has no value"
+            run, rule, value, rule.optional, "" if rule.optional else f"{whose} has no value"
         )
-    if rule.relative and reference is None:
-        return RuleOutcome(
-            run, rule, value, rule.optional, "" if rule.optional else "the baseline has no value"
-        )
+    why = next(_broken(rule, value, reference), "")
+    return RuleOutcome(run, rule, value, not why, why)
+
+
+def _broken(rule: GateRule, value: float, reference: float | None) -> Iterator[str]:
+    """The limits that a value breaks, each in a sentence with both numbers."""
     for name, limit in rule.limits.items():
-        low, high = _bounds(name, limit, reference or 0.0)
+        low, high = _BOUNDS[name](limit, reference or 0.0)
         if not low <= value <= high:
             bound = high if value > high else low
             sign = ">" if value > high else "<"
             from_base = f" (baseline {reference:.6g})" if name in _RELATIVE else ""
-            return RuleOutcome(
-                run,
-                rule,
-                value,
-                False,
-                f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}",
-            )
-    return RuleOutcome(run, rule, value, True)
-
-
-def _bounds(name: str, limit: float, reference: float) -> tuple[float, float]:
-    infinity = float("inf")
-    return {
-        "min": (limit, infinity),
-        "max": (-infinity, limit),
-        "min_ratio": (limit * reference, infinity),
-        "max_ratio": (-infinity, limit * reference),
-        "max_increase": (-infinity, reference + limit),
-        "max_decrease": (reference - limit, infinity),
-    }[name]
+            yield f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}"
 
 
 def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
-    """Raise CheckFailed with the first broken rule, if there is one."""
+    """Raise CheckFailed with the first broken rule, if there is one.
+
+    Args:
+        outcomes: the outcomes of all rules.
+    """
     broken = [o for o in outcomes if not o.ok]
     if broken:
         o = broken[0]

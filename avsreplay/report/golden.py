@@ -224,6 +224,11 @@ def _is_number(value: Any) -> bool:
 def update_golden(path: str | Path, rows: Sequence[Row], *, first: int = 20) -> GoldenResult | None:
     """Replace the golden file and return the differences from the previous one (None if there was
     none).
+
+    Args:
+        path: the golden file.
+        rows: the rows of a run.
+        first: largest number of differences that are listed.
     """
     former = compare_golden(path, rows, first=first) if Path(path).is_file() else None
     write_rows(path, rows)
@@ -231,7 +236,13 @@ def update_golden(path: str | Path, rows: Sequence[Row], *, first: int = 20) -> 
 
 
 def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
-    """Return in one line where the rows of two runs first differ."""
+    """Return in one line where the rows of two runs first differ.
+
+    Args:
+        baseline: name of the first run.
+        other: name of the second run.
+        found: their differences.
+    """
     first = found.differences[0]
     scan = "every scan" if first.seq is None else f"scan {first.seq}"
     line = (
@@ -244,6 +255,9 @@ def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
 def golden_table(result: GoldenResult) -> Table:
     """Return the table of the first differences from a golden file; its note has the number of
     differences in each column.
+
+    Args:
+        result: the differences.
     """
     counts = sorted(result.by_column.items(), key=lambda item: (-item[1], item[0]))
     more = f", and {len(counts) - 12} further columns" if len(counts) > 12 else ""

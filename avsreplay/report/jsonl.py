@@ -27,10 +27,10 @@ from avsreplay.rows import Row, field_types
 from avsreplay.settings import LARGEST_NUMBER
 from avsreplay.tables import RowTable
 
-_NAMES = tuple(f.name for f in dataclasses.fields(Row))
-_VALUES = attrgetter(*_NAMES)
+_ROW_COLUMNS = tuple(f.name for f in dataclasses.fields(Row))
+_ROW_VALUES = attrgetter(*_ROW_COLUMNS)
 _ENCODE = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
-_PLAIN = (float, str, int, bool, type(None))  # types of values that JSON has
+_PLAIN_TYPES = (float, str, int, bool, type(None))  # types of values that JSON has
 _MAX_LINE_BYTES = 1 << 20
 _MAX_ROWS_BYTES = 2 << 30
 _MAX_NAME_CHARACTERS = 100
@@ -43,18 +43,18 @@ def plain(value: Any) -> Any:
     """Return a value that JSON has: numpy scalars as those of Python, floats that are not finite as
     None.
     """
-    if type(value) not in _PLAIN and hasattr(value, "item"):
+    if type(value) not in _PLAIN_TYPES and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def dump_row(row: Row) -> str:
     """Return a row as one line of JSON, without the line end."""
-    values = _VALUES(row)
+    values = _ROW_VALUES(row)
     try:
-        return _ENCODE(dict(zip(_NAMES, values, strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, values, strict=True)))
     except (TypeError, ValueError):  # a numpy scalar, or a float that is not finite
-        return _ENCODE(dict(zip(_NAMES, map(plain, values), strict=True)))
+        return _ENCODE(dict(zip(_ROW_COLUMNS, map(plain, values), strict=True)))
 
 
 class RowWriter:
@@ -102,6 +102,9 @@ def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
     The columns are not checked, but every name is printable text and every value is null, a bool, a
     number of 64 bits or printable text.
+
+    Args:
+        path: a rows.jsonl file.
 
     Raises:
         UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
@@ -171,6 +174,10 @@ def _is_cell(value: Any) -> bool:
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
     """Build a row from its JSON object; a text column and one that may be null may be missing.
+
+    Args:
+        record: the object.
+        where: file and line, for messages.
 
     Raises:
         UnreadableInput: a column is unknown or missing, or a value has the wrong type.
@@ -327,6 +334,10 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
 
 def read_json(path: Path, *, hint: str) -> Any:
     """Return the value of a JSON file, see ``parse_json``.
+
+    Args:
+        path: the file.
+        hint: what to do where it cannot be read.
 
     Raises:
         UnreadableInput: the file cannot be read, or is no such JSON.

@@ -41,6 +41,9 @@ class Moment:
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
     """Return the five worst intervals, which do not overlap: those without a used scan, and those
     whose error or NIS is far above the median.
+
+    Args:
+        rows: the rows of a run.
     """
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
@@ -141,7 +144,11 @@ def _cause_in_estimate(
 
 
 def plain(name: str) -> str:
-    """Return a status or reason in words."""
+    """Return a status or reason in words.
+
+    Args:
+        name: a value of the columns ``status`` or ``reason``.
+    """
     return "no usable points" if name == "no_scan" else name.replace("_", " ")
 
 

@@ -76,7 +76,7 @@ def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
     """
     moments = tensor = centre = rate = None
     if truth is not None:
-        R_cb, found = geometry.matrix(truth.q_bc).T, _moments(truth)
+        R_cb, found = geometry.matrix(truth.q_bc).T, relative_moments(truth)
         moments, centre = _tuple(np.sort(found)), _tuple(-R_cb @ truth.c_b)
         rate = _tuple(R_cb @ truth.w_b)
         full = R_cb @ np.diag(found) @ R_cb.T
@@ -99,9 +99,11 @@ def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
     ]
 
 
-def _moments(x: State) -> geometry.Array:
-    """Principal moments (3,) over their sum, from the inertia ratios: I / tr I is 1 over the
-    diagonal of B(sigma).
+def relative_moments(x: State) -> geometry.Array:
+    """Return the principal moments of inertia (3,) over their sum: 1 over the diagonal of B(sigma).
+
+    Args:
+        x: a state; its inertia ratios are used.
     """
     s1, s2 = float(x.sigma[0]), float(x.sigma[1])
     xx = 1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2)

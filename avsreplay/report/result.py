@@ -23,7 +23,7 @@ from avsreplay.assessment import Assessment
 from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, bounding_diagonal
-from avsreplay.records import NS_PER_S, Label, State, Surface
+from avsreplay.records import NS_PER_S, STATE_SIZES, Label, State, Surface
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
 from avsreplay.report.summary import Summary
@@ -32,7 +32,6 @@ from avsreplay.settings import dump
 from avsreplay.spool import LARGEST_STORED
 from avsreplay.tables import PoseTable, RowTable
 
-_STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 _RUN_AGAIN = "the result is not as a run wrote it: run again"
@@ -125,12 +124,17 @@ def facts_record(
 ) -> dict[str, Any]:
     """Return what ``Summary.fold`` received beside the rows as JSON values, for the key ``facts``
     of ``run.json``.
+
+    Args:
+        labels: labels of the log; None where it has none.
+        truth: true state at the last scan.
+        counts: further counts by name.
     """
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
         "truth": None
         if truth is None
-        else {name: getattr(truth, name).tolist() for name in _STATE},
+        else {name: getattr(truth, name).tolist() for name in STATE_SIZES},
         "counts": dict(counts or {}),
     }
 
@@ -154,6 +158,9 @@ def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file.
+
+    Args:
+        path: the file.
 
     Raises:
         OSError: it cannot be read.
@@ -315,8 +322,8 @@ def _label(values: Mapping[str, Any]) -> Label:
 
 
 def _state(values: Mapping[str, Any]) -> State:
-    arrays = {name: np.array(values[name], dtype=np.float64) for name in _STATE}
-    sizes_match = all(arrays[name].shape == (size,) for name, size in _STATE.items())
+    arrays = {name: np.array(values[name], dtype=np.float64) for name in STATE_SIZES}
+    sizes_match = all(arrays[name].shape == (size,) for name, size in STATE_SIZES.items())
     if not sizes_match or not all((np.abs(a) < LARGEST_STORED).all() for a in arrays.values()):
         raise ValueError("a state of another shape")
     if any(abs(np.linalg.norm(arrays[name]) - 1.0) > _UNIT_NORM_ERROR for name in ("q_ab", "q_bc")):

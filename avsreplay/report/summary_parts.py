@@ -141,7 +141,11 @@ def length_text(metres: float) -> str:
 
 
 def times(count: int) -> str:
-    """Return a number of events in words: never, once, 2 times."""
+    """Return a number of events in words: never, once, 2 times.
+
+    Args:
+        count: the number.
+    """
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 

@@ -163,6 +163,9 @@ def print_tables(
 def verdict_table(verdict: RunVerdict) -> Table:
     """Return the table of reasons, first pose, robot and the settings that differ from their
     defaults.
+
+    Args:
+        verdict: the verdict on a run.
     """
     marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
     rows: list[tuple[str | TableCell, ...]] = [
@@ -182,6 +185,10 @@ def verdict_table(verdict: RunVerdict) -> Table:
 def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
     """Return the table of the worst moments; ``place`` maps a row to its row on a page, to which a
     click leads.
+
+    Args:
+        verdict: the verdict on a run.
+        place: the row on the page to which a click on a row leads.
     """
     rows = []
     for m in verdict.moments:
@@ -194,13 +201,21 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
     """Return the tables of errors, injected faults, manoeuvres, parameters and consistency; a table
     without content has no rows.
+
+    Args:
+        summary: the summary of a run.
+        rows: the rows of a run.
     """
     events = fault_table(summary, rows), manoeuvre_table(summary, rows)
     return error_table(summary), *events, parameter_table(summary), consistency_table(summary)
 
 
 def error_table(summary: Summary) -> Table:
-    """Return the statistics of pose and registration errors in mm (m from 1 m on) and deg."""
+    """Return the statistics of pose and registration errors in mm (m from 1 m on) and deg.
+
+    Args:
+        summary: the summary of a run.
+    """
     groups = (
         ("pose, all scans", summary.pose_all if summary.coasting else Errors(None, None)),
         ("pose, healthy", summary.pose_healthy),
@@ -234,6 +249,9 @@ def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
 def consistency_table(summary: Summary) -> Table:
     """Return the normalised errors squared with their degrees of freedom and two-sided 95 %
     chi-square bands.
+
+    Args:
+        summary: the summary of a run.
     """
     sizes = {f"NEES {name}": block.stop - block.start for name, block in BLOCKS.items()}
     blocks = [(f"NEES {name}", share) for name, share in summary.nees_blocks.items()]
@@ -260,6 +278,10 @@ def consistency_table(summary: Summary) -> Table:
 def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     """Return the table of the injected faults; with ``rows`` the first cell leads to the first scan
     of the fault.
+
+    Args:
+        summary: the summary of a run.
+        rows: the rows of a run.
     """
     heads = (
         "kind",
@@ -286,19 +308,23 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
 
 
 def event_table(header: Mapping[str, Any] | None) -> Table:
-    """Events of the whole log by the smoothing pass; no rows without it."""
+    """Events of the whole log by the smoothing pass; no rows without it.
+
+    Args:
+        header: the record of the run, ``run.json``; None where there is none.
+    """
     heads = ("t\n[s]", "1 sigma\n[s]", "event", "log odds", "first known\n[s]")
     record = (header or {}).get("smoothed")
     found = record.get("events") if isinstance(record, dict) else None
     lines = tuple(
-        (*(_figure(each.get(name), places) for name, places in _TIMES), *_told(each))
+        (*(_figure(each.get(name), places) for name, places in _ONSET_COLUMNS), *_told(each))
         for each in (found if isinstance(found, list) else ())
         if isinstance(each, dict)
     )
     return Table("Events by all poses of the log", heads, lines)
 
 
-_TIMES = (("onset_s", 2), ("onset_1s_s", 2))
+_ONSET_COLUMNS = (("onset_s", 2), ("onset_1s_s", 2))
 
 
 def _told(event: Mapping[str, Any]) -> tuple[str, str, str]:
@@ -314,6 +340,10 @@ def _figure(value: Any, places: int) -> str:
 def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     """Return the table of the changes of the target's velocity; with ``rows`` the first cell leads
     to the nearest scan.
+
+    Args:
+        summary: the summary of a run.
+        rows: the rows of a run.
     """
     heads = (
         "t\n[s]",
@@ -358,7 +388,11 @@ def _verdict(episode: Episode) -> TableCell:
 
 
 def parameter_table(summary: Summary) -> Table:
-    """Return the table of the estimated and the true constants, one row for each component."""
+    """Return the table of the estimated and the true constants, one row for each component.
+
+    Args:
+        summary: the summary of a run.
+    """
     heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
     rows = tuple(row for p in summary.parameters for row in _parameter_rows(p))
     note = (
@@ -390,7 +424,11 @@ def _small(value: float | None) -> str:
 
 
 def in_one_line(summary: Summary) -> str:
-    """Return scans used, faults, errors, t_1 and planned capture in one line."""
+    """Return scans used, faults, errors, t_1 and planned capture in one line.
+
+    Args:
+        summary: the summary of a run.
+    """
     parts = [
         f"{summary.healthy} of {summary.scans} scans used",
         *_fault_words(summary),
@@ -436,7 +474,12 @@ def _error_words(summary: Summary) -> list[str]:
 
 
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
-    """Yield names and values of what takes one line: scans, faults, filter, plan, counts, speed."""
+    """Yield names and values of what takes one line: scans, faults, filter, plan, counts, speed.
+
+    Args:
+        summary: the summary of a run.
+        scans_per_s: speed of the replay; None where it was not measured.
+    """
     facts = [
         *_scan_facts(summary),
         *_fault_facts(summary),

@@ -44,7 +44,11 @@ class TableCell:
     scan: int | None = None
 
     def signed(self, *, ascii_only: bool = False) -> str:
-        """Return the text after the sign of its mark."""
+        """Return the text after the sign of its mark.
+
+        Args:
+            ascii_only: whether the sign is ASCII.
+        """
         sign = _SIGNS[self.mark][ascii_only] if self.mark else ""
         return " ".join(part for part in (sign, self.text) if part)
 
@@ -148,7 +152,12 @@ def _least_width(table: Table, gap: int) -> int:
 
 
 def print_line(console: Console, text: str) -> None:
-    """Print one line of text as it is."""
+    """Print one line of text as it is.
+
+    Args:
+        console: where it is printed.
+        text: the line.
+    """
     console.print(Text(printable(text, "\n")))
 
 
@@ -205,25 +214,41 @@ def escaped(text: str) -> str:
 
 
 def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
-    """Return a table of names and values."""
+    """Return a table of names and values.
+
+    Args:
+        title: title of the table.
+        facts: name and value of each line.
+    """
     return Table(title, ("what", "value"), tuple(facts), align="l")
 
 
 def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
-    """Return a number as text, or ``none`` where there is no value."""
+    """Return a number as text, or ``none`` where there is no value.
+
+    Args:
+        value: the number.
+        spec: its format specification.
+        none: the text for None.
+    """
     return none if value is None else format(value, spec)
 
 
 def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
     """Return the number of decimals, from ``least`` to 8, that show ``figures`` significant figures
     of the middle value.
+
+    Args:
+        values: the numbers of a column.
+        least: fewest decimals.
+        figures: significant figures of the middle value.
     """
     sizes: Sequence[float] = sorted(abs(v) for v in values if v)
     wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2])) if sizes else least
     return min(max(least, wanted), 8)
 
 
-SHOWN_ROWS = 24  # rows of a table that are shown without being asked for
+SHOWN_ROWS = 24  # rows of a table that are shown unless more are requested
 _HEADS = {  # a line end stands where the heading may break
     "seq": "scan",
     "t_s": "time",
@@ -272,6 +297,11 @@ def choose_rows(
 
     With neither flag: every k-th row so that about 24 are left, the last one, and those at which
         gamma changes.
+
+    Args:
+        rows: the rows of a run.
+        every: show every k-th row; None leaves the choice to the function.
+        show_all: whether all rows are shown.
     """
     if show_all or (every is None and len(rows) <= SHOWN_ROWS):
         return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
@@ -297,6 +327,12 @@ def scan_table(
 ) -> Table:
     """Return the table of the chosen rows; columns that do not fit the console are left out and
     named in the note.
+
+    Args:
+        console: where it is printed.
+        rows: the rows of a run.
+        every: show every k-th row; None leaves the choice to the function.
+        show_all: whether all rows are shown.
     """
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
     plain = ascii_only(console)
@@ -327,6 +363,10 @@ def scan_table(
 def head(column: Column, shown: str = "") -> str:
     """Return a heading of whole words with the unit on the last line; ``shown`` is the unit of the
     printed numbers.
+
+    Args:
+        column: the column.
+        shown: unit of the printed numbers.
     """
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
     name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
@@ -377,6 +417,10 @@ def _cell(value: Any, fmt: str) -> TableCell:
 def state_cell(gamma: int, reason: str) -> TableCell:
     """Return the cell of a state: healthy, coasting because there was no scan, or flagged with the
     reason.
+
+    Args:
+        gamma: 1 for a healthy scan, 0 for another one.
+        reason: why a scan is not healthy.
     """
     if gamma == 1:
         return TableCell("ok", "good")
@@ -400,6 +444,10 @@ _LABEL_CHARACTERS = 32
 def spark(values: Sequence[float | None], width: int) -> str:
     """Return at most ``width`` blocks, whose heights from 0 to the largest value show the largest
     value of each part; a blank where a part has none.
+
+    Args:
+        values: the values in order, None where there is none.
+        width: largest number of blocks.
     """
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)
@@ -415,7 +463,12 @@ def _parts(count: int, width: int) -> list[tuple[int, int]]:
 
 
 def print_sparks(console: Console, rows: Sequence[Row]) -> None:
-    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
+    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode.
+
+    Args:
+        console: where it is printed.
+        rows: the rows of a run.
+    """
     if not console.is_terminal or console.width < LEAST_WIDTH_CHARACTERS or ascii_only(console):
         return
     width = console.width - _LABEL_CHARACTERS

@@ -461,7 +461,12 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
 
 
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
-    """Return in words where the first pose came from."""
+    """Return in words where the first pose came from.
+
+    Args:
+        rows: the rows of a run.
+        header: the record of the run, ``run.json``.
+    """
     if not rows:
         return "no scan"
     config = header.get("config") or {}

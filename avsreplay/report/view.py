@@ -173,6 +173,10 @@ def thin_cloud(
 def thin_surface(surface: Surface, *, most: int = MAX_FACES) -> tuple[Floats, Faces]:
     """Thin a model to at most ``most`` faces (vertices, for a model without faces): vertices are
     merged on a grid that is made coarser until this holds.
+
+    Args:
+        surface: the model of the target.
+        most: largest number of faces or vertices.
     """
     vertices, faces = surface.vertices, surface.faces
     size = surface.extent / 256.0 or 1.0
@@ -213,7 +217,12 @@ def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def write_view(path: str | Path, view: View) -> None:
-    """Write one npz file atomically; the same view gives the same bytes."""
+    """Write one npz file atomically; the same view gives the same bytes.
+
+    Args:
+        path: the file.
+        view: the model, clouds and paths.
+    """
     clouds = view.clouds if isinstance(view.clouds, CloudTable) else CloudTable(view.clouds)
     misses = [np.nan if p.miss_m is None else p.miss_m for p in view.paths]
     arrays: dict[str, NDArray[Any] | Spool] = {
@@ -244,6 +253,9 @@ def _each_point(parts: Sequence[tuple[CloudView, Floats | None]]) -> Floats:
 
 def read_view(path: str | Path) -> View:
     """Read a view.
+
+    Args:
+        path: the file.
 
     Raises:
         UnreadableInput: the file is missing or is not a view.
@@ -316,6 +328,11 @@ CONE_LINES = 48  # lines of a cone
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
     """Return the plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit
     steps about a centre [m].
+
+    Args:
+        rows: the rows of a run.
+        truth: true T_ac by number of the scan.
+        view: the model, clouds and paths; None where there are none.
     """
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack(

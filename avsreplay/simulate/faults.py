@@ -485,7 +485,11 @@ def active(faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int) -> Activ
 
 
 def first_of_each_kind(now: Active) -> Active:
-    """Return the first fault of each kind, in their order."""
+    """Return the first fault of each kind, in their order.
+
+    Args:
+        now: the active faults with their numbers.
+    """
     first: dict[str, tuple[int, InjectedFault]] = {}
     for number, each in now:
         first.setdefault(each.kind, (number, each))
@@ -493,7 +497,11 @@ def first_of_each_kind(now: Active) -> Active:
 
 
 def in_order_of_action(now: Active) -> list[tuple[int, Fault]]:
-    """Return faults in the order in which they act; those of one kind keep their order."""
+    """Return faults in the order in which they act; those of one kind keep their order.
+
+    Args:
+        now: the active faults with their numbers.
+    """
     found = [(number, each.fault()) for number, each in now]
     return sorted(found, key=lambda item: (item[1].stage, item[1].name))
 
@@ -501,6 +509,9 @@ def in_order_of_action(now: Active) -> list[tuple[int, Fault]]:
 def view_of(directions: Array) -> Array:
     """Rotation (3, 3) from the frame of the scan to one whose +z axis is the mean direction of the
     points.
+
+    Args:
+        directions: unit directions (n, 3) of the points in the frame of the scan.
     """
     mean = directions.mean(axis=0)
     z = mean / np.sqrt(mean @ mean) if mean @ mean > 0.0 else np.array([0.0, 0.0, 1.0])

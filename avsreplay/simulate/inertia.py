@@ -98,6 +98,11 @@ def principal(inertia_c: ArrayLike, centre_c: ArrayLike) -> Body:
 def with_axes(moments: ArrayLike, q_bc: ArrayLike, centre_c: ArrayLike) -> Body:
     """Return the body of given principal moments (3,) [m2], axes mu (4,) and mass centre (3,) in
     {C} [m].
+
+    Args:
+        moments: principal moments (3,) over the mass [m2].
+        q_bc: attitude (4,) of {C} in {B}.
+        centre_c: mass centre (3,) in {C} [m].
     """
     R_bc = geometry.matrix(geometry.normalise(q_bc))
     inertia = R_bc.T @ np.diag(np.asarray(moments, dtype=np.float64)) @ R_bc

@@ -133,7 +133,11 @@ class MotionParams(Settings):
 
 
 class Motion:
-    """The motion of a body over [0, span_s]."""
+    """The motion of a body over [0, span_s].
+
+    Attributes:
+        step_starts_s: (k,) begin of each step of the integration [s].
+    """
 
     def __init__(
         self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator
@@ -147,7 +151,7 @@ class Motion:
             rng: Generator of the disturbances.
         """
         self._body = body
-        self._starts, self._coefficients = _integrate(body, params, span_s, rng)
+        self.step_starts_s, self._coefficients = _integrate(body, params, span_s, rng)
 
     def states(self, times_s: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """Return attitude, angular rate, position and velocity.
@@ -161,9 +165,11 @@ class Motion:
         """
         times = np.asarray(times_s, dtype=np.float64)
         step = np.clip(
-            np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1
+            np.searchsorted(self.step_starts_s, times, side="right") - 1,
+            0,
+            len(self.step_starts_s) - 1,
         )
-        tau = (times - self._starts[step])[:, None]
+        tau = (times - self.step_starts_s[step])[:, None]
         value = np.zeros((len(times), 13))
         # ``take`` copies the column of all steps that it is given: those of one scan are few.
         first, last = (step.min(), step.max()) if len(step) else (0, 0)

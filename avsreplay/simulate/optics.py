@@ -94,6 +94,12 @@ class FaceOptics:
     ) -> Array:
         """Intensity (n,) of returns from these faces (n,), by cosine of incidence (n,) and range
         (n,) [m].
+
+        Args:
+            faces: number of the face of each return (n,).
+            cosines: cosine of incidence (n,).
+            ranges: (n,) [m].
+            reference_m: range at which the intensity is the reflectance [m].
         """
         angle = np.arccos(np.minimum(cosines, 1.0))
         lobe = self.specular[faces] * np.exp(-np.square(angle / self.width_rad[faces]))
@@ -235,7 +241,11 @@ class TracedRays:
         )
 
     def chosen(self, index: NDArray[np.intp]) -> TracedRays:
-        """Return some of the rays."""
+        """Return some of the rays.
+
+        Args:
+            index: their numbers (k,).
+        """
         return TracedRays(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
@@ -312,6 +322,11 @@ def crosstalk(ranges: Array, intensities: Array, ratio: float) -> Array:
 
     The sum of two returns of a continuous-wave instrument has, to first order in their difference,
     the mean of their ranges weighted by intensity.
+
+    Args:
+        ranges: (n,) [m].
+        intensities: (n,) of the returns.
+        ratio: share of the strongest return that is added to every return.
     """
     if not len(ranges):
         return ranges
@@ -344,7 +359,12 @@ def bloomed(
 
 
 def part_of(surface: Surface, faces: NDArray[np.intp]) -> Surface:
-    """Return the mesh with some of its faces only."""
+    """Return the mesh with some of its faces only.
+
+    Args:
+        surface: the mesh.
+        faces: numbers (k,) of the faces.
+    """
     return (
         surface
         if len(faces) == len(surface.faces)

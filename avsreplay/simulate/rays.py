@@ -53,6 +53,14 @@ def ray_grid(
     mirrors, row by row from the top left. A Lissajous figure has as many rays as columns times
     rows. A spinning scanner measures column by column from the left; its rays are uniform in
     azimuth and elevation.
+
+    Args:
+        pattern: order in which the rays are measured.
+        view: shape of the field of view.
+        fov_deg: width and height of the field of view [deg].
+        rays: number of columns and rows.
+        lissajous: frequencies of the figure across and down.
+        scan_s: duration of a scan [s].
     """
     (across, down), (columns, rows) = fov_deg, rays
     halves = [math.radians(0.5 * across), math.radians(0.5 * down)]

@@ -63,7 +63,11 @@ class Returns:
     dropouts: Array
 
     def keep(self, chosen: NDArray[Any]) -> Returns:
-        """Return the returns that a mask (n,) or indices select."""
+        """Return the returns that a mask (n,) or indices select.
+
+        Args:
+            chosen: mask (n,) or numbers (k,).
+        """
         index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         return Returns(*(getattr(self, field.name).take(index, axis=0) for field in fields(self)))
 
@@ -92,6 +96,9 @@ class Scanner:
         motion: Of the target.
         centre_c: (3,) centre of the target's bounding sphere in {C} [m].
         radius_m: Its radius [m].
+        rays: Unit directions (k, n, 3) of k rays of each beam in the frame of the scanner; the
+            first is its centre.
+        times_s: (n,) when each ray is measured after the stamp [s].
     """
 
     def __init__(
@@ -114,10 +121,10 @@ class Scanner:
             for k, each in enumerate(appendages)
             for faces in [np.flatnonzero(owner == k)]
         ]
-        directions, self._times = ray_grid(
+        directions, self.times_s = ray_grid(
             p.pattern, p.view, p.fov_deg, p.rays, p.lissajous, p.scan_s
         )
-        self._rays = beam(directions, 1e-3 * params.divergence_mrad)
+        self.rays = beam(directions, 1e-3 * params.divergence_mrad)
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
         reach = [float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))]
@@ -149,24 +156,24 @@ class Scanner:
             plumes: plumes that are present, each with the generator of its particles.
             limbs: the sunlit Earth where it is present, with the generator of its false returns.
         """
-        times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times
+        times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self.times_s
         target = self.motion.poses(times)
         poses = self._seen(target, times)
         near = self._may_hit(*poses)
-        found = [self._traced(self._caster, self._optics, poses, rays, near) for rays in self._rays]
+        found = [self._traced(self._caster, self._optics, poses, rays, near) for rays in self.rays]
         for each, caster, optics in self._flexible:
             placed = self._seen(each.placed(target, times), times)
-            for k, rays in enumerate(self._rays):
+            for k, rays in enumerate(self.rays):
                 found[k] = found[k].nearer(self._traced(caster, optics, placed, rays, near))
-        every = np.arange(len(self._times))
+        every = np.arange(len(self.times_s))
         for body in bodies:
             placed = self._seen(body.params.poses(times), times)
-            for k, rays in enumerate(self._rays):
+            for k, rays in enumerate(self.rays):
                 found[k] = found[k].nearer(
                     self._traced(body.caster, body.optics, placed, rays, every)
                 )
         for plume, rng in plumes:
-            for k, rays in enumerate(self._rays):
+            for k, rays in enumerate(self.rays):
                 found[k] = found[k].nearer(self._particles(plume, found[k], rays, rng))
         if bodies or plumes or self.params.bloom_deg > 0.0:
             near = every
@@ -185,6 +192,10 @@ class Scanner:
         """Factor on the 1 sigma of the ranges by stray light of the Earth at a time [s].
 
         The variance grows in proportion to the share of the beams that look at it.
+
+        Args:
+            t_s: time [s after the first scan].
+            limbs: the limbs of the Earth.
         """
         times = np.array([t_s])
         return math.sqrt(
@@ -195,7 +206,7 @@ class Scanner:
     def _behind(self, limb: Limb, times: Array) -> NDArray[np.bool_]:
         """Whether each beam looks at the Earth."""
         R_wa = np.eye(3)[None] if self._camera is None else self._camera.poses(times)[0]
-        return limb.behind(self._rays[0], times, R_wa)
+        return limb.behind(self.rays[0], times, R_wa)
 
     def _false(self, beams: NDArray[np.intp], ratio: float, rng: np.random.Generator) -> Returns:
         """False returns of some of these beams (n,), with the least intensity at any range."""
@@ -204,7 +215,7 @@ class Scanner:
         n = len(beams)
         ranges, least = rng.uniform(p.range_min_m, p.range_max_m, n), np.full(n, p.intensity_min)
         return Returns(
-            self._rays[0][beams], ranges, self._times[beams], np.ones(n), least, np.zeros(n)
+            self.rays[0][beams], ranges, self.times_s[beams], np.ones(n), least, np.zeros(n)
         )
 
     def _particles(
@@ -229,13 +240,13 @@ class Scanner:
             )
         if p.bloom_deg > 0.0:
             strong = returns.keep(returns.intensities >= p.saturation)
-            ray, source = bloomed(self._rays[0], strong.directions, math.radians(p.bloom_deg))
+            ray, source = bloomed(self.rays[0], strong.directions, math.radians(p.bloom_deg))
             if len(ray):
                 from scipy.spatial import cKDTree  # takes 0.2 s to import
 
-                inside = np.asarray(cKDTree(self._rays[0][ray]).query(returns.directions)[0]) < 1e-9
+                inside = np.asarray(cKDTree(self.rays[0][ray]).query(returns.directions)[0]) < 1e-9
                 bloom = replace(
-                    strong.keep(source), directions=self._rays[0][ray], times_s=self._times[ray]
+                    strong.keep(source), directions=self.rays[0][ray], times_s=self.times_s[ray]
                 )
                 returns = returns.keep(~inside).joined(bloom)
         return returns
@@ -259,11 +270,11 @@ class Scanner:
         else:
             groups = kept_returns(ranges, intensities, self.params.merge_m, self.params.returns)
         found = None
-        directions = self._rays[0].take(near, axis=0)
+        directions = self.rays[0].take(near, axis=0)
         for mean, intensity, weights in groups:
             cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
             dropouts = (weights * np.stack([r.dropouts for r in rays])).sum(axis=0)
-            each = Returns(directions, mean, self._times[near], cosines, intensity, dropouts)
+            each = Returns(directions, mean, self.times_s[near], cosines, intensity, dropouts)
             found = each if found is None else found.joined(each.keep(np.isfinite(mean)))
         assert found is not None
         return found
@@ -301,7 +312,13 @@ class Scanner:
     def disturb(
         self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0
     ) -> Returns:
-        """Add range noise and outliers, remove dropouts, and quantise the ranges."""
+        """Add range noise and outliers, remove dropouts, and quantise the ranges.
+
+        Args:
+            returns: the returns without errors.
+            rng: generator of the random numbers.
+            noise_factor: factor of the 1 sigma of the ranges.
+        """
         p, n = self.params, len(returns.ranges)
         noise_m = noise_factor * p.noise_m * np.ones(n)
         if p.noise_growth > 0.0:
@@ -326,7 +343,7 @@ class Scanner:
     def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
         """The rays that pass through the bounding sphere of the target."""
         centre = rotate(R_ac, self.centre_c) + t_ac
-        along = dot(self._rays[0], centre)
+        along = dot(self.rays[0], centre)
         aside = dot(centre, centre) - along * along
         spread = 1e-3 * self.params.divergence_mrad * np.maximum(along, 0.0)
         return np.flatnonzero(aside <= (1.001 * self._reach_m + spread) ** 2)

@@ -220,6 +220,12 @@ def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator
     """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20
     error states.
 
+    Args:
+        start: the offsets and the 1 sigma.
+        truth: the true state at the instant.
+        t_ns: the instant [ns].
+        rng: generator of the random numbers.
+
     Raises:
         UsageError: the given offset leads to inertia ratios that no body has.
     """

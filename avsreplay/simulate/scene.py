@@ -60,7 +60,11 @@ class Presence(Settings):
             raise ValueError("it needs a name")
 
     def present(self, t_s: float) -> bool:
-        """Return whether it is present at a time [s after the instant of the first scan]."""
+        """Return whether it is present at a time [s after the instant of the first scan].
+
+        Args:
+            t_s: time [s after the first scan].
+        """
         return self.start_s <= t_s and (
             self.duration_s is None or t_s < self.start_s + self.duration_s
         )
@@ -123,7 +127,11 @@ class SceneObject(Presence):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
 
     def poses(self, times_s: Array) -> tuple[Array, Array]:
-        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s]."""
+        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s].
+
+        Args:
+            times_s: (n,) [s after the first scan].
+        """
         turn = geometry.exp(times_s[:, None] * np.array(self.rate_radps))
         R_as = geometry.matrix(
             geometry.multiply(turn, geometry.normalise(np.array([self.attitude_xyzw])))
@@ -283,7 +291,12 @@ class Appendage(Settings):
             raise ValueError(f"axis_c = {list(self.axis_c)} is not a unit vector")
 
     def placed(self, target: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:
-        """Poses (n, 3, 3), (n, 3) of the part in {A} from those of the target at times (n,) [s]."""
+        """Poses (n, 3, 3), (n, 3) of the part in {A} from those of the target at times (n,) [s].
+
+        Args:
+            target: rotations (n, 3, 3) and positions (n, 3) of {C} in {A} [m].
+            times_s: (n,) [s after the first scan].
+        """
         R_ac, t_ac = target
         phase = 2.0 * math.pi * self.frequency_hz * times_s + math.radians(self.phase_deg)
         angle = math.radians(self.amplitude_deg) * np.sin(phase)
@@ -297,6 +310,10 @@ class Appendage(Settings):
 def appendage_faces(surface: Surface, appendages: Sequence[Appendage]) -> NDArray[np.int64]:
     """The number of the appendage (m,) to which each face belongs, -1 for the rigid part; of
     several the last.
+
+    Args:
+        surface: the model of the target.
+        appendages: the moving parts.
 
     Raises:
         UsageError: no face lies in the box of an appendage.
@@ -349,6 +366,9 @@ class MovingCamera:
     def poses(self, times_s: Array) -> tuple[Array, Array]:
         """Rotations R_wa (n, 3, 3) and positions (n, 3) in the fixed frame [m] at times (n,)
         [s].
+
+        Args:
+            times_s: (n,) [s after the first scan].
         """
         p = self.params
         swing = np.sin(2.0 * math.pi * p.frequency_hz * times_s[:, None] + self.phases)
@@ -358,12 +378,21 @@ class MovingCamera:
         return R, times_s[:, None] * np.array(p.velocity_mps) + p.vibration_m * swing[:, :3]
 
     def pose(self, t_s: float) -> Pose:
-        """Return the pose T_wa at a time [s]."""
+        """Return the pose T_wa at a time [s].
+
+        Args:
+            t_s: time [s after the first scan].
+        """
         R, t = self.poses(np.array([t_s]))
         return Pose(geometry.quaternion(R[0]), t[0])
 
     def reported(self, t_s: float, rng: np.random.Generator) -> Pose:
-        """Return the pose that the topic reports, with its error."""
+        """Return the pose that the topic reports, with its error.
+
+        Args:
+            t_s: time [s after the first scan].
+            rng: generator of the errors.
+        """
         p, true = self.params, self.pose(t_s)
         error = geometry.exp(math.radians(p.pose_std_deg) * rng.standard_normal(3))
         return Pose(
@@ -385,6 +414,11 @@ def scene_bodies(
 ) -> list[SceneBody]:
     """The objects of a scenario; ``meshes`` has the surface of every ``model`` that one of
     them names.
+
+    Args:
+        objects: the objects.
+        meshes: the surface of every ``model`` that one of them names.
+        engine: what casts the rays.
     """
     bodies = []
     for params in objects:

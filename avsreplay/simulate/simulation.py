@@ -46,8 +46,18 @@ __all__ = [
 # time of the first scan of every simulated log, fixed so that logs are reproducible
 SIMULATED_EPOCH_NS = 1_700_000_000_000_000_000
 T = TypeVar("T")
-_NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", "plume", "limb"
-_STREAMS = {name: k for k, name in enumerate(_NAMES)}
+_GENERATOR_NAMES = (
+    "motion",
+    "start",
+    "noise",
+    "fault",
+    "plate",
+    "camera",
+    "camera_pose",
+    "plume",
+    "limb",
+)
+_STREAMS = {name: k for k, name in enumerate(_GENERATOR_NAMES)}
 
 
 @value_class

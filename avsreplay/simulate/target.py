@@ -101,6 +101,10 @@ def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
 def body(params: TargetParams, surface: Surface) -> Body:
     """Mass properties of the target: those of the scenario where given, else those of the mesh.
 
+    Args:
+        params: the target of the scenario.
+        surface: its mesh.
+
     Raises:
         UsageError: They are needed from a mesh that has none (see ``body_of``), or the body has no
             thickness.
@@ -202,7 +206,12 @@ def extrusion(outline: Sequence[tuple[float, float]], x0: float, x1: float) -> S
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Solid:
-    """The box between two corners (3,) [m], two triangles a side."""
+    """The box between two corners (3,) [m], two triangles a side.
+
+    Args:
+        low: corner (3,) with the smallest coordinates [m].
+        high: corner (3,) with the largest coordinates [m].
+    """
     (x0, y0, z0), (x1, y1, z1) = (
         np.asarray(low, dtype=np.float64),
         np.asarray(high, dtype=np.float64),
@@ -216,7 +225,15 @@ def box(low: ArrayLike, high: ArrayLike) -> Solid:
 
 
 def frustum(x0: float, r0: float, x1: float, r1: float, sides: int = 24) -> Solid:
-    """A closed cone frustum about x from radius r0 at x0 to r1 at x1 > x0 [m]."""
+    """A closed cone frustum about x from radius r0 at x0 to r1 at x1 > x0 [m].
+
+    Args:
+        x0: begin along x [m].
+        r0: radius there [m].
+        x1: end along x, above ``x0`` [m].
+        r1: radius there [m].
+        sides: number of sides of the polygon that stands for a circle.
+    """
     return _tube([[(x0, 0.0, 0.0)], _ring(x0, r0, sides), _ring(x1, r1, sides), [(x1, 0.0, 0.0)]])
 
 
@@ -225,6 +242,15 @@ def shell(
 ) -> Solid:
     """An open cup about x: radius r0 at x0 and r1 at its opening x1, thickness ``wall``,
     bottom at x0 + floor [m].
+
+    Args:
+        x0: begin along x [m].
+        r0: outer radius there [m].
+        x1: opening along x [m].
+        r1: outer radius there [m].
+        wall: thickness of the wall [m].
+        floor: thickness of the bottom [m].
+        sides: number of sides of the polygon that stands for a circle.
     """
     outer0, outer1 = _ring(x0, r0, sides), _ring(x1, r1, sides)
     inner1, inner0 = _ring(x1, r1 - wall, sides), _ring(x0 + floor, r0 - wall, sides)
@@ -234,6 +260,11 @@ def shell(
 def adapter(r0: float, r1: float, half_height: float) -> Solid:
     """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m]; wall 5 %
     of the smaller one.
+
+    Args:
+        r0: radius at one end [m].
+        r1: radius at the other end [m].
+        half_height: half of the height [m].
     """
     wall, low, high = 0.05 * min(r0, r1), -half_height, half_height
     outer, inner = _ring(low, r0, 48), _ring(low, r0 - wall, 48)

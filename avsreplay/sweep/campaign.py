@@ -20,8 +20,8 @@ from avsreplay import toml_document
 from avsreplay.settings import Settings, setting
 
 MAX_REPEATS = 10_000_000
-SCORES = ("rms_m", "alpha_m", "inlier_ratio", "nis", "nees", "pos_err_m", "rot_err_deg")
-SCAN_COLUMNS = ("seq", "fault", "harmful", "gamma", *SCORES)
+RECORDED_SCORES = ("rms_m", "alpha_m", "inlier_ratio", "nis", "nees", "pos_err_m", "rot_err_deg")
+SCAN_COLUMNS = ("seq", "fault", "harmful", "gamma", *RECORDED_SCORES)
 PREFIXES = ("scenario.", "run.")
 
 

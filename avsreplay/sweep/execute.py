@@ -37,7 +37,7 @@ from avsreplay.rows import Row
 from avsreplay.run import Job, Listener, ReplayedScan, Run
 from avsreplay.saved_result import of_run
 from avsreplay.simulate.scenario import scenario_of
-from avsreplay.sweep.campaign import SCORES, RunResult
+from avsreplay.sweep.campaign import RECORDED_SCORES, RunResult
 from avsreplay.sweep.expansion import Expansion, Point, Task
 from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
 from avsreplay.sweep.page import build_sweep_page
@@ -59,7 +59,12 @@ def run_task(task: Task) -> RunResult:
 
 
 def log_of(task: Task, folder: Path) -> Path:
-    """The log of a run: the one it names, or its scenario recorded into ``folder``."""
+    """The log of a run: the one it names, or its scenario recorded into ``folder``.
+
+    Args:
+        task: the run.
+        folder: where a scenario is recorded.
+    """
     if task.log:
         return Path(task.log)
     scenario = scenario_of(toml_document.parse(task.scenario, "scenario"), folder=Path(task.folder))
@@ -133,7 +138,7 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
     alpha = None
     if row.innov_m is not None and row.innov_deg is not None:
         alpha = float(np.hypot(row.innov_m, length_m * np.radians(row.innov_deg)))
-    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in SCORES)
+    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in RECORDED_SCORES)
     return (row.seq, row.fault, harmful, row.gamma, *scores)
 
 
@@ -215,7 +220,7 @@ def run_tasks(
     if workers == 0 and scheduler is None:
         yield from _here(tasks, work)
         return
-    with _client(workers, scheduler, dashboard) as client:
+    with connected(workers, scheduler, dashboard) as client:
         yield from _on(client, iter(tasks), work)
 
 
@@ -235,11 +240,21 @@ def _here(tasks: Iterable[T], work: Callable[[T], RunResult]) -> Iterator[RunRes
         for task in tasks:
             future = pool.submit(work, task)
             error = future.exception()
-            yield future.result() if error is None else _crashed(task.id, error)
+            yield future.result() if error is None else crashed(task.id, error)
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+def connected(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
+    """Connect to a Dask scheduler, or start one with workers on this machine, as a context.
+
+    Args:
+        workers: number of worker processes, where one is started.
+        scheduler: address of a running scheduler; None starts one.
+        dashboard: address of the dashboard of one that is started.
+
+    Raises:
+        UnreadableInput: the scheduler does not answer.
+    """
     dask = _distributed()
     if scheduler is not None:
         try:
@@ -307,12 +322,16 @@ def _collected(future: Any) -> RunResult:
     if future.status == "finished":
         outcome: RunResult = future.result()
         return outcome
-    return _crashed(str(future.key).removeprefix("run-"), future.exception())
+    return crashed(str(future.key).removeprefix("run-"), future.exception())
 
 
-def _crashed(task_id: str, error: BaseException | None) -> RunResult:
-    """The result of a run that raised: kind and first line of the error, without addresses
-    that differ between runs.
+def crashed(task_id: str, error: BaseException | None) -> RunResult:
+    """Return the result of a run that raised: kind and first line of the error, without addresses,
+    which differ between runs.
+
+    Args:
+        task_id: the run.
+        error: what it raised.
     """
     if type(error).__name__ == "KilledWorker":
         return RunResult(task_id, "crashed", "the worker process died repeatedly")

@@ -30,7 +30,7 @@ from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
 RESULT_FORMAT = 4  # format of a run's result; a result with another format is computed again
-_NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
+_NAMED_TABLES = ("scenario", "log", "case")  # axes that select a file or a case, not a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,11 @@ class Expansion:
         of_case: Mapping[str, Any] = next(
             (case.set for case in campaign.case if case.name == values.get("case")), {}
         )
-        every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in _NAMED}}
+        every = {
+            **campaign.set,
+            **of_case,
+            **{k: v for k, v in values.items() if k not in _NAMED_TABLES},
+        }
         name = values.get("scenario", campaign.scenario)
         home = (folder / name).parent
         scenario = "" if campaign.logs else self._scenario(name, every, repeat)

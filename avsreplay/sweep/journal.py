@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import output_path
-from avsreplay.result_dir import OWN
+from avsreplay.result_dir import OWN_FILES
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 
 
@@ -68,7 +68,13 @@ def write_scans(path: Path, rows: Sequence[tuple[Any, ...]]) -> None:
 
 
 def write_batches(path: Path, schema: Any, batches: Iterable[Sequence[tuple[Any, ...]]]) -> None:
-    """Write rows in batches to a file that appears once it is complete."""
+    """Write rows in batches to a file that appears once it is complete.
+
+    Args:
+        path: the file.
+        schema: the pyarrow schema of a row.
+        batches: rows as tuples in the order of the schema.
+    """
     pa, pq = arrow()
     with (
         output_path(path) as part,
@@ -145,7 +151,7 @@ class Journal:
         self._stream: BinaryIO | None = None
         self._lock: BinaryIO | None = None
         self._guarded(self._read)
-        foreign = [name for name in (*RESULTS, *sorted(OWN)) if (folder / name).exists()]
+        foreign = [name for name in (*RESULTS, *sorted(OWN_FILES)) if (folder / name).exists()]
         if foreign and not self.path.exists():
             hint = "name another directory; it is left alone"
             raise UsageError(

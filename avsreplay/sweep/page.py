@@ -13,8 +13,8 @@ from markupsafe import Markup
 from avsreplay.report.episodes import Peak
 from avsreplay.report.page import Part, Section, build_html, render
 from avsreplay.report.table import Table
-from avsreplay.sweep.statistics import NONE, FaultKind, Quantiles, Rate, Roc, Typical
-from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, WorstRun
+from avsreplay.sweep.statistics import NO_HYPOTHESIS, FaultKind, Quantiles, Rate, Roc, Typical
+from avsreplay.sweep.summary import CAMPAIGN_METRICS, Cell, Detector, SweepSummary, WorstRun
 
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its
 # own
@@ -25,7 +25,7 @@ _CHART_WIDTH_PX = 460
 _CHART_ROW_PX = 44
 _CHART_HEAD_PX = 52
 _NAME_CHARACTERS = 62  # of the name of a combination over its line
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
+_TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # round distances of ticks, times a power of ten
 _LEAST_FALSE_RATE = 1e-4  # left end of the ROC's logarithmic axis
 # The square of the ROC.
 _ROC_LEFT_PX = 60
@@ -65,7 +65,7 @@ def build_sweep_page(summary: SweepSummary) -> str:
     cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
     figures = [
         _spans(title, [(_named(n, c), c.metrics.get(name)) for n, c in cells])
-        for name, title in HEADLINES.items()
+        for name, title in CAMPAIGN_METRICS.items()
     ]
     parts: list[Part] = [
         combination_table(cells),
@@ -88,6 +88,10 @@ def build_sweep_page(summary: SweepSummary) -> str:
 def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
     """A row per run that did not end well or has the largest errors, with ``digits`` of its id (all
     if None).
+
+    Args:
+        worst: the runs, worst first.
+        digits: characters of an id; None: all.
     """
     rows = tuple(
         (
@@ -110,7 +114,11 @@ def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
 
 
 def words(values: Mapping[str, Any]) -> str:
-    """A combination in words, without the prefixes of its keys."""
+    """A combination in words, without the prefixes of its keys.
+
+    Args:
+        values: key and value of each axis.
+    """
     pairs = (
         f"{key.removeprefix('scenario.').removeprefix('run.')}={value}"
         for key, value in values.items()
@@ -128,7 +136,11 @@ def _status_line(summary: SweepSummary) -> str:
 
 
 def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
-    """A row per combination: what was set, runs done, NEES at their ends."""
+    """A row per combination: what was set, runs done, NEES at their ends.
+
+    Args:
+        cells: number and content of each combination.
+    """
     rows = []
     for number, cell in cells:
         nees = cell.nees
@@ -141,7 +153,11 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
 
 def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
-    """A row per combination: share of the runs that meet each criterion, with its 95 % interval."""
+    """A row per combination: share of the runs that meet each criterion, with its 95 % interval.
+
+    Args:
+        cells: number and content of each combination.
+    """
     names = list(cells[0][1].rates) if cells else []
     rows = tuple(
         (_named(number, cell), *(_share(cell.rates[name]) for name in names))
@@ -151,14 +167,19 @@ def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
 
 def cell_table(number: int, cell: Cell) -> Table:
-    """Metrics and success rates of one combination."""
+    """Metrics and success rates of one combination.
+
+    Args:
+        number: number of the combination.
+        cell: its runs.
+    """
     rows: list[tuple[str, ...]] = []
     for name, found in cell.metrics.items():
         if found is not None:
             points = (f"{v:.3g}" for v in (found.q05, found.median, found.q95))
             rows.append(
                 (
-                    HEADLINES[name],
+                    CAMPAIGN_METRICS[name],
                     str(found.count),
                     *points,
                     _interval(found.median_low, found.median_high, ".3g"),
@@ -187,7 +208,11 @@ def cell_table(number: int, cell: Cell) -> Table:
 
 
 def detector_table(detector: Detector) -> Table:
-    """The rule in force, and each score as the only test at 1 % false alarms."""
+    """The rule in force, and each score as the only test at 1 % false alarms.
+
+    Args:
+        detector: the fault detector of a campaign.
+    """
     rows = []
     if detector.detected is not None and detector.false is not None:
         rows.append(("rule in force", _share(detector.detected), _share(detector.false), "", ""))
@@ -235,7 +260,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     """
     span = high - low or abs(high) or 1.0
     power = 10.0 ** math.floor(math.log10(span / 5.0))
-    step = next(s * power for s in _STEPS if s * power >= span / 5.0)
+    step = next(s * power for s in _TICK_STEPS if s * power >= span / 5.0)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     return [float(f"{k * step:.12g}") for k in range(first, max(last, first + 1) + 1)]
 
@@ -324,17 +349,25 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
 
     Times are in s; errors are position [mm] and rotation [deg] of the estimate. The rows of kind
     "none" come first: flagged scans in these rows are false alarms.
+
+    Args:
+        cells: number and content of each combination.
     """
     title = (
         "By kind of fault: times in s, errors in mm and deg; ~: usable by its label; none:"
         " outside every window"
     )
-    injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)
+    injected = any(cell.kinds.keys() - {NO_HYPOTHESIS} for _, cell in cells)
     return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else (), wide=True)
 
 
 def columns_of(table: Table, kept: Sequence[int]) -> Table:
-    """Some columns of a table."""
+    """Some columns of a table.
+
+    Args:
+        table: the table.
+        kept: numbers of the columns, in order.
+    """
     heads, align = tuple(table.heads[k] for k in kept), "".join(table.letter(k) for k in kept)
     return replace(
         table,
@@ -346,14 +379,14 @@ def columns_of(table: Table, kept: Sequence[int]) -> Table:
 
 def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:
     names = {name for _, cell in cells for name in cell.kinds}
-    for name in sorted(names, key=lambda name: (name != NONE, name)):
+    for name in sorted(names, key=lambda name: (name != NO_HYPOTHESIS, name)):
         for number, cell in cells:
             if name in cell.kinds:
                 yield _kind_row(name, number, cell.kinds[name])
 
 
 def _kind_row(name: str, number: int, kind: FaultKind) -> tuple[str, ...]:
-    harmless = name != NONE and not kind.harmful
+    harmless = name != NO_HYPOTHESIS and not kind.harmful
     return (
         f"{name} ~" if harmless else name,
         str(number),

@@ -43,6 +43,9 @@ class Quantiles:
 def quantiles(values: Sequence[float]) -> Quantiles | None:
     """Quantiles by linear interpolation, the interval of the median by order statistics; None
     without a value.
+
+    Args:
+        values: the values of the runs.
     """
     if not len(values):
         return None
@@ -68,7 +71,11 @@ class Typical:
 
 
 def typical(values: Sequence[float]) -> Typical | None:
-    """Median and largest value; None without a value."""
+    """Median and largest value; None without a value.
+
+    Args:
+        values: the values of the runs.
+    """
     return (
         Typical(len(values), float(np.median(values)), float(max(values))) if len(values) else None
     )
@@ -86,7 +93,12 @@ class Rate:
 
 
 def rate(successes: int, count: int) -> Rate | None:
-    """The share of successes with Wilson's score interval; None for no run."""
+    """The share of successes with Wilson's score interval; None for no run.
+
+    Args:
+        successes: number of successes.
+        count: number of runs.
+    """
     if count == 0:
         return None
     if count == 1:
@@ -109,7 +121,12 @@ class RunConsistency:
 
 
 def consistency(nees: Sequence[float], dof: int) -> RunConsistency | None:
-    """The consistency of one NEES of ``dof`` states per run; None without a value."""
+    """The consistency of one NEES of ``dof`` states per run; None without a value.
+
+    Args:
+        nees: normalised errors squared at the ends of the runs.
+        dof: number of states in each.
+    """
     if not len(nees):
         return None
     from scipy.stats import chi2
@@ -154,7 +171,12 @@ class ScoreHistogram:
         self._counts = np.zeros((2, len(self.EDGES) + 1), dtype=np.int64)
 
     def add(self, score: float | None, harmful: bool) -> None:
-        """Count one scan; a larger score is worse."""
+        """Count one scan; a larger score is worse.
+
+        Args:
+            score: the score; None where the scan has none.
+            harmful: whether a harmful fault was injected.
+        """
         place = (
             len(self.EDGES)
             if score is None or math.isnan(score)
@@ -194,12 +216,17 @@ def _floats(values: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-NONE = "none"
-_PLAIN = tuple(f.name for f in dataclasses.fields(Episode) if not f.name.startswith("peak_"))
+NO_HYPOTHESIS = "none"
+_PLAIN_FIGURES = tuple(
+    f.name for f in dataclasses.fields(Episode) if not f.name.startswith("peak_")
+)
 _PEAKS = ("flagged", "used", "after")
-_ERRORS = tuple(f.name for f in dataclasses.fields(Peak))
-EPISODE_COLUMNS = (*_PLAIN, *(f"peak_{when}.{error}" for when in _PEAKS for error in _ERRORS))
-_TIMES = ("delay_s", "delay_scans", "recover_s", "recover_scans")
+_ERROR_FIGURES = tuple(f.name for f in dataclasses.fields(Peak))
+EPISODE_COLUMNS = (
+    *_PLAIN_FIGURES,
+    *(f"peak_{when}.{error}" for when in _PEAKS for error in _ERROR_FIGURES),
+)
+_TIME_FIGURES = ("delay_s", "delay_scans", "recover_s", "recover_scans")
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +271,11 @@ class FaultKind:
 
 
 def episode_lines(episodes: Iterable[Episode]) -> tuple[tuple[Any, ...], ...]:
-    """One tuple of plain values per window, in the order of EPISODE_COLUMNS."""
+    """One tuple of plain values per window, in the order of EPISODE_COLUMNS.
+
+    Args:
+        episodes: the windows of injected faults.
+    """
     return tuple(tuple(_at(settings.dump(e), name) for name in EPISODE_COLUMNS) for e in episodes)
 
 
@@ -261,7 +292,7 @@ class _Windows:
         self.harmful = False
         self.strengths, self.lengths = set[float](), set[float]()
         self.scans = self.flagged = self.episodes = self.detected = self.lost = 0
-        self.times: dict[str, list[float]] = {name: [] for name in _TIMES}
+        self.times: dict[str, list[float]] = {name: [] for name in _TIME_FIGURES}
         self.peaks: dict[str, float] = {}
 
     def add(self, window: Mapping[str, Any]) -> None:
@@ -278,17 +309,17 @@ class _Windows:
         self.take_peaks(window)
 
     def take_peaks(self, found: Mapping[str, Any], prefix: str = "") -> None:
-        for name in (f"peak_{when}.{error}" for when in _PEAKS for error in _ERRORS):
+        for name in (f"peak_{when}.{error}" for when in _PEAKS for error in _ERROR_FIGURES):
             value = found.get(prefix + name)
             if value is not None:
                 self.peaks[name] = max(value, self.peaks.get(name, value))
 
     def result(self) -> FaultKind:
         delay_s, delay_scans, recovery_s, recovery_scans = (
-            typical(self.times[name]) for name in _TIMES
+            typical(self.times[name]) for name in _TIME_FIGURES
         )
         flagged, used, after = (
-            Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERRORS)) for when in _PEAKS
+            Peak(*(self.peaks.get(f"peak_{when}.{e}") for e in _ERROR_FIGURES)) for when in _PEAKS
         )
         return FaultKind(
             harmful=self.harmful,
@@ -326,7 +357,7 @@ class FaultKinds:
             window = dict(zip(EPISODE_COLUMNS, line, strict=True))
             self._kinds.setdefault(window["kind"], _Windows()).add(window)
         if metrics.get("faults.known"):
-            none = self._kinds.setdefault(NONE, _Windows())
+            none = self._kinds.setdefault(NO_HYPOTHESIS, _Windows())
             none.scans += metrics["faults.unlabelled"]
             none.flagged += metrics["faults.false_alarms"]
             none.take_peaks(metrics, "faults.")

@@ -17,7 +17,7 @@ from avsreplay.sweep import statistics
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult, SuccessCriterion
 from avsreplay.sweep.expansion import Expansion, Point
 
-HEADLINES = {
+CAMPAIGN_METRICS = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",
     "pose_healthy.rotation_deg.rmse": "rotation error, healthy scans [deg]",
     "worst_coast.pos_err_m": "position error, worst coasting [m]",
@@ -32,7 +32,7 @@ CRITERIA = (
     SuccessCriterion("no fault missed", "faults.missed", max=0),
     SuccessCriterion("no false alarm", "faults.false_alarms", max=0),
 )
-SCORES = {
+SCORE_COLUMNS = {
     "rms_m": "rms_m",
     "alpha_m": "alpha_m",
     "outlier_ratio": "inlier_ratio",
@@ -40,7 +40,10 @@ SCORES = {
 }  # score: its column
 FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
 LISTED_RUNS = 5  # number of runs that are listed
-_ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
+_WORST_RUN_METRICS = {
+    "pose_healthy.position_m.max": "healthy scan",
+    "worst_coast.pos_err_m": "coasting",
+}
 _BAD = ("crashed", "failed", "lossy")  # worst status first
 
 
@@ -52,7 +55,7 @@ class Cell:
         values: What was set, by key.
         runs: Number of finished runs.
         status: Number of runs by status.
-        metrics: Quantiles of HEADLINES.
+        metrics: Quantiles of CAMPAIGN_METRICS.
         rates: Share of the finished runs that meet each criterion, and of all their whole flights
             that end in each way.
         nees: NEES at the last scan of each run.
@@ -117,7 +120,7 @@ class SweepSummary:
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON; a number that is not finite is null."""
-        plain: dict[str, Any] = _finite(settings.dump(self))
+        plain: dict[str, Any] = without_infinities(settings.dump(self))
         return plain
 
 
@@ -131,7 +134,12 @@ class CampaignFold:
         self._worst: list[tuple[tuple[float, ...], WorstRun]] = []
 
     def add(self, point: Point, result: RunResult) -> None:
-        """Add one finished run."""
+        """Add one finished run.
+
+        Args:
+            point: the combination of the run.
+            result: its result.
+        """
         self._cells[point.cell].add(result, self._criteria)
         badness, reason = _badness(result)
         run = WorstRun(result.id, point.cell, point.repeat, point.seed, result.status, reason)
@@ -141,7 +149,11 @@ class CampaignFold:
                 heapq.heappop(self._worst)
 
     def result(self, detector: Detector | None) -> SweepSummary:
-        """The summary of the runs added."""
+        """The summary of the runs added.
+
+        Args:
+            detector: the curves of the detector; None where no scans are kept.
+        """
         status = sum((cell.status for cell in self._cells), Counter[str]())
         return SweepSummary(
             name=self._plan.loaded.campaign.name,
@@ -162,7 +174,9 @@ class CampaignFold:
 class _CellFold:
     def __init__(self) -> None:
         self.status: Counter[str] = Counter()
-        self._numbers: dict[str, list[float]] = {name: [] for name in (*HEADLINES, "end.nees")}
+        self._numbers: dict[str, list[float]] = {
+            name: [] for name in (*CAMPAIGN_METRICS, "end.nees")
+        }
         self._met: Counter[str] = Counter()
         self._kinds = statistics.FaultKinds()
         self._flights: Counter[str] = Counter()
@@ -189,7 +203,7 @@ class _CellFold:
             values=values,
             runs=runs,
             status=dict(sorted(self.status.items())),
-            metrics={name: statistics.quantiles(self._numbers[name]) for name in HEADLINES},
+            metrics={name: statistics.quantiles(self._numbers[name]) for name in CAMPAIGN_METRICS},
             rates=rates | (flown if count else {}),
             nees=statistics.consistency(self._numbers["end.nees"], STATES),
             kinds=self._kinds.result(),
@@ -205,7 +219,9 @@ def _badness(result: RunResult) -> tuple[tuple[float, float], str]:
     """Sort key, larger for a worse run, and the reason in words."""
     metrics = result.metrics or {}
     known = [
-        (metrics[name], what) for name, what in _ERRORS.items() if metrics.get(name) is not None
+        (metrics[name], what)
+        for name, what in _WORST_RUN_METRICS.items()
+        if metrics.get(name) is not None
     ]
     error, what = max(known, default=(0.0, ""))
     rank = len(_BAD) - _BAD.index(result.status) if result.status in _BAD else 0
@@ -219,7 +235,7 @@ class DetectorFold:
     PLACE: ClassVar[dict[str, int]] = {name: place for place, name in enumerate(SCAN_COLUMNS)}
 
     def __init__(self) -> None:
-        self._curves = {name: statistics.ScoreHistogram() for name in SCORES}
+        self._curves = {name: statistics.ScoreHistogram() for name in SCORE_COLUMNS}
         self._flagged: Counter[tuple[bool, bool]] = Counter()
 
     def add(self, scans: Iterable[Sequence[Any]]) -> None:
@@ -227,7 +243,7 @@ class DetectorFold:
         for line in scans:
             harmful, flagged = bool(line[self.PLACE["harmful"]]), line[self.PLACE["gamma"]] == 0
             self._flagged[harmful, flagged] += 1
-            for name, column in SCORES.items():
+            for name, column in SCORE_COLUMNS.items():
                 self._curves[name].add(_score(name, line[self.PLACE[column]]), harmful)
 
     def result(self) -> Detector:
@@ -251,9 +267,14 @@ def _score(name: str, value: float | None) -> float | None:
     return 1.0 - value if value is not None and name == "outlier_ratio" else value
 
 
-def _finite(value: Any) -> Any:
+def without_infinities(value: Any) -> Any:
+    """Return a JSON value with null in place of every number that is not finite.
+
+    Args:
+        value: a number, a text, None, or lists and tables of these.
+    """
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: without_infinities(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return [without_infinities(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

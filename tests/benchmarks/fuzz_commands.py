@@ -295,13 +295,13 @@ def build(folder: Path) -> None:
         "scenario.toml": SCENARIO,
         "rules.toml": RULES,
         "robot.toml": ROBOT,
-        "task.toml": b"[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
+        "task.toml": "[task]\ngrasp_m = [0.0, 0.0, 0.0]\nangle_deg = 2.0\n",
         "dense.toml": SCENARIO.replace("[40, 40]", "[80, 80]"),
         "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml")),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
-    collect = run_command._collect
+    collect = run_command.collect
     with (
         contextlib.redirect_stdout(io.StringIO()) as out,
         contextlib.redirect_stderr(io.StringIO()),
@@ -315,10 +315,10 @@ def build(folder: Path) -> None:
         call("record", folder / "dense.toml", "-o", folder / "dense.mcap")
         with cached(folder / "cache"):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "result")
-        run_command._collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
+        run_command.collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
         with contextlib.suppress(click.Abort, KeyboardInterrupt):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "interrupted")
-        run_command._collect = collect
+        run_command.collect = collect
         call("sweep", folder / "campaign.toml", "-o", folder / "sweep", "--workers", "0")
     _files(folder)
 

@@ -223,7 +223,7 @@ def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
     for _ in range(int(rng.integers(1, 9))):
         if out:
             out = bytearray(MUTATIONS[int(rng.integers(len(MUTATIONS)))](out, rng, others))
-    if rng.random() < 0.5 and out[:8] == mcap.MAGIC:
+    if rng.random() < 0.5 and out[:8] == mcap.MCAP_MAGIC:
         _mend(out)
     return bytes(out)
 
@@ -237,7 +237,7 @@ def in_place(data: bytes, rng: np.random.Generator) -> bytes:
         if out:
             size, change = len(out), (_flip, _set, _number)[int(rng.integers(3))]
             out = change(out, rng, [])[:size]
-    if out[:8] == mcap.MAGIC:
+    if out[:8] == mcap.MCAP_MAGIC:
         _mend(out)
     return bytes(out)
 

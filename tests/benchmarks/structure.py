@@ -7,8 +7,13 @@ names, documentation.
     python tests/benchmarks/structure.py --list           # what lacks a docstring section
 
 Tokens are those of Python without comments, docstrings and line ends. A constant is a name in
-capitals that a module assigns a number. Private members are names that begin with one underscore,
-taken from another module. A long line has over 100 characters. Complexity is radon's.
+capitals that a module assigns a number; names that are equal but for the underscore at the begin
+are one, and several values of a name are several numbers. Private members are names that begin
+with one underscore, taken from another module. A compiled module (one with a ``.pyi``) begins with
+an underscore too; it is the boundary to C++ that all modules of its package share and that the
+oracle tests of docs/developer/kernels.md call, so it counts only where another package imports it;
+the test files that import one are counted apart. A long line has over 100 characters. Complexity is
+radon's.
 
 Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments
 and docstrings. The import share counts the lines of import statements and of ``__all__`` over all
@@ -116,6 +121,8 @@ def concepts(root: Path) -> dict:
     constants: collections.Counter[str] = collections.Counter()
     values: dict[str, set[str]] = collections.defaultdict(set)
     wide = 0
+    kernels = {p.stem: p.parent for p in (root / "avsreplay").rglob("*.pyi")}
+    tests = sorted((root / "tests").glob("test_*.py"))
     for path in modules(root):
         text = path.read_text(encoding="utf-8")
         parts = path.relative_to(root / "avsreplay").parts
@@ -133,11 +140,14 @@ def concepts(root: Path) -> dict:
         **{f"  {name} (code tokens)": n for name, n in sorted(tokens.items())},
         "numeric constants": constants.total(),
         **{f"  {name} (numeric constants)": n for name, n in sorted(constants.items())},
-        "constant names with several values": sum(len(v) > 1 for v in values.values()),
+        "numeric constant names with several values": sum(len(v) > 1 for v in values.values()),
         f"functions with {MANY_PARAMETERS} or more parameters": wide,
-        "private members used by other modules": sum(map(private_uses, modules(root))),
-        "private members used by tests": sum(
-            map(private_uses, sorted((root / "tests").glob("test_*.py")))
+        "private members used by other modules": sum(
+            private_uses(path, kernels) for path in modules(root)
+        ),
+        "private members used by tests": sum(private_uses(path, kernels) for path in tests),
+        "test files that import a compiled module": sum(
+            imports_a_kernel(p, kernels) for p in tests
         ),
     }
 
@@ -191,22 +201,35 @@ def parameters(node: ast.FunctionDef) -> int:
     return sum(a.arg not in ("self", "cls") for a in every)
 
 
-def private_uses(path: Path) -> int:
-    """Imports of private names of the package, and private attributes of what is not self."""
-    found = 0
+def private_uses(path: Path, kernels: dict[str, Path]) -> int:
+    """Imports of private names of the package, and private attributes of what is not self.
+
+    Args:
+        path: a module, or a file of tests.
+        kernels: the folder of each compiled module, by its name.
+    """
+    found, is_test = 0, path.name.startswith("test_")
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("avsreplay"):
-            found += sum(_is_private(alias.name) for alias in node.names)
+            for alias in node.names:
+                shared = alias.name in kernels and (is_test or kernels[alias.name] in path.parents)
+                found += _is_private(alias.name) and not shared
         elif isinstance(node, ast.Attribute) and _is_private(node.attr):
             base = node.value.id if isinstance(node.value, ast.Name) else ""
-            found += base not in ("self", "cls", "other", "os", "sys") and path.name.startswith(
-                "test_"
-            )
+            found += is_test and base not in ("self", "cls", "other", "os", "sys")
     return found
 
 
+def imports_a_kernel(path: Path, kernels: dict[str, Path]) -> bool:
+    """Return whether a file imports a compiled module."""
+    return any(
+        isinstance(node, ast.ImportFrom) and any(alias.name in kernels for alias in node.names)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    )
+
+
 def _is_private(name: str) -> bool:
-    return name.startswith("_") and not name.startswith("__") and name != "_kernel"
+    return name.startswith("_") and not name.startswith("__")
 
 
 def form(root: Path) -> dict:

@@ -13,38 +13,44 @@ constexpr double PART[2] = {0.875, 0.125};  // parts of an interval that the cha
 
 constexpr double MOST = 600;  // log of a likelihood ratio, larger ones are cut
 
-// One change: the log of its likelihood ratio, and its effect F u on the estimate's error, E uu' = moment.
+// One change: the log of its likelihood ratio, and the second moments of the estimate's error, effect effect'.
 struct Candidate {
-  double log_ratio, F[DIM][3], moment[3][3];
+  double log_ratio, effect[DIM][4];
 };
 
-// Log evidence of white unknowns v in size A v = b, over none, and the second moments of their posterior times size^2.
-void evidence(const double A[SEEN][SEEN], const double b[SEEN], int first, double size, Candidate& out) {
-  double L[3][3], D[3], det = 1, v[3], gain = 0, inverse[3][3];
+// Log evidence of white unknowns v in size A v = b, over none, and the second moments of their effect F size v. These are a
+// product of factors, so that they are no less than 0 where some directions of the state are not determined and F is large.
+void evidence(const double A[SEEN][SEEN], const double b[SEEN], const double F[DIM][SEEN], int first, double size,
+              Candidate& out) {
+  double L[3][3], D[3], det = 1, v[3];
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c <= r; ++c) {
       double s = (r == c) + size * size * A[first + r][first + c];
       for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
       if (c < r) L[r][c] = s / D[c];
-      else det *= D[r] = s;
+      else det *= D[r] = std::max(s, 1.0);  // exactly at least 1
     }
-  for (int column = 0; column < 4; ++column) {  // the three columns of the inverse, then the mean
+  for (int r = 0; r < 3; ++r) {
+    v[r] = size * b[first + r];
+    for (int i = 0; i < r; ++i) v[r] -= L[r][i] * v[i];
+  }
+  for (int r = 2; r >= 0; --r) {
+    v[r] /= D[r];
+    for (int i = r + 1; i < 3; ++i) v[r] -= L[i][r] * v[i];
+  }
+  double gain = 0;
+  for (int r = 0; r < 3; ++r) gain += 0.5 * size * b[first + r] * v[r];
+  out.log_ratio = gain - 0.5 * log_of(det);
+  for (int k = 0; k < DIM; ++k) {
+    const double* f = F[k] + first;
+    out.effect[k][3] = size * (f[0] * v[0] + f[1] * v[1] + f[2] * v[2]);
     double x[3];
     for (int r = 0; r < 3; ++r) {
-      x[r] = column < 3 ? r == column : size * b[first + r];
+      x[r] = f[r];
       for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
+      out.effect[k][r] = size * x[r] / std::sqrt(D[r]);
     }
-    for (int r = 2; r >= 0; --r) {
-      x[r] /= D[r];
-      for (int i = r + 1; i < 3; ++i) x[r] -= L[i][r] * x[i];
-    }
-    for (int r = 0; r < 3; ++r) (column < 3 ? inverse[r][column] : v[r]) = x[r];
   }
-  for (int r = 0; r < 3; ++r) {
-    gain += 0.5 * size * b[first + r] * v[r];
-    for (int c = 0; c < 3; ++c) out.moment[r][c] = size * size * (inverse[r][c] + v[r] * v[c]);
-  }
-  out.log_ratio = gain - 0.5 * log_of(std::max(det, 1.0));
 }
 
 }  // namespace
@@ -88,9 +94,7 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
       for (int kind = 0; kind < 2; ++kind)
         for (const double size : sizes) {
           Candidate one;
-          evidence(A, b, 3 * kind, size * one_sigma[kind], one);
-          for (int r = 0; r < DIM; ++r)
-            for (int c = 0; c < 3; ++c) one.F[r][c] = F[r][3 * kind + c];
+          evidence(A, b, F, 3 * kind, size * one_sigma[kind], one);
           found.push_back(one);
         }
     }
@@ -104,16 +108,12 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
   for (const Candidate& one : found) {
     const double weight = (one.log_ratio - none) / total;  // a change as likely as before the scans adds nothing
     if (!(weight > 0)) continue;
-    double FM[DIM][3] = {};
     for (int r = 0; r < DIM; ++r)
-      for (int i = 0; i < 3; ++i)
-        for (int c = 0; c < 3; ++c) FM[r][c] += weight * one.F[r][i] * one.moment[i][c];
-    for (int r = 0; r < DIM; ++r)
-      for (int c = 0; c < DIM; ++c)
-        for (int i = 0; i < 3; ++i) P[r][c] += FM[r][i] * one.F[c][i];
+      for (int c = 0; c <= r; ++c)
+        for (int i = 0; i < 4; ++i) P[r][c] += weight * one.effect[r][i] * one.effect[c][i];
   }
   for (int r = 0; r < DIM; ++r)
-    for (int c = 0; c < r; ++c) P[r][c] = P[c][r] = 0.5 * (P[r][c] + P[c][r]);
+    for (int c = 0; c < r; ++c) P[c][r] = P[r][c];
   return exp_of(top) * total / (double)found.size();
 }
 
