@@ -134,8 +134,8 @@ def evidence(
     rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
     noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
     sums = (found.counts, found.normals, found.gradients, found.offsets, found.errors, found.places)
-    of_all = (len(points), found.inliers, rms, found.centre, noise)
-    return Evidence(*of_all, *sums, camera_c)
+    inliers, centre = found.inliers, found.centre
+    return Evidence(len(points), inliers, rms, centre, noise, *sums, camera_c=camera_c)
 
 
 def instants(
@@ -296,7 +296,7 @@ def _seen(
     camera_c: Array | None,
 ) -> _Seen:
     of_all = (found.points, found.inliers, found.rms_m, found.centre, found.noise_m)
-    used = Evidence(*of_all, *found.patches, camera_c)
+    used = Evidence(*of_all, *found.patches, camera_c=camera_c)
     return _Seen(index, visibility, points, gate_m, found, used, _directions(used))
 
 
