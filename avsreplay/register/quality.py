@@ -296,7 +296,7 @@ def _seen(
     camera_c: Array | None,
 ) -> _Seen:
     of_all = (found.points, found.inliers, found.rms_m, found.centre, found.noise_m)
-    used = Evidence(*of_all, *found.patches, camera_c=camera_c)
+    used = replace(Evidence(*of_all, *found.patches), camera_c=camera_c)
     return _Seen(index, visibility, points, gate_m, found, used, _directions(used))
 
 
