@@ -296,6 +296,7 @@ def entry_point() -> None:
     except click.ClickException as error:
         code = _fail(_with_help(error), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
+        interrupts.forget()
         code = _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
     except OSError as error:
         code = _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
