@@ -453,13 +453,7 @@ def test_the_number_of_intervals_costs_less_than_a_tenth_of_a_second():
     ("number", "earliest_s"),
     [
         (0, 24.016442393),
-        pytest.param(
-            3,
-            21.57,
-            marks=pytest.mark.xfail(
-                strict=False, reason="the search with the bound ends at another local minimum"
-            ),
-        ),
+        (3, 21.57),
         (3, 15.0),
     ],
 )

@@ -3,8 +3,9 @@
 Each iteration linearises the constraints about a reference path and solves a second-order cone
 programme with free end time. Most constraints are alternatives (inside the cone, or outside its
 range); the reference decides which one holds at an instant. Several initial paths with different
-arrival times and sides lead to different local minima; the earliest capture is kept. A plan is
-accepted only after the true constraints hold at sixteen instants of every interval.
+arrival times and sides lead to different local minima; the earliest capture is kept. Withdrawals are
+then required of the path that was found without them. A plan is accepted only after the true
+constraints hold at sixteen instants of every interval.
 """
 
 from __future__ import annotations
@@ -329,7 +330,7 @@ def _best_path(
             return other
     plain = replace(case, limits=replace(case.limits, abort=False))
     near = _near(case, free, drafts)
-    found = _improved(plain, coarse, drafts, None)
+    found = _improved(plain, coarse, drafts)
     for reference in near if found is None else ():
         found = found or _converged(plain, reference)
     if found is None:
@@ -383,19 +384,15 @@ def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
     return _different(drafts)
 
 
-def _improved(
-    case: Case, coarse: Case, drafts: list[StepPath], best: StepPath | None
-) -> StepPath | None:
-    """Return the earliest of ``best`` and of the drafts, which are refined in the order of their
-    arrival.
-    """
+def _improved(case: Case, coarse: Case, drafts: list[StepPath]) -> StepPath | None:
+    """Return the earliest of the drafts, which are refined in the order of their arrival."""
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
+    best: StepPath | None = None
     for draft in _different(drafts):
         for trust in (TRUST, CAREFUL):
-            unsafe = best is None or best.short_m > 0.0
-            if best is None or unsafe or (trust == TRUST and best.t_go_s > draft.t_go_s):
+            if best is None or (trust == TRUST and best.t_go_s > draft.t_go_s):
                 found = filter(None, (best, _refined(case, draft, trust=trust)))
-                best = min(found, key=_safest, default=None)
+                best = min(found, key=_duration, default=None)
     return best
 
 

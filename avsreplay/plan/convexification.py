@@ -406,8 +406,8 @@ def withdrawn(
 
 
 def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
-    """Return whether withdrawals from every instant keep the margin, and otherwise rows for the
-    worst, whose instants are tried from then on.
+    """Return whether withdrawals from every instant keep the stated margin, and otherwise rows that
+    also contain those from the worst instants, which are tried from then on.
 
     Args:
         case: The problem; on the coarse grid nothing is proven.
