@@ -3,8 +3,8 @@
 Each iteration linearises the constraints about a reference path and solves a second-order cone
 programme with free end time. Most constraints are alternatives (inside the cone, or outside its
 range); the reference decides which one holds at an instant. Several initial paths with different
-arrival times and sides lead to different local minima; the earliest capture is kept. Withdrawals are
-then required of the path that was found without them. A plan is accepted only after the true
+arrival times and sides lead to different local minima; the earliest capture is kept. Withdrawals
+are then required of the path that was found without them. A plan is accepted only after the true
 constraints hold at sixteen instants of every interval.
 """
 
