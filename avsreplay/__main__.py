@@ -23,6 +23,9 @@ def main() -> None:
         gc.set_threshold(10_000)  # objects between two searches for cycles, of which there are few
         from avsreplay.cli import main as cli
     except KeyboardInterrupt:
+        from avsreplay.cli import interrupts
+
+        interrupts.forget()
         print("avsreplay: interrupted", file=sys.stderr)  # noqa: T201
         sys.exit(130)
     cli.entry_point()

@@ -179,3 +179,18 @@ def test_ctrl_c_while_the_command_is_loaded_is_one_line(
         main()
     assert ended.value.code == 130
     assert capsys.readouterr().err == "avsreplay: interrupted\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_an_interrupt_within_code_from_a_text_ends_with_the_exit_code_of_the_command(tmp_path):
+    """As one that arrives while a data class is imported: "python -m" would end with a signal."""
+    (tmp_path / "interrupted.py").write_text(
+        "from avsreplay.cli import main\n"
+        "main.group.main = lambda **_: exec('raise KeyboardInterrupt')\n"
+        "main.entry_point()\n"
+    )
+    command = [sys.executable, "-m", "interrupted"]
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "avsreplay: interrupted\n")

@@ -152,15 +152,34 @@ def _ellipsoid(rng: np.random.Generator, count: int = 6000) -> tuple[np.ndarray,
     return p, n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def _scan(rng: np.random.Generator, strain: float, noise: float = 0.003) -> Evidence:
+CAMERA = np.array([0.5, -0.3, 5.0])
+
+
+def _scan(
+    rng: np.random.Generator, strain: float, noise: float = 0.003, ranges: float = 0.0
+) -> Evidence:
     """Sums at the least-squares pose of a scan whose surface is strained at random."""
+    return _moved_scan(rng, strain, noise, ranges)[0]
+
+
+def _moved_scan(
+    rng: np.random.Generator, strain: float, noise: float = 0.003, ranges: float = 0.0
+) -> tuple[Evidence, np.ndarray]:
+    """The same, with an error of the ranges that varies over the image, and the error (6,) of the
+    pose that both cause.
+    """
     p, n = _ellipsoid(rng)
     S = strain * rng.normal(size=(3, 3))
     e = np.sum(n * (p @ (S + S.T)), axis=1) + rng.normal(0.0, noise, len(p))
+    waves, phase = rng.uniform(-3.0, 3.0, (5, 2)), rng.uniform(0.0, 2.0 * np.pi, 5)
+    rays = p - CAMERA
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    along = np.cos(p[:, :2] @ waves.T + phase) @ rng.normal(size=5) * np.sqrt(2.0 / 5.0)
+    e += ranges * along * np.sum(n * rays, axis=1)
     J = np.hstack([np.cross(p, n), n])
-    e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
+    d = np.linalg.lstsq(J, e, rcond=None)[0]
     patch = np.unique(np.floor(p / 0.1), axis=0, return_inverse=True)[1].reshape(-1)
-    return summed(J, e, patch, p=p)
+    return replace(summed(J, e - J @ d, patch, p=p), camera_c=CAMERA), d
 
 
 def _nis(strain: float) -> tuple[float, float, float]:
@@ -172,7 +191,7 @@ def _nis(strain: float) -> tuple[float, float, float]:
         found = _scan(rng, strain)
         errors = systematic_errors(found, 2.0, 0.1)
         none = replace(
-            errors, block_m2=0.0, smooth_m2=np.zeros(7), amplitudes=np.zeros(7), fit=np.zeros(6)
+            errors, block_m2=0.0, smooth_m2=np.zeros(17), amplitudes=np.zeros(17), fit=np.zeros(6)
         )
         values.append(split_nis(found, errors, np.eye(3)[:1]))
         bare.append(split_nis(found, none, np.eye(3)[:1]))
@@ -211,11 +230,27 @@ def test_halves_that_disagree_beyond_all_errors_have_a_large_nis() -> None:
     assert split_nis(found.only(found.places[:, 0] < -0.93), errors, np.eye(3)[:1]) is None
 
 
+def test_an_error_of_the_ranges_that_varies_over_the_image_is_in_the_covariance() -> None:
+    """Without the position of the camera it is not known, and the covariance is too small."""
+    squared = []
+    for seed in range(25):
+        found, d = _moved_scan(np.random.default_rng(seed), 0.0, ranges=0.003)
+        each = (found, replace(found, camera_c=None))
+        P = [registration_covariance(f, systematic_errors(f, 2.0, 0.1))[0] for f in each]
+        squared.append([d @ np.linalg.solve(C, d) / 6.0 for C in P])
+    known, unknown = np.mean(squared, axis=0)
+    assert 0.5 < known < 2.0
+    assert unknown > 4.0
+
+
+@pytest.mark.parametrize("ranges", [0.0, 0.003])
 @pytest.mark.parametrize("strain", [0.0, 0.004])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_covariance_and_test_of_halves_are_those_of_the_oracle(strain: float, seed: int) -> None:
+def test_covariance_and_test_of_halves_are_those_of_the_oracle(
+    ranges: float, strain: float, seed: int
+) -> None:
     """The sums in C++ against the same formulas in numpy."""
-    found = _scan(np.random.default_rng(seed), strain)
+    found = _scan(np.random.default_rng(seed), strain, ranges=ranges)
     if seed == 3:  # a view of a narrow part, where not every amplitude is observable
         found = found.only(found.places[:, 2] > 0.35)
     errors, oracle = (

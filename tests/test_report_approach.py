@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -77,3 +78,24 @@ def test_without_a_flown_plan_there_is_no_picture() -> None:
     assert approach_picture(rows("stand_still"), view(), {}) is None
     assert approach_picture(rows(), None, {}) is None
     assert approach_picture(rows(), replace(view(), paths=()), {}) is None
+
+
+@pytest.mark.parametrize(("degrees", "mouth"), [(15.0, 0.0), (30.0, 1.0), (10.0, 1.5)])
+def test_the_rim_of_a_cone_is_at_its_range_and_on_its_side(degrees: float, mouth: float) -> None:
+    header = {
+        "approach": {"final_deg": degrees, "final_range_m": 3.0, "mouth_m": mouth},
+        "task": {"axis": [0.0, -1.0, 0.0]},
+    }
+    shown = approach_picture(rows(), view(), header)
+    assert shown is not None
+    metre = shown["bar"] / float(shown["bar_text"].split()[0])
+    for panel in shown["panels"]:
+        corners = np.array(re.findall(r"(-?[\d.]+)[ ,](-?[\d.]+)", panel["cones"][0]), float)
+        along, across = ((corners - panel["grasp"]) / metre).T
+        rim = along > 0.1
+        half_pixel = 0.5 / metre
+        assert rim.sum() >= 3
+        assert np.hypot(along, across)[rim] == pytest.approx(3.0, abs=half_pixel)
+        edge = np.abs(across).argmax()
+        side = mouth + np.tan(np.radians(degrees)) * along[edge]
+        assert np.abs(across[edge]) == pytest.approx(side, abs=half_pixel)

@@ -526,6 +526,21 @@ def test_it_loads_without_a_console_message(opened, width, dark):
     assert len(browser.find_elements("css selector", ".chart canvas")) >= 12
 
 
+def test_the_page_of_a_flight_has_its_path_from_the_instant_of_planning():
+    t = np.linspace(0.0, 20.0, 5)
+    y = np.outer(1.0 - t / 20.0, [3.0, 1.0, 0.5])
+    flight = Flight(t, y, {"distance_m": np.linalg.norm(y, axis=1)}, np.array([1.0, 0.0, 0.0]))
+    data = _data(build_flight_page("flight", ["found"], flight, [("status", "found")]))
+    (path,) = data["scene"]["paths"]
+    assert path["t_s"] == 0.0
+    assert _numbers(path["points"]) == pytest.approx(y.ravel(), abs=1e-6)
+    assert _numbers(data["runs"][0]["t"]) == pytest.approx(t)
+
+
+def _numbers(packed):
+    return np.frombuffer(base64.b64decode(packed["data"]), f"<{packed['type']}")
+
+
 @pytest.mark.slow
 def test_the_page_of_a_flight_moves_the_gripper_with_the_slider(browser, tmp_path):
     t = np.linspace(0.0, 20.0, 41)

@@ -383,3 +383,14 @@ f -6 -2 -5
         UsageError, match="no group 'nose' in the model; groups of the model: black, body, panel"
     ):
         face_optics(surface, [Material("m", group="nose")])
+
+
+def test_colours_of_the_vertices_of_an_obj_model_leave_its_groups(tmp_path):
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    lines = [f"v {x} {y} {z} 0.2 0.7 {0.1 * k}" for k, (x, y, z) in enumerate(corners)]
+    lines += ["g front", "f 1 2 3", "g side", "f 1 2 4"]
+    (tmp_path / "coloured.obj").write_text("\n".join(lines) + "\n")
+    surface = read_surface(tmp_path / "coloured.obj")
+    centres = surface.vertices[surface.faces].mean(axis=1)
+    optics = face_optics(surface, [Material("m", group="side", reflectance=0.9)])
+    assert_allclose(optics.diffuse, np.where(centres[:, 2] > 0.1, 0.9, 0.5))

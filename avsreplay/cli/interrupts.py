@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from collections import namedtuple
 
 _received: list[int] = []
 _ignored: list[bool] = []
@@ -33,6 +34,16 @@ def hear() -> list[int]:
 def counts() -> bool:
     """Return whether a SIGINT that has arrived is to end the command."""
     return bool(_received) or not _ignored
+
+
+def forget() -> None:
+    """Let the process end with an exit code of its own after an interrupt that was handled.
+
+    CPython ends "python -m" with SIGINT if a KeyboardInterrupt has left code that was compiled from
+    a text, as the methods of a data class that was being imported; the next such code that ends
+    clears this, and a named tuple has some.
+    """
+    namedtuple("Handled", ())
 
 
 def _stand_in(number: int, _frame: object) -> None:

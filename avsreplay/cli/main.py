@@ -314,6 +314,7 @@ def _run(received: Sequence[int]) -> int:
     except click.ClickException as error:
         return _fail(_with_help(error), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
+        interrupts.forget()
         return _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
     except OSError as error:
         return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)

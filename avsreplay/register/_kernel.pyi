@@ -77,6 +77,7 @@ class Table:
         centre: Sequence[float],
         extent_m: float,
         side_m: float,
+        camera: Sequence[float],
     ) -> None: ...
     def systematic(
         self,

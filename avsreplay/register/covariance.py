@@ -16,6 +16,11 @@ Systematic errors Errors of the model or of the ranges that vary slowly over the
     of paint or of the mesh). They are fitted with the pose; the amplitudes of the strain are taken
     as draws of one normal distribution, that of the offset of another. Their variances are maximum
     likelihood estimates (empirical Bayes), 0 if not significant.
+Errors of the ranges They vary slowly over the image (calibration, multipath) and move the surface
+    along the rays: a polynomial of third degree over the image, whose terms are draws of a third
+    distribution. Its constant and linear terms look like a motion, so that no residual shows them;
+    their variance is that of the other terms. They are fitted where the position of the camera is
+    known.
 
 The covariance is an estimate from some hundred patches: the squared error of a pose in its metric
 is Hotelling's T^2, not chi-square. Its degrees of freedom are those of a Wishart matrix with the
@@ -64,6 +69,7 @@ class Evidence:
         offsets: (m, 6) sums of J over each patch.
         errors: (m,) sums of e.
         places: (m, 3) centroid of the points of each patch, projected onto their faces.
+        camera_c: (3,) the camera in {C}; None where it is not known.
     """
 
     points: int
@@ -77,13 +83,13 @@ class Evidence:
     offsets: Array
     errors: Array
     places: Array
+    camera_c: Array | None = None
 
     def only(self, keep: NDArray[np.bool_]) -> Evidence:
         """Return the evidence of the patches with ``keep`` (m,) true."""
         names = [f.name for f in fields(self)]
-        return replace(
-            self, **{name: getattr(self, name)[keep] for name in names[names.index("counts") :]}
-        )
+        of_patches = names[names.index("counts") : names.index("camera_c")]
+        return replace(self, **{name: getattr(self, name)[keep] for name in of_patches})
 
 
 @value_class
@@ -94,9 +100,9 @@ class Systematic:
         extent_m: diagonal of the model's bounding box; the strains are per this length.
         patch_m: side of a patch.
         block_m2: variance of the displacement of a block, each axis [m^2].
-        smooth_m2: (7,) variances of the amplitudes: six of the strain times the extent, and the
-            offset [m^2].
-        amplitudes: (7,) their fitted values [m].
+        smooth_m2: (17,) variances of the amplitudes: six of the strain times the extent, the
+            offset, and ten modes of the ranges [m^2].
+        amplitudes: (17,) their fitted values [m].
         centre: (3,) about which the strain was fitted.
         fit: (6,) pose part of the common fit of pose and amplitudes.
     """
@@ -251,7 +257,8 @@ def _table(found: Evidence, centre: Array, extent_m: float, patch_m: float) -> A
     """The sums as the kernel takes them."""
     sums = (*_contiguous(found.normals, found.gradients, found.offsets), found.counts)
     lengths = (tuple(centre.tolist()), float(extent_m), float(patch_m))
-    return kernel_module().Table(*sums, *_contiguous(found.errors, found.places), *lengths)
+    camera = (np.nan,) * 3 if found.camera_c is None else tuple(found.camera_c.tolist())
+    return kernel_module().Table(*sums, *_contiguous(found.errors, found.places), *lengths, camera)
 
 
 def _contiguous(*arrays: Array) -> tuple[Array, ...]:

@@ -28,7 +28,10 @@ from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetr
 from avsreplay.register.work import TEST_WORK, healthy_work
 
 VERSION = 12  # version of the kept data of a model
-SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
+SAMPLES, DENSER, MOST_MARKS = 4000, 5, 500  # points to find marks, times as many around them, kept
+# Most work of a search of all samples [point searches]: of a model with long thin faces, at which
+# a search costs up to a hundred times as much, fewer points are sampled, which misses small marks.
+SAMPLES_WORK = 40_000
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED = 16  # motions of a kind by which the marks are found
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
@@ -64,9 +67,10 @@ class NearSymmetry:
         self._target, self._test, self.search = target, test, search
         self.poses, self._gate = search.poses, target.limits.gate_m
         surface = target.surface
+        self._samples = min(SAMPLES, int(SAMPLES_WORK / target.near_work))
         if "kinds" not in kept:
             found = (
-                near_symmetries(search, target.index, *sample(surface, SAMPLES))
+                near_symmetries(search, target.index, *sample(surface, self._samples))
                 if len(surface.faces)
                 else NONE
             )
@@ -89,7 +93,7 @@ class NearSymmetry:
         if not len(motions):
             return motions
         width = EXACT_OF_EXTENT * self._target.index.extent_m
-        points = sample(self._target.surface, SAMPLES)[0]
+        points = sample(self._target.surface, self._samples)[0]
         off = [self._distances(points, T[None], width)[0] >= width for T in motions]
         return motions[[float(each.mean()) <= MOST_INEXACT for each in off]]
 
@@ -103,19 +107,19 @@ class NearSymmetry:
         surface, none = self._target.surface, np.zeros((2, 0, 3))
         if not len(self._kinds):
             return none, np.zeros(2)
-        points, _ = sample(surface, SAMPLES)
+        points, _ = sample(surface, self._samples)
         moved = self._carried_off(points, MOST_MARKED)
         normals = mesh.normals(surface.vertices, surface.faces)
         share, area = float(moved.mean()), 0.5 * float(np.linalg.norm(normals, axis=1).sum())
         if not moved.any() or share >= MOST_MARKED:
             return none, np.array([share, 0.0])
-        dense, normals = sample(surface, DENSE)
+        dense, normals = sample(surface, DENSER * self._samples)
         apart = kernel_module().PointTree(points[moved]).query(dense)[0][:, 0]
-        around = np.flatnonzero(apart < AROUND * np.sqrt(area / SAMPLES))
+        around = np.flatnonzero(apart < AROUND * np.sqrt(area / self._samples))
         marks = around[self._carried_off(dense[around], 1.0)]
         stride = max(1, -(-len(marks) // MOST_MARKS))
         found = np.stack([dense[marks[::stride]], normals[marks[::stride]]])
-        return found, np.array([len(marks) / DENSE, stride * area / DENSE])
+        return found, np.array([len(marks) / len(dense), stride * area / len(dense)])
 
     def _carried_off(self, points: Array, most: float) -> NDArray[np.bool_]:
         """Which points some near-symmetry does not carry onto the surface; ends when this

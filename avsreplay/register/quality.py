@@ -126,15 +126,16 @@ def evidence(
     A patch is the points that project onto their faces in one cube, or one point with at most
     ``LEAST_PATCHES`` cubes.
     """
-    facing = visibility.camera_c(index, points, T_ca) is not None
-    size = PATCH_OF_EXTENT * index.extent_m
+    camera_c = visibility.camera_c(index, points, T_ca)
+    facing, size = camera_c is not None, PATCH_OF_EXTENT * index.extent_m
     found = index.evidence(
         points, T_ca, gate_m, size, LEAST_PATCHES, facing=facing, matches=matches
     )
     rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
     noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
     sums = (found.counts, found.normals, found.gradients, found.offsets, found.errors, found.places)
-    return Evidence(len(points), found.inliers, rms, found.centre, noise, *sums)
+    inliers, centre = found.inliers, found.centre
+    return Evidence(len(points), inliers, rms, centre, noise, *sums, camera_c=camera_c)
 
 
 def instants(
@@ -223,7 +224,8 @@ def grade(
     if found.observable:
         pose = _determined(found, fit.T_ca, index.extent_m)
     elif found.overlap:
-        view = _seen(index, visibility, points, limits.gate_m, found)
+        camera_c = visibility.camera_c(index, points, fit.T_ca)
+        view = _seen(index, visibility, points, limits.gate_m, found, camera_c)
         pose = view.pose(fit, guess if fit.converged else None, systematic)
     return _alignment(found, fit, pose, systematic)
 
@@ -291,10 +293,10 @@ def _seen(
     points: NDArray[Any],
     gate_m: float,
     found: PoseQuality,
+    camera_c: Array | None,
 ) -> _Seen:
-    used = Evidence(
-        found.points, found.inliers, found.rms_m, found.centre, found.noise_m, *found.patches
-    )
+    of_all = (found.points, found.inliers, found.rms_m, found.centre, found.noise_m)
+    used = replace(Evidence(*of_all, *found.patches), camera_c=camera_c)
     return _Seen(index, visibility, points, gate_m, found, used, _directions(used))
 
 

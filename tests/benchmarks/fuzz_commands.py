@@ -504,7 +504,8 @@ def check_seeds(seeds: Path, cases: list[tuple[str, str]]) -> None:
                 code, err = invoke(
                     case[0], words, copied, seeds, Path(place), cache=choices[0] == "cache"
                 )
-            if code not in ("exit 0", "exit 1"):
+            unfit = case == ("model", "against") and "does not fit the CAD model" in err
+            if code not in ("exit 0", "exit 1") and not unfit:  # of four scans of one side
                 raise SystemExit(f"{case} {words}: {code} with an intact input: {err}")
 
 

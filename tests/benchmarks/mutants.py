@@ -39,6 +39,8 @@ from mutation import Module, Mutant
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ("-q", "-p", "no:cacheprovider", "-m", "not slow", "--hypothesis-seed=0", "-n0")
 SLACK, START_S = 5.0, 40.0  # processor time of a mutant's tests: times what was recorded, and more
+IDLE_S = 30.0  # tests whose processes use less than LEAST_TICKS for so long do not end [s]
+LEAST_TICKS = 50  # processor time [0.01 s]
 SITE = """import sys
 sys.meta_path[:] = [e for e in sys.meta_path if not type(e).__module__.startswith("_editable")]
 import mutation
@@ -283,11 +285,14 @@ def fails(folder: Folder, mutant: Mutant | None, tests: list[str], spent_s: floa
         os._exit(0)
     os.close(here)
     with os.fdopen(there, "rb") as stream:
-        until = time.monotonic() + 20 * limit
-        ended = 0
-        while not ended and time.monotonic() < until:
-            ended, _ = os.waitpid(child, os.WNOHANG)
-            time.sleep(0.02)
+        ended, spent, idle_since = 0, -LEAST_TICKS, time.monotonic()
+        while not ended and time.monotonic() - idle_since < IDLE_S:
+            for _ in range(50):
+                ended, _ = (ended, 0) if ended else os.waitpid(child, os.WNOHANG)
+                time.sleep(0.0 if ended else 0.02)
+            now = sum(_group(child).values())
+            if now >= spent + LEAST_TICKS:
+                spent, idle_since = now, time.monotonic()
         for each in _group(child):
             os.kill(each, signal.SIGKILL)
         if not ended:
@@ -296,16 +301,16 @@ def fails(folder: Folder, mutant: Mutant | None, tests: list[str], spent_s: floa
     return "" if text == "passed" else text or "end"
 
 
-def _group(leader: int) -> list[int]:
-    """The processes that a child has started and left."""
-    found = []
+def _group(leader: int) -> dict[int, int]:
+    """Processor time [ticks] of the processes that a child has started and left, and its own."""
+    found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = path.read_text().rpartition(")")[2].split()
         except OSError:
             continue
         if int(fields[3]) == leader:
-            found.append(int(path.parent.name))
+            found[int(path.parent.name)] = int(fields[11]) + int(fields[12])
     return found
 
 

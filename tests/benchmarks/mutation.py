@@ -53,7 +53,7 @@ class Mutant:
         what: what is changed.
         statement: number of the statement, or lambda, that runs it.
         deferred: whether that is inside a function; otherwise it runs with the import.
-        names: what a statement outside of functions defines.
+        names: what a statement outside of functions defines, then the classes that it is in.
     """
 
     path: str
@@ -85,7 +85,8 @@ class _Walk(ast.NodeTransformer):
             return super().visit(node)
         self._inside.append(self._numbered(node))
         at_top = not self._functions and not isinstance(node, ast.Lambda)
-        self._defined.append(tuple(_defined(node)) if at_top else self._defined[-1])
+        outer = self._defined[-1]
+        self._defined.append((*_defined(node), *outer) if at_top else outer)
         changed = super().visit(node)
         self._defined.pop()
         number = self._inside.pop()
@@ -205,14 +206,14 @@ def _names(node: ast.AST) -> set[str]:
     return set().union({own} - {None}, *map(_names, inside))
 
 
-def _defined(node: ast.stmt) -> set[str]:
+def _defined(node: ast.stmt) -> list[str]:
     """What a statement outside of functions defines."""
     if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-        return {node.name}
+        return [node.name]
     if isinstance(node, (ast.Assign, ast.AnnAssign)):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        return {each.id for t in targets for each in ast.walk(t) if isinstance(each, ast.Name)}
-    return set()
+        return [each.id for t in targets for each in ast.walk(t) if isinstance(each, ast.Name)]
+    return []
 
 
 @dataclass(frozen=True)

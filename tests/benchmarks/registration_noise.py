@@ -14,7 +14,9 @@ error against the turn between two scans.
 
 With ``--bodies`` the scans are ray-cast views of thin bodies (``bodies.THIN``, a body of its own
 for each view), of the meshes of ``scenes.py`` and of mesh files, with noise of a share of the
-extent along the rays. They are registered from 0.5 deg and 0.002 of the extent off. Printed for
+extent along the rays. ``--ranges`` adds an error that varies over the image by waves of one to two
+widths of the target, of a rms of so many times the noise. They are registered from 0.5 deg and
+0.002 of the extent off. Printed for
 each body, noise and number of points: the accepted scans, the normalised error squared per degree
 of freedom (mean, median, largest), the median of the claimed standard deviation of the attitude,
 that of the error, and of the processor time.
@@ -108,8 +110,9 @@ def of_bodies(args: argparse.Namespace) -> None:
                 for surface, seed in views:
                     for draw in range(args.draws):
                         v = scenes.view(surface, count, seed + draw, noise=noise)
+                        points = v.points + args.ranges * noise * surface.extent * waves(v)
                         guess, begun = scenes.off(v, 0.5, 0.002), time.process_time()
-                        found = registrars[id(surface)].register(v.points, guess, 1)
+                        found = registrars[id(surface)].register(points, guess, 1)
                         rows.append((*_claims(found, v.T_ac), 1e3 * (time.process_time() - begun)))
                 used = np.array([row for row in rows if np.isfinite(row[0])]).reshape(-1, 4)
                 nees = used[:, 0] if len(used) else np.full(1, np.nan)
@@ -120,6 +123,18 @@ def of_bodies(args: argparse.Namespace) -> None:
                     f" {error:10.3f}"
                 )
                 print(f"{what} {size} {np.median([row[3] for row in rows]):7.2f}", flush=True)
+
+
+def waves(v: scenes.View) -> np.ndarray:
+    """Displacements (n, 3) along the rays that vary slowly over the image, of a rms of 1."""
+    rng = np.random.default_rng(int(1e9 * abs(v.points[0, 0])))
+    image = v.points[:, :2] / v.points[:, 2:]
+    image = image / np.ptp(image, axis=0).max()
+    turn, size = rng.uniform(0.0, 2.0 * np.pi, 4), rng.uniform(0.5, 1.0, 4)
+    k = 2.0 * np.pi * size * np.stack([np.cos(turn), np.sin(turn)])
+    e = np.cos(image @ k + rng.uniform(0.0, 2.0 * np.pi, 4)) @ rng.standard_normal(4)
+    rays = v.points / np.linalg.norm(v.points, axis=1, keepdims=True)
+    return rays * (e / np.sqrt(np.mean(e**2)))[:, None]
 
 
 def _claims(found: object, truth: geometry.Pose) -> tuple[float, float, float]:
@@ -143,6 +158,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=1)
     parser.add_argument("--points", default="2000,4000,10000")
     parser.add_argument("--noise", default="0.002,0.004,0.008,0.015")
+    parser.add_argument("--ranges", type=float, default=0.0, help="see above")
     parser.add_argument("--quick", action="store_true", help="three short tumbles")
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 12))
     parser.add_argument("--seconds", type=float, default=120.0)

@@ -6,6 +6,8 @@ Also ``difference_covariance``: of the poses of two parts of one scan, for the t
 
 from __future__ import annotations
 
+from math import comb, factorial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,8 @@ OBSERVABLE = 1e-4
 SIGNIFICANT = 4.0
 LEAST_DETERMINED = 0.05
 ROUNDS = 8
+VARIES = 1.5
+OBSERVABLE_RANGES = 3e-4
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -67,11 +71,15 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     Returns:
         The variances; zero where every patch is a single point, or there are fewer than 24 patches.
     """
-    none = Systematic(extent_m, patch_m, 0.0, np.zeros(7), np.zeros(7), np.zeros(6), found.centre)
+    zero = np.zeros(17)
+    none = Systematic(extent_m, patch_m, 0.0, zero, zero, np.zeros(6), found.centre)
     if len(found.counts) < 2 * LEAST_HALF or found.counts.max() == 1:
         return none
     N, g, basis = _joined(found, none)
     inverse = _pseudo_inverse(N.sum(axis=0))
+    fit = inverse @ g.sum(axis=0)
+    variance, amplitudes = _range_errors(found, none, N, g - N @ fit, inverse, basis)
+    g = g - _mode_columns(found, none, N, basis) @ amplitudes
     fit = inverse @ g.sum(axis=0)
     g = g - N @ fit
     leverage = np.trace(N @ inverse, axis1=1, axis2=2) / len(fit)
@@ -81,9 +89,66 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     )
     P = inverse @ (S.sum(axis=0) + block * M) @ inverse
     strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
-    smooth = np.repeat(_common_variance(fit[strains], P[strains, strains]), 7)
+    smooth = np.repeat([_common_variance(fit[strains], P[strains, strains]), variance], (7, 10))
     smooth[6] = _common_variance(fit[strains.stop :], P[strains.stop :, strains.stop :])
-    return Systematic(extent_m, patch_m, block, smooth, basis @ fit[6:], fit[:6], found.centre)
+    every = np.concatenate([basis @ fit[6:], amplitudes])
+    return Systematic(extent_m, patch_m, block, smooth, every, fit[:6], found.centre)
+
+
+def _range_errors(
+    found: Evidence, none: Systematic, N: Array, left: Array, inverse: Array, basis: Array
+) -> tuple[float, Array]:
+    """Variance and amplitudes (10,) of the modes of the ranges, by partitioned regression from
+    what pose and amplitudes leave of the gradients (m, k).
+    """
+    D, X = _modes(found), _mode_columns(found, none, N, basis)
+    B = X.sum(axis=0).T @ inverse
+    F = np.einsum("pac,pab,pbd->cd", D, found.normals[:, 3:, 3:], D) - B @ X.sum(axis=0)
+    h = np.einsum("pac,pa->pc", D, left[:, 3:6]) - left @ B.T
+    values, vectors = np.linalg.eigh(F)
+    kept = values > OBSERVABLE_RANGES * found.counts.sum()
+    W = (vectors[:, kept] / values[kept]).T
+    along = W @ h.sum(axis=0)
+    variance = _common_variance(along, W @ h.T @ h @ W.T)
+    return variance, vectors[:, kept] @ along if variance > 0.0 else np.zeros(10)
+
+
+def _mode_columns(found: Evidence, none: Systematic, N: Array, basis: Array) -> Array:
+    """(m, k, 10): sums over each patch of the derivatives by pose and amplitudes times those by
+    each mode. The offset moves the surface along its normals, a mode along the rays.
+    """
+    D = _modes(found)
+    of_surface = np.concatenate(
+        [
+            _strains(found, none).transpose(0, 2, 1) @ found.normals[:, 3:, 3:],
+            found.offsets[:, None, 3:],
+        ],
+        axis=1,
+    )
+    return np.concatenate([found.normals[:, :, 3:] @ D, basis.T @ of_surface @ D], axis=1)
+
+
+def _modes(found: Evidence) -> Array:
+    """D (m, 3, 10): displacement of each patch per amplitude of a mode of the ranges."""
+    if found.camera_c is None:
+        return np.zeros((len(found.places), 3, 10))
+    rays = found.places - found.camera_c
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    weight = found.counts / found.counts.sum()
+    along = weight @ rays / np.linalg.norm(weight @ rays)
+    first = np.eye(3)[np.argmin(np.abs(along))]
+    first = first - (first @ along) * along
+    first /= np.linalg.norm(first)
+    across = np.stack([first, np.cross(along, first)])
+    image = found.places @ across.T
+    image = image - weight @ image
+    u, v = (image / (VARIES * np.sqrt(0.5 * weight @ np.sum(image**2, axis=1)))).T
+    terms = [
+        np.sqrt(comb(d, k) / (2**d * factorial(d))) * u ** (d - k) * v**k
+        for d in range(4)
+        for k in range(d + 1)
+    ]
+    return np.asarray(rays[:, :, None] * np.stack(terms, axis=1)[:, None, :])
 
 
 def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
@@ -128,7 +193,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
     for along in across @ found.places.T:
         low = along < np.median(along)
         D, C = np.zeros(6), np.zeros((6, 6))
-        X, Y = np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
+        X, Y = np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 17))
         for half, sign in ((low, -1.0), (~low, 1.0)):
             normals = found.normals[half]
             inverse = _inverse(normals.sum(axis=0)) if len(normals) >= LEAST_HALF else None
@@ -160,7 +225,7 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
     moves, X, Y = (
         np.zeros((patches.max() + 1, 6)),
         np.zeros((blocks.max() + 1, 6, 3)),
-        np.zeros((6, 7)),
+        np.zeros((6, 17)),
     )
     for (part, sign), k in zip(parts, which, strict=True):
         inverse = _pseudo_inverse(part.normals.sum(axis=0))
@@ -205,9 +270,15 @@ def _strains(found: Evidence, errors: Systematic) -> Array:
 
 
 def _coupling(found: Evidence, errors: Systematic) -> Array:
-    """A (m, 6, 7): sums over each patch of J times the residual per amplitude of strain and
-    offset.
+    """A (m, 6, 17): sums over each patch of J times the residual per amplitude of strain, offset
+    and modes of the ranges.
     """
+    of_ranges = found.normals[:, :, 3:] @ _modes(found)
+    return np.concatenate([_of_surface(found, errors), of_ranges], axis=2)
+
+
+def _of_surface(found: Evidence, errors: Systematic) -> Array:
+    """The same (m, 6, 7) for strain and offset."""
     return np.concatenate(
         [found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2
     )
@@ -217,7 +288,7 @@ def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
     """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k);
     their basis (7, k-6).
     """
-    T, A = _strains(found, errors), _coupling(found, errors)
+    T, A = _strains(found, errors), _of_surface(found, errors)
     m, turned = len(T), T.transpose(0, 2, 1)
     F = np.zeros((m, 7, 7))
     F[:, :6, :6] = turned @ found.normals[:, 3:, 3:] @ T

@@ -433,7 +433,7 @@ struct Table {
   PatchTable table;
 
   Table(Patches normals, Patches gradients, Patches offsets, Counts counts, Patches errors, Patches places,
-        std::array<double, 3> centre, double extent, double side)
+        std::array<double, 3> centre, double extent, double side, std::array<double, 3> camera)
       : normals(normals), gradients(gradients), offsets(offsets), errors(errors), places(places), counts(counts) {
     check_patches(normals, gradients), check_patches(normals, offsets);
     const size_t m = normals.shape(0);
@@ -441,14 +441,14 @@ struct Table {
     require(places.ndim() == 2 && places.shape(0) == m && places.shape(1) == 3, "places must be (m, 3)");
     require(extent > 0 && side > 0, "extent and patch size must be positive");
     table = {(int64_t)m, normals.data(), gradients.data(), offsets.data(), errors.data(), places.data(), counts.data(),
-             {centre[0], centre[1], centre[2]}, extent, side, {}};
+             {centre[0], centre[1], centre[2]}, extent, side, {camera[0], camera[1], camera[2]}, {}};
     complete(table, inverted(total(table.normals, table.m)));
   }
 };
 
-using Seven = std::array<double, AMPLITUDES>;
+using Amplitudes = std::array<double, AMPLITUDES>;
 
-Systematic errors_of(double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
+Systematic errors_of(double block, const Amplitudes& smooth, const Amplitudes& amplitudes, const std::array<double, 6>& fit) {
   Systematic e;
   e.block = block;
   std::copy(smooth.begin(), smooth.end(), e.smooth), std::copy(amplitudes.begin(), amplitudes.end(), e.amplitudes);
@@ -465,13 +465,13 @@ nb::tuple systematic_of(const Table& t) {
   return nb::make_tuple(e.block, a, b, c);
 }
 
-nb::tuple covariance_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
+nb::tuple covariance_of(const Table& t, double block, const Amplitudes& smooth, const Amplitudes& amplitudes, const std::array<double, 6>& fit) {
   const Systematic errors = errors_of(block, smooth, amplitudes, fit);
   const Estimated found = covariance(t.table, errors, unexplained(t.table, errors));
   return nb::make_tuple(array66(found.P), found.dof);
 }
 
-double split_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit,
+double split_of(const Table& t, double block, const Amplitudes& smooth, const Amplitudes& amplitudes, const std::array<double, 6>& fit,
                 const Patches& across) {
   require(across.ndim() == 2 && across.shape(1) == 3, "directions must be (k, 3)");
   const Systematic errors = errors_of(block, smooth, amplitudes, fit);
@@ -660,9 +660,10 @@ NB_MODULE(_kernel, m) {
   m.def("pseudo_inverse", &pseudo_inverse_of, nb::arg("N"));
   m.def("sandwich", &sandwich_of, nb::arg("normals"), nb::arg("gradients"));
   nb::class_<Table>(m, "Table")
-      .def(nb::init<Patches, Patches, Patches, Counts, Patches, Patches, std::array<double, 3>, double, double>(),
+      .def(nb::init<Patches, Patches, Patches, Counts, Patches, Patches, std::array<double, 3>, double, double,
+                    std::array<double, 3>>(),
            nb::arg("normals"), nb::arg("gradients"), nb::arg("offsets"), nb::arg("counts"), nb::arg("errors"),
-           nb::arg("places"), nb::arg("centre"), nb::arg("extent_m"), nb::arg("side_m"))
+           nb::arg("places"), nb::arg("centre"), nb::arg("extent_m"), nb::arg("side_m"), nb::arg("camera"))
       .def("systematic", &systematic_of)
       .def("size_error", [](const Table& t) { return size_error(t.table); })
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))

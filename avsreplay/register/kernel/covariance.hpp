@@ -8,7 +8,9 @@
 
 namespace avs {
 
-constexpr int AMPLITUDES = 7;  // six of a strain and the offset
+constexpr int SURFACE = 7;                    // amplitudes of errors of the surface: six of a strain and the offset
+constexpr int RANGES = 10;                    // modes of an error of the ranges: a polynomial of third degree over the image
+constexpr int AMPLITUDES = SURFACE + RANGES;  // of all
 using Six = Square<6>;
 using Coupling = std::array<std::array<double, AMPLITUDES>, 6>;
 
@@ -25,10 +27,12 @@ struct PatchTable {
   const int64_t* counts;
   double centre[3];     // about which the strain is taken
   double extent, side;  // of the model, and of a patch [m]
+  double camera[3];     // where the rays begin; NaN where that is not known, and errors of the ranges are not fitted
 
   // What follows from these, see `complete`.
   Inverted total;                       // of the sum of the normals
   std::vector<Coupling> coupling = {};  // of each patch, sums of J times the residual per amplitude
+  std::vector<std::array<std::array<double, RANGES>, 3>> ranges = {};  // displacement of a patch per amplitude of the modes
   std::vector<int64_t> block = {};  // the number of the block of each patch, in the order of the blocks' places
   int64_t blocks = 0;
 };

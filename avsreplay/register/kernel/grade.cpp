@@ -77,11 +77,12 @@ bool is_bounded(const Six& P, double extent) {
 }
 
 // Covariance, test of halves and error of size.
-void measure(const PatchArrays& sums, const Inverted& all, const GradeRule& rule, Grade& out) {
+void measure(const PatchArrays& sums, const Inverted& all, const GradeRule& rule, const std::array<double, 3>& camera, Grade& out) {
   const int64_t directions = (int64_t)rule.across.size() / 3;
   const double* c = out.centre;
   PatchTable table{sums.size(), sums.normals.data(), sums.gradients.data(), sums.offsets.data(), sums.errors.data(),
-                   sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side, {}};
+                   sums.places.data(), sums.counts.data(), {c[0], c[1], c[2]}, rule.extent, rule.patches.side,
+                   {camera[0], camera[1], camera[2]}, {}};
   complete(table, all);
   Systematic errors;
   std::vector<double> left;
@@ -178,7 +179,9 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
     whole.without(noise.patches), sums.without(noise.patches);
     step_of(whole, whole_scan.inverse, gradient, step);
   }
-  measure(sums, all, rule, out);
+  std::array<double, 3> camera{nan, nan, nan};
+  if (patches.facing) camera = {T[3], T[7], T[11]};
+  measure(sums, all, rule, camera, out);
   out.bounded = is_bounded(out.covariance.P, rule.extent);
   const bool large = length(step) > rule.turn || length(step + 3) > rule.move;
   out.beyond = large && form(pseudo_inverse(with_noise(out)), step) > BEYOND;

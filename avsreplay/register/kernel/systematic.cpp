@@ -16,7 +16,11 @@ constexpr double SIGNIFICANT = 4.0;        // twice the log likelihood ratio: 2 
 constexpr double LEAST_DETERMINED = 0.05;  // with less of the displacements of blocks left by the fit they are not estimated
 constexpr int ROUNDS = 8;                  // of the maximum likelihood estimate; the last ones change nothing
 constexpr int PAIRS[6][2] = {{0, 0}, {1, 1}, {2, 2}, {0, 1}, {0, 2}, {1, 2}};  // of a strain
-constexpr int JOINED = 6 + AMPLITUDES;     // pose and amplitudes
+constexpr int JOINED = 6 + SURFACE;        // pose and amplitudes of the surface
+// Over the rms radius of the image: the length over which an error of the ranges varies. A smaller value leaves the errors
+// too small that no residual shows, as those of a constant, a larger one makes the modes unobservable.
+constexpr double VARIES = 1.5;
+constexpr double OBSERVABLE_RANGES = 3e-4;  // as OBSERVABLE, for the modes of the ranges
 using Joined = Square<JOINED>;
 using Row = std::array<double, JOINED>;
 
@@ -31,10 +35,10 @@ struct Equations {
 // The observable combinations of the amplitudes, from the sum of N over all patches.
 void observable(const PatchTable& t, const Joined& all, Equations& out) {
   const Six& inverse = t.total.inverse;
-  double points = 0, free[AMPLITUDES][AMPLITUDES];
+  double points = 0, free[SURFACE][SURFACE];
   for (int64_t p = 0; p < t.m; ++p) points += (double)t.counts[p];
-  for (int r = 0; r < AMPLITUDES; ++r)
-    for (int c = 0; c < AMPLITUDES; ++c) {
+  for (int r = 0; r < SURFACE; ++r)
+    for (int c = 0; c < SURFACE; ++c) {
       free[r][c] = all.v[6 + r][6 + c];
       for (int i = 0; i < 6; ++i)
         for (int j = 0; j < 6; ++j) free[r][c] -= all.v[i][6 + r] * inverse.v[i][j] * all.v[j][6 + c];
@@ -72,10 +76,10 @@ Equations joined(const PatchTable& t, Joined& all) {
     for (int i = 0; i < 6; ++i) {
       g[i] = t.gradients[6 * p + i];
       for (int j = 0; j < 6; ++j) N.v[i][j] = t.normals[36 * p + 6 * i + j];
-      for (int c = 0; c < AMPLITUDES; ++c) N.v[i][6 + c] = N.v[6 + c][i] = A[i][c];
+      for (int c = 0; c < SURFACE; ++c) N.v[i][6 + c] = N.v[6 + c][i] = A[i][c];
     }
     for (int r = 0; r < 6; ++r) {
-      for (int c = 0; c < AMPLITUDES; ++c) N.v[6 + r][6 + c] = T[0][r] * A[3][c] + T[1][r] * A[4][c] + T[2][r] * A[5][c];
+      for (int c = 0; c < SURFACE; ++c) N.v[6 + r][6 + c] = T[0][r] * A[3][c] + T[1][r] * A[4][c] + T[2][r] * A[5][c];
       N.v[12][6 + r] = N.v[6 + r][12];
       g[6 + r] = T[0][r] * g[3] + T[1][r] * g[4] + T[2][r] * g[5];
     }
@@ -218,13 +222,14 @@ double block_variance(const PatchTable& t, const Equations& q, const std::vector
 
 // Variance t of the `size` values from `first` on, ~ N(0, t I + P), of greatest likelihood, by weighted moments; 0 where it
 // is not significant.
-double common_variance(const double* values, const Joined& P, int first, int size) {
+template <int N>
+double common_variance(const double* values, const Square<N>& P, int first, int size) {
   if (size == 0) return 0;
-  Six A, V;
+  Square<N> A, V;
   for (int i = 0; i < size; ++i)
     for (int j = 0; j < size; ++j) A.v[i][j] = P.v[first + i][first + j];
   eigen(A.v, V.v, size, 1e-32);
-  double square[6], variance[6], t = 0;
+  double square[N], variance[N], t = 0;
   for (int k = 0; k < size; ++k) {
     double along = 0;
     for (int i = 0; i < size; ++i) along += V.v[i][k] * values[first + i];
@@ -261,6 +266,149 @@ std::vector<double> take_fit(Equations& q, const Joined& inverse, const double* 
   return enlarge;
 }
 
+// Fits pose and amplitudes to the gradients and adds them to `fit` of the observable part and to `all`. Takes the fit from the
+// gradients, and returns how much the leverage of each patch enlarges their covariance.
+std::vector<double> fitted(Equations& q, const Joined& reduced, const Joined& inverse, double (&fit)[JOINED], double (&all)[JOINED]) {
+  Row g{};
+  for (const Row& each : q.g)
+    for (int i = 0; i < JOINED; ++i) g[i] += each[i];
+  double found[JOINED] = {};
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) fit[i] += reduced.v[i][j] * g[j], found[i] += inverse.v[i][j] * g[j];
+  for (int i = 0; i < JOINED; ++i) all[i] += found[i];
+  return take_fit(q, inverse, found);
+}
+
+// Amplitudes of the modes of the ranges, and their variance, 0 if it is not significant.
+struct Ranges {
+  double variance = 0, amplitudes[RANGES] = {};
+};
+
+// Sums over a patch of the residuals' derivatives by pose and amplitudes times that by each mode, from its normal equations.
+using Crossed = std::array<std::array<double, RANGES>, JOINED>;
+
+Crossed crossed(const PatchTable& t, const Equations& q, int64_t p) {
+  Crossed X{};
+  const auto& D = t.ranges[(size_t)p];
+  for (int i = 0; i < JOINED; ++i)
+    for (int a = 0; a < 3; ++a)
+      for (int c = 0; c < RANGES; ++c) X[(size_t)i][(size_t)c] += q.N[p].v[i][3 + a] * D[(size_t)a][(size_t)c];
+  return X;
+}
+
+// The modes in the common fit with pose and amplitudes, from what these leave of the gradients: of each patch the part of its
+// gradient by the modes that they do not explain.
+Ranges range_errors(const PatchTable& t, const Equations& q, const Joined& inverse) {
+  Ranges out;
+  Crossed all{};
+  Square<RANGES> F, S, V;
+  double points = 0;
+  for (int64_t p = 0; p < t.m; ++p) {
+    const Crossed X = crossed(t, q, p);
+    const auto& D = t.ranges[(size_t)p];
+    points += (double)t.counts[p];
+    for (size_t i = 0; i < JOINED; ++i)
+      for (size_t c = 0; c < RANGES; ++c) all[i][c] += X[i][c];
+    for (size_t a = 0; a < 3; ++a)
+      for (size_t b = 0; b < RANGES; ++b)
+        for (size_t c = 0; c < RANGES; ++c) F.v[b][c] += D[a][b] * X[3 + a][c];
+  }
+  double B[RANGES][JOINED] = {};  // of the gradients of pose and amplitudes, those of the modes
+  for (size_t c = 0; c < RANGES; ++c)
+    for (size_t i = 0; i < JOINED; ++i)
+      for (size_t j = 0; j < JOINED; ++j) B[c][i] += all[j][c] * inverse.v[j][i];
+  for (size_t b = 0; b < RANGES; ++b)
+    for (size_t c = 0; c < RANGES; ++c)
+      for (size_t i = 0; i < JOINED; ++i) F.v[b][c] -= B[b][i] * all[i][c];
+  double sum[RANGES] = {};
+  for (int64_t p = 0; p < t.m; ++p) {
+    double h[RANGES] = {};
+    const Row& g = q.g[(size_t)p];
+    for (size_t c = 0; c < RANGES; ++c) {
+      for (size_t a = 0; a < 3; ++a) h[c] += t.ranges[(size_t)p][a][c] * g[3 + a];
+      for (size_t i = 0; i < JOINED; ++i) h[c] -= B[c][i] * g[i];
+      sum[c] += h[c];
+    }
+    for (int b = 0; b < RANGES; ++b)
+      for (int c = 0; c < RANGES; ++c) S.v[b][c] += h[b] * h[c];
+  }
+  eigen(F.v, V.v, RANGES, 1e-32);
+  double values[RANGES] = {}, W[RANGES][RANGES] = {};  // W: amplitudes along the observable combinations, from the sums
+  int n = 0;
+  for (int k = 0; k < RANGES; ++k) {
+    if (!(F.v[k][k] > OBSERVABLE_RANGES * points)) continue;
+    for (int c = 0; c < RANGES; ++c) W[n][c] = V.v[c][k] / F.v[k][k], values[n] += W[n][c] * sum[c];
+    for (int c = 0; c < RANGES; ++c) out.amplitudes[c] += V.v[c][k] * values[n];
+    ++n;
+  }
+  Square<RANGES> P;
+  for (int k = 0; k < n; ++k)
+    for (int l = 0; l < n; ++l)
+      for (int b = 0; b < RANGES; ++b)
+        for (int c = 0; c < RANGES; ++c) P.v[k][l] += W[k][b] * S.v[b][c] * W[l][c];
+  out.variance = common_variance(values, P, 0, n);
+  return out.variance > 0 ? out : Ranges();
+}
+
+// Takes the modes of the ranges from the gradients.
+void take_ranges(const PatchTable& t, const Ranges& ranges, Equations& q) {
+  for (int64_t p = 0; p < t.m; ++p) {
+    const Crossed X = crossed(t, q, p);
+    for (size_t i = 0; i < JOINED; ++i)
+      for (size_t c = 0; c < RANGES; ++c) q.g[(size_t)p][i] -= X[i][c] * ranges.amplitudes[c];
+  }
+}
+
+// The modes at each patch: the terms of a polynomial over the image, along the rays. The terms are weighted so that equal
+// variances of their amplitudes do not depend on the axes of the image, and give a random field that varies over one unit.
+void image_modes(PatchTable& t) {
+  t.ranges.resize((size_t)t.m);
+  if (!std::isfinite(t.camera[0])) return;
+  std::vector<std::array<double, 3>> rays((size_t)t.m);
+  double along[3] = {}, centre[2] = {}, points = 0;
+  for (int64_t p = 0; p < t.m; ++p) {
+    std::array<double, 3>& r = rays[(size_t)p];
+    double length = 0;
+    for (size_t a = 0; a < 3; ++a) r[a] = t.places[3 * p + (int64_t)a] - t.camera[a], length += r[a] * r[a];
+    for (double& x : r) x /= std::sqrt(length);
+    for (size_t a = 0; a < 3; ++a) along[a] += (double)t.counts[p] * r[a];
+    points += (double)t.counts[p];
+  }
+  int least = 0;
+  for (int a = 1; a < 3; ++a)
+    if (std::fabs(along[a]) < std::fabs(along[least])) least = a;
+  double axes[2][3] = {};
+  axes[0][least] = 1;
+  const double square = along[0] * along[0] + along[1] * along[1] + along[2] * along[2];
+  double size = 0;
+  for (int a = 0; a < 3; ++a) axes[0][a] -= along[least] / square * along[a], size += axes[0][a] * axes[0][a];
+  for (int a = 0; a < 3; ++a) axes[0][a] /= std::sqrt(size);
+  for (int a = 0; a < 3; ++a)
+    axes[1][a] = (along[(a + 1) % 3] * axes[0][(a + 2) % 3] - along[(a + 2) % 3] * axes[0][(a + 1) % 3]) / std::sqrt(square);
+  std::vector<std::array<double, 2>> image((size_t)t.m);
+  for (int64_t p = 0; p < t.m; ++p)
+    for (size_t k = 0; k < 2; ++k) {
+      for (int64_t a = 0; a < 3; ++a) image[(size_t)p][k] += axes[k][a] * t.places[3 * p + a];
+      centre[k] += (double)t.counts[p] / points * image[(size_t)p][k];
+    }
+  double spread = 0;
+  for (int64_t p = 0; p < t.m; ++p)
+    for (size_t k = 0; k < 2; ++k) spread += (double)t.counts[p] / points * (image[(size_t)p][k] - centre[k]) * (image[(size_t)p][k] - centre[k]);
+  const double unit = VARIES * std::sqrt(std::max(0.5 * spread, std::numeric_limits<double>::min()));
+  constexpr double WEIGHTS[4] = {1, 0.7071067811865476, 0.3535533905932738, 0.14433756729740643};  // 1 / sqrt(2^d d!)
+  constexpr double TERMS[4][4] = {{1}, {1, 1}, {1, 1.4142135623730951, 1}, {1, 1.7320508075688772, 1.7320508075688772, 1}};
+  for (int64_t p = 0; p < t.m; ++p) {
+    const double u = (image[(size_t)p][0] - centre[0]) / unit, v = (image[(size_t)p][1] - centre[1]) / unit;
+    size_t mode = 0;
+    for (int d = 0; d < 4; ++d)
+      for (int k = 0; k <= d; ++k, ++mode) {
+        double value = WEIGHTS[d] * TERMS[d][k];
+        for (int i = 0; i < d; ++i) value *= i < d - k ? u : v;
+        for (size_t a = 0; a < 3; ++a) t.ranges[(size_t)p][a][mode] = rays[(size_t)p][a] * value;
+      }
+  }
+}
+
 }  // namespace
 
 // Displacement of the middle of a patch per amplitude of the strain.
@@ -281,11 +429,14 @@ void couple(const PatchTable& t, int64_t p, const double (&T)[3][6], Coupling& A
   for (int i = 0; i < 6; ++i) {
     for (int k = 0; k < 6; ++k) A[i][k] = N[6 * i + 3] * T[0][k] + N[6 * i + 4] * T[1][k] + N[6 * i + 5] * T[2][k];
     A[i][6] = t.offsets[6 * p + i];
+    for (int k = 0; k < RANGES; ++k)
+      for (int a = 0; a < 3; ++a) A[i][SURFACE + k] += N[6 * i + 3 + a] * t.ranges[(size_t)p][(size_t)a][(size_t)k];
   }
 }
 
 void complete(PatchTable& t, const Inverted& all) {
   t.total = all;
+  image_modes(t);
   t.coupling.resize((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
     double T[3][6];
@@ -314,14 +465,11 @@ Systematic systematic_errors(const PatchTable& t) {
   Joined N, M, spread;
   Equations q = joined(t, N);
   const int n = q.n;
-  Row g{};
-  for (int64_t p = 0; p < t.m; ++p)
-    for (int i = 0; i < JOINED; ++i) g[i] += q.g[p][i];
   const Joined back = transposed(q.basis), reduced = product(pseudo_inverse(about(back, N), n), back), inverse = product(q.basis, reduced);
   double fit[JOINED] = {}, all[JOINED] = {};  // of the observable part, and of pose and amplitudes
-  for (int i = 0; i < JOINED; ++i)
-    for (int j = 0; j < JOINED; ++j) fit[i] += reduced.v[i][j] * g[j], all[i] += inverse.v[i][j] * g[j];
-  const std::vector<double> enlarge = take_fit(q, inverse, all);
+  std::vector<double> enlarge = fitted(q, reduced, inverse, fit, all);
+  const Ranges ranges = range_errors(t, q, inverse);
+  if (ranges.variance > 0) take_ranges(t, ranges, q), enlarge = fitted(q, reduced, inverse, fit, all);
   for (int64_t p = 0; p < t.m; ++p) add_outer(enlarge[p], q.g[p], q.g[p], spread);
   out.block = block_variance(t, q, enlarge, spread, inverse, M);
   for (int i = 0; i < JOINED; ++i)
@@ -330,7 +478,8 @@ Systematic systematic_errors(const PatchTable& t) {
   const double strain = common_variance(fit, P, 6, q.strains);
   for (int k = 0; k < 6; ++k) out.smooth[k] = strain, out.fit[k] = fit[k];
   out.smooth[6] = common_variance(fit, P, 6 + q.strains, n - 6 - q.strains);
-  for (int r = 0; r < AMPLITUDES; ++r) out.amplitudes[r] = all[6 + r];
+  for (int r = 0; r < SURFACE; ++r) out.amplitudes[r] = all[6 + r];
+  for (int k = 0; k < RANGES; ++k) out.smooth[SURFACE + k] = ranges.variance, out.amplitudes[SURFACE + k] = ranges.amplitudes[k];
   return out;
 }
 
