@@ -84,7 +84,7 @@ class Assessment:
 
     @property
     def lowers_grade(self) -> bool:
-        """Whether a run with this assessment has a reason for concern beside the tracking.
+        """Whether the assessment is a reason for concern beside the tracking.
 
         A capture that is not assessed, because the assumed grasp point cannot be used or plans are
         switched off, is none.

@@ -123,6 +123,19 @@ def _replaces(place: Path, source: Path) -> bool:
     return place.suffix != ".html"
 
 
+def _check_replaced(path: Path, mode: int, overwrite: bool, folder: bool) -> None:
+    """Raise UsageError where what is at the place of an output cannot be replaced by it."""
+    if stat.S_ISDIR(mode) != folder:
+        what = "is not a folder" if folder else "is a folder"
+        raise UsageError(what, where=str(path), hint="name another output")
+    if not folder and not stat.S_ISREG(mode):
+        raise UsageError("is not a regular file", where=str(path), hint="name another output")
+    if not overwrite:
+        raise UsageError(
+            "already exists", where=str(path), hint="choose another name, or add --overwrite"
+        )
+
+
 def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
     if path == STDOUT:
         if folder:
@@ -131,18 +144,10 @@ def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
             )
         return
     place = path.resolve()
-    there = place.stat().st_mode if place.exists() else None
-    if there is not None and not folder and is_stream(place):
-        return
-    if there is not None and stat.S_ISDIR(there) != folder:
-        what = "is not a folder" if folder else "is a folder"
-        raise UsageError(what, where=str(path), hint="name another output")
-    if there is not None and not folder and not stat.S_ISREG(there):
-        raise UsageError("is not a regular file", where=str(path), hint="name another output")
-    if there is not None and not overwrite:
-        raise UsageError(
-            "already exists", where=str(path), hint="choose another name, or add --overwrite"
-        )
+    if place.exists():
+        if not folder and is_stream(place):
+            return
+        _check_replaced(path, place.stat().st_mode, overwrite, folder)
     parent = place.parent
     while folder and not parent.exists():
         parent = parent.parent

@@ -174,7 +174,7 @@ def record_scenario(
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, SIMULATED_EPOCH_NS)
-        tally = write_scans(
+        tally = write_recorded(
             pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_poses
         )
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
@@ -230,7 +230,7 @@ def record_source(
             # poses
             seen = (replace(s, points=opened.in_own_frame(s)) for s in scans) if moved else scans
             pairs = _with_faults(seen, header, options, epoch_ns)
-            tally = write_scans(
+            tally = write_recorded(
                 pairs,
                 opened.truth_of,
                 writer,
@@ -291,7 +291,7 @@ class _Tally:
         return label.kind, start, end, label.harmful
 
 
-def write_scans(
+def write_recorded(
     pairs: Iterable[tuple[Scan, Scan | None]],
     truth_of: Callable[[Scan], Truth],
     writer: LogWriter,

@@ -2,6 +2,9 @@
 the smoothing pass against bodies that another integrator moves.
 """
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -126,8 +129,11 @@ def _scene(
     offset=0.0,
     share=0.1,
     wrong=0.0,
+    torque_at=None,
 ):
-    """Poses of a random body, its true states, and the true steps at 45.2 s."""
+    """Poses of a random body, its true states, and the true steps at 45.2 s; ``torque_at``: time
+    and rate to angular acceleration.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, 77]))
     world = tumbling.draw(seed, seconds=seconds, hz=HZ, sigma_max=0.85)
     x, states, turned = world.states[0], [world.states[0]], np.zeros(3)
@@ -143,6 +149,7 @@ def _scene(
         if abs(t - 45.25) < 0.5 * h:
             v, w = v + steps[0], w + steps[1]
             turned = geometry.matrix(x.q_bc).T @ steps[1]
+        w = w if torque_at is None else w + h * torque_at(t + 0.5 * h, x.w_b)
         x = tumbling.follow(
             np.array([0.0, h]), world.moments, replace(x, w_b=x.w_b + w, v_a=x.v_a + v)
         )[-1]
@@ -194,6 +201,7 @@ def test_without_an_event_none_is_found_and_the_claims_hold(case):
         fixes, states, _, _ = _scene(seed, **case)
         found = smoothed(fixes, PARAMS)
         assert found.events == ()
+        assert all(names for _, names in found.rivals)  # another set than the best one
         squares += [_squares(found.beliefs[k], states[k]) for k in range(0, len(fixes), 20)]
         if "random" in case:
             assert 0.4 < found.torque / case["random"][0] < 2.0
@@ -268,3 +276,26 @@ def test_the_same_poses_give_the_same_motion_whatever_the_store():
 def test_three_poses_are_too_few():
     with pytest.raises(UsageError, match="only 3"):
         smoothed(_scene(331, seconds=1.0)[0], PARAMS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("torque_at", "words"),
+    [
+        (lambda t, w: 3e-4 * np.sin(0.1 * np.pi * t) * np.array([0.6, -0.5, 0.62]), "periodic"),
+        (lambda t, w: -0.005 * w, "drag of 0.5"),
+        (None, ""),
+    ],
+    ids=["periodic", "drag", "free"],
+)
+def test_the_verdict_names_what_acts_on_the_target(tmp_path, torque_at, words):
+    fixes = _scene(341, seconds=90.0, torque_at=torque_at)[0]
+    lines = [(1.0 + fix.t_ns * 1e-9, *fix.T_ac.t.tolist(), *fix.T_ac.q.tolist()) for fix in fixes]
+    log, out = tmp_path / "poses.tum", tmp_path / "out"
+    log.write_text("\n".join(" ".join(map(repr, line)) for line in lines))
+    command = [sys.executable, "-m", "avsreplay", "run", str(log), "--backend", "poses"]
+    command += ["--extent", str(EXTENT), "-o", str(out), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    verdict = json.loads(done.stdout)["verdict"]
+    assert (f"by all poses of the log: {words}" in verdict["line"]) == bool(words)
+    assert (verdict["tracking"] == "PASS") == (not words)

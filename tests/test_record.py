@@ -311,7 +311,7 @@ def test_messages_that_cannot_be_decoded_are_left_out_and_counted():
         def write_truth(self, *truth):
             assert len(truth) == 4
 
-    tally = recording.write_scans(
+    tally = recording.write_recorded(
         [(scan, scan) for scan in scans],
         truth_of,
         Writer(),

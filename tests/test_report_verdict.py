@@ -54,6 +54,18 @@ def test_a_good_run_passes(make_rows):
     assert found.line == "PASS: no reason for concern was found."
 
 
+@pytest.mark.parametrize(
+    ("known", "odds", "stated"), [(None, 40.0, True), (30.0, 40.0, False), (None, 2.0, False)]
+)
+def test_an_event_that_only_the_whole_log_shows_is_a_reason(make_rows, known, odds, stated):
+    words = "periodic torque of 0.3 +- 0.02 mrad/s2, period 20 s"
+    event = {"kind": "periodic_torque", "words": words, "log_odds": odds, "first_known_s": known}
+    found = _judged(_good(make_rows), header={**HEADER, "smoothed": {"events": [event]}})
+    assert (words in found.line) == stated
+    assert found.tracking is (Grade.CHECK if stated else Grade.PASS)
+    assert _judged(_good(make_rows), header={**HEADER, "smoothed": None}).tracking is Grade.PASS
+
+
 def test_no_healthy_scan_fails(make_rows):
     rows = _good(
         make_rows,

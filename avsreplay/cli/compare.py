@@ -115,14 +115,7 @@ def compare_command(
     if all(path.suffix == ".json" for path in results):
         _compare_benchmarks(results, as_json, as_markdown)
         return
-    if (junit or github) and not gate:
-        raise UsageError(
-            "--junit and --github need --gate", hint="name the rules with --gate rules.toml"
-        )
-    check_outputs("junit")
-    check_outputs("output", overwrite=overwrite)
-    if output:
-        check_suffix(output, *HTML)
+    _check_options(gate, junit or github, output, overwrite)
     rules = gates.load_rules(gate) if gate else ()
     groups = _with_distinct_names([_group(path) for path in results])
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]
@@ -140,6 +133,20 @@ def compare_command(
     gates.check_gate(outcomes)
     if gate:
         _check_sources([run for group in groups for run in group.runs])
+
+
+def _check_options(
+    gate: Path | None, needs_gate: object, output: Path | None, overwrite: bool
+) -> None:
+    """Raise UsageError where options do not fit to one another or an output cannot be written."""
+    if needs_gate and not gate:
+        raise UsageError(
+            "--junit and --github need --gate", hint="name the rules with --gate rules.toml"
+        )
+    check_outputs("junit")
+    check_outputs("output", overwrite=overwrite)
+    if output:
+        check_suffix(output, *HTML)
 
 
 def _compare_benchmarks(paths: Sequence[Path], as_json: bool, as_markdown: bool) -> None:

@@ -16,7 +16,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -284,25 +284,7 @@ def entry_point() -> None:
     one line on stderr.
     """
     output, received = _standard_output(), interrupts.hear()
-    try:
-        code = group.main(
-            standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY"
-        )
-    except AvsError as error:
-        code = _fail(str(error), error.exit_code)
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
-        code = error.exit_code
-    except click.ClickException as error:
-        code = _fail(_with_help(error), error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        interrupts.forget()
-        code = _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
-    except OSError as error:
-        code = _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
-    except Exception as error:
-        code = _crash(error)
-    code = code if isinstance(code, int) else 0
+    code = _run(received)
     sys.stdout.flush()
     if output and output.failure and not code:
         closed = isinstance(output.failure, BrokenPipeError)
@@ -312,6 +294,33 @@ def entry_point() -> None:
             else _fail(f"standard output: {output.failure.strerror or output.failure}", 3)
         )
     sys.exit(code)
+
+
+def _run(received: Sequence[int]) -> int:
+    """Run the command; return its exit code.
+
+    Args:
+        received: the signals that have been received, last one last.
+    """
+    try:
+        code = group.main(
+            standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY"
+        )
+    except AvsError as error:
+        return _fail(str(error), error.exit_code)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return error.exit_code
+    except click.ClickException as error:
+        return _fail(_with_help(error), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        interrupts.forget()
+        return _fail("interrupted", 128 + (received or [signal.SIGINT])[-1])
+    except OSError as error:
+        return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
+    except Exception as error:
+        return _crash(error)
+    return code if isinstance(code, int) else 0
 
 
 def _with_help(error: click.ClickException) -> str:

@@ -241,13 +241,20 @@ def _changes(
     planning: Replanning, saved: Saved, flags: dict[str, Any], index: int
 ) -> list[PossibleChange]:
     """Return single changes with which a plan is found: of settings, then of the instant."""
+    return [*_other_settings(planning, saved, flags, index), *_later_begin(planning, saved, index)]
+
+
+def _other_settings(
+    planning: Replanning, saved: Saved, flags: dict[str, Any], index: int
+) -> list[PossibleChange]:
+    """At most MOST_CHANGES single settings with another value, with each of which a plan is
+    found.
+    """
     from dataclasses import replace
-    from itertools import islice
 
     from avsreplay.cli.plan_output import PossibleChange
     from avsreplay.errors import UsageError
     from avsreplay.saved_result import with_settings
-    from avsreplay.tables import column_of
 
     options = {p.name: p.opts[0] for p in click.get_current_context().command.params}
     params, limits = _given(saved, flags)
@@ -271,6 +278,16 @@ def _changes(
                 option = f"{options[name]} {value}" if name in options else f"--set {key}={value}"
                 out.append(PossibleChange(key, option, saved.rows[index].t_s, made))
                 break
+    return out
+
+
+def _later_begin(planning: Replanning, saved: Saved, index: int) -> list[PossibleChange]:
+    """The first later instant at which a plan is found, if there is one."""
+    from itertools import islice
+
+    from avsreplay.cli.plan_output import PossibleChange
+    from avsreplay.tables import column_of
+
     for later_s in LATER_BEGINS_S:
         at_s = saved.rows[index].t_s + later_s
         known = zip(column_of(saved.rows, "t_s"), column_of(saved.rows, "converged"), strict=True)
@@ -278,13 +295,9 @@ def _changes(
         for later in islice(later_ones, 1):
             made = planning.plan_at(later)
             if made.found:
-                return [
-                    *out,
-                    PossibleChange(
-                        "--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made
-                    ),
-                ]
-    return out
+                at_s = saved.rows[later].t_s
+                return [PossibleChange("--at", f"--at {at_s:.2f}", at_s, made)]
+    return []
 
 
 def _scaled(value: Any, factor: float) -> tuple[str, Any]:

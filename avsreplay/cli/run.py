@@ -27,7 +27,7 @@ from avsreplay.cli.options import (
 from avsreplay.errors import CheckFailed, UsageError, value_class
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import Callable, Generator, Mapping, Sequence
 
     from avsreplay.log import GrowingLog
     from avsreplay.model_size import Advice
@@ -388,7 +388,7 @@ def _replayed(
             record["interrupted_after"] = len(rows)
             _say_interrupted(run, rows, resumable=keeper is not None)
         if keeper:
-            record["smoothed"] = _smoothed_record(run, summary)
+            record["smoothed"] = _smoothed_record(run, rows, summary)
             keeper.finish(record, resumable=interrupted and not run.job.growing)
     return _Finished(
         rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds
@@ -560,7 +560,7 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     }
 
 
-def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
+def _smoothed_record(run: Run, rows: Sequence[Row], summary: Summary) -> dict[str, Any] | None:
     """The events of the whole log, with the time at which each was first known from the scans so
     far; None where too few poses are healthy.
     """
@@ -569,14 +569,25 @@ def _smoothed_record(run: Run, summary: Summary) -> dict[str, Any] | None:
         return None
     record = motion.smoothed.record(run.taken[0].t_ns)
     for event in record["events"]:
-        away = 3.0 * event["onset_1s_s"] + _SAME_EVENT_S
-        near = (
-            change.reported_s
-            for change in summary.velocity_changes
-            if abs(change.t_s - event["onset_s"]) <= away
-        )
-        event["first_known_s"] = min(near, default=None)
+        event["first_known_s"] = _first_known_s(event, rows, summary)
     return record
+
+
+def _first_known_s(event: Mapping[str, Any], rows: Sequence[Row], summary: Summary) -> float | None:
+    """Time of the first row that contains an event of the whole log; None where none does."""
+    from avsreplay.tables import column_of
+
+    kind, onset_s = event["kind"], event["onset_s"]
+    away = 3.0 * event["onset_1s_s"] + _SAME_EVENT_S
+    times = column_of(rows, "t_s")
+    if kind in ("torque", "force"):
+        stated = zip(times, column_of(rows, "drift_s"), strict=True)
+        return next((t for t, since in stated if since is not None), None)
+    if kind == "sensor_offset":
+        reasons = zip(times, column_of(rows, "reason"), strict=True)
+        return next((t for t, why in reasons if why == "sensor_bias" and t >= onset_s - away), None)
+    near = (c.reported_s for c in summary.velocity_changes if abs(c.t_s - onset_s) <= away)
+    return min(near, default=None) if kind in ("rate_step", "velocity_step") else None
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

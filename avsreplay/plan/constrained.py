@@ -10,7 +10,9 @@ accepted only after the true constraints hold at sixteen instants of every inter
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 from operator import attrgetter
 
 import numpy as np
@@ -149,7 +151,7 @@ def linearised_s(
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, 1.5 * end_s + COAST_S)
     limits = replace(limits, nodes=n)
     case = Case(sampled, limits, params, path.r0, path.v0, BUFFER_OF_EXTENT * extent_m)
-    tried = Tried.near(path.escapes, case.wait_s, end_s)
+    tried = Tried.near(path.escapes, case.wait_s, end_s, case.reserve_m)
     away = withdrawn(case, path, tried, improve=False)
     reference = warm_reference(case, path, 0.0)
     change, off = largest_change(case, reference, TRUST), np.zeros((2 * n, len(CONSTRAINTS)))
@@ -263,7 +265,7 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     worst, name = worst_margin(case, path)
     if worst < 0.0:
         return None
-    away = proven(case, path, withdrawn(case, path, Tried.first()))
+    away = proven(case, path, withdrawn(case, path))
     if away.short_m > 0.0:
         return None
     return replace(free, violation_m=0.0, margin_m=worst, binding=name, escapes=away.escapes)
@@ -275,8 +277,8 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     position, velocity = found.terminal_errors(case.scene.goal)
     worst, name = worst_margin(case, found)
     escapes = found.escapes
-    if found.short_m > 0.0 and case.space is not None:  # the search ended at the first short ones
-        escapes = certified(case.space, found, case.wait_s, escapes).escapes
+    if found.short_m > 0.0 and case.stated is not None:  # the search ended at the first short ones
+        escapes = certified(case.stated, found, case.wait_s, escapes).escapes
     return Plan(
         t_ns=t_ns,
         status=PlanStatus.OPTIMAL
@@ -325,15 +327,45 @@ def _best_path(
         )
         if other is not None and other.t_go_s >= case.earliest_s:
             return other
-    best = _improved(case, coarse, drafts, best)
-    if drafts and best is None:
-        near = sorted(
-            initial_references(case, free),
-            key=lambda reference: abs(reference.t - drafts[0].t_go_s),
-        )
-        for reference in near[:RETRIED]:
-            best = best or _converged(case, reference)
-    return best if best is None else _moved(case, best)
+    plain = replace(case, limits=replace(case.limits, abort=False))
+    near = _near(case, free, drafts)
+    found = _improved(plain, coarse, drafts, None)
+    for reference in near if found is None else ():
+        found = found or _converged(plain, reference)
+    if found is None:
+        return best
+    found = _moved(plain, found)
+    if case.space is None or not case.limits.abort:
+        return found if best is None else min(best, found, key=_safest)
+    away = proven(case, found, withdrawn(case, found))
+    found = replace(found, escapes=away.escapes, short_m=away.short_m)
+    known = [path for path in (best, found) if path is not None]
+    for path in _withdrawing(case, found, drafts, near):
+        known += [] if path is None else [path]
+        if min(known, key=_safest).short_m <= case.reserve_m:
+            break
+    return min(known, key=_safest)
+
+
+def _near(case: Case, free: Plan, drafts: list[StepPath]) -> list[ReferencePath]:
+    """Return the initial paths whose end times are nearest to that of the earliest draft."""
+    if not drafts:
+        return []
+    references = initial_references(case, free)
+    references.sort(key=lambda reference: abs(reference.t - drafts[0].t_go_s))
+    return references[:RETRIED]
+
+
+def _withdrawing(
+    case: Case, found: StepPath, drafts: list[StepPath], near: list[ReferencePath]
+) -> Iterator[StepPath | None]:
+    """Search paths that keep the withdrawals: from the path that was found without them, then from
+    the drafts, then from initial paths.
+    """
+    for start, trust in product((found, *drafts[:IMPROVED]), (TRUST, CAREFUL)):
+        yield _refined(case, start, trust=trust)
+    for reference in near:
+        yield _converged(case, reference)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
@@ -429,7 +461,8 @@ def _refined(
     requires.
     """
     known = path.escapes if isinstance(path, StepPath) else None
-    away = withdrawn(case, path, Tried.near(known, since_s + case.wait_s, path.t_go_s), since_s)
+    tried = Tried.near(known, since_s + case.wait_s, path.t_go_s, case.reserve_m)
+    away = withdrawn(case, path, tried, since_s)
     reference = warm_reference(case, path, since_s)
     return _converged(case, reference, latest_s, trust, rough, away, enough_s)
 
@@ -474,8 +507,9 @@ class _Search:
             return False
         if self.best.short_m <= 0.0 and self.best.t_go_s <= enough_s:
             return True
-        idle = self.idle >= IDLE and (self.best.short_m <= 0.0 or math.isfinite(enough_s))
-        return idle or (settled and self.idle == 0)
+        safe = self.best.short_m <= 0.0
+        idle = self.idle >= IDLE and (safe or math.isfinite(enough_s))
+        return idle or (settled and safe and self.idle == 0)
 
     def tighten(self, over: Array, buffer_m: float, near: bool) -> None:
         """Subtract the excess ``over`` from the constraints where the path is near its reference;
@@ -496,10 +530,9 @@ def _accepted(case: Case, path: StepPath, over: Array, search: _Search) -> None:
     allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
     if not feasible(case, path, over.max(), allowed):
         return
-    rows, best = search.away.rows, search.best
+    best = search.best
     if best is None or best.short_m > 0.0 or path.t_go_s < best.t_go_s:
         search.away = proven(case, path, search.away)
-        search.away = replace(search.away, rows=(*search.away.rows, *rows))
     elif search.away.short_m == 0.0:
         return
     away = search.away
@@ -528,15 +561,16 @@ def _converged(
     rows = () if away is None else away.rows
     search = _Search(Withdrawn(rows=rows), np.zeros((2 * n, len(CONSTRAINTS))))
     change = largest_change(case, reference, trust)
+    last: StepPath | None = None
     for iteration in range(ITERATIONS):
         problem = convex_subproblem(case, reference, search.off, change, search.away.rows)
         if (found := solve(problem)) is None:
             break
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
-        over = excess(case, path)
         stuck, search.slack = found.slack > 0.9 * search.slack, found.slack
-        _withdraw(case, path, search)
+        path = last = _damped(case, path, last, search)
+        t, over = path.t_go_s - case.wait_s, excess(case, path)
         search.idle += 1
         if found.slack <= case.allowed_slack_m:
             _accepted(case, path, over, search)
@@ -552,13 +586,29 @@ def _converged(
     return search.best
 
 
-def _withdraw(case: Case, path: StepPath, search: _Search) -> None:
-    """Find the withdrawals from a path."""
+def _damped(case: Case, path: StepPath, last: StepPath | None, search: _Search) -> StepPath:
+    """Find the withdrawals from the solution of a programme, and return it, or its mean with the
+    path of the last iteration where more of what is required is missing than from this mean.
+
+    The margins of withdrawals are not linear in the path, so that the solutions alternate about
+    paths that keep them.
+    """
     tried = search.away.tried
     lacks = search.slack > case.buffer_m  # the programme cannot keep as much
-    if lacks:
-        tried = replace(tried, reserve_m=tried.reserve_m - search.slack)
-    search.away = withdrawn(case, path, tried, improve=lacks)
+    if lacks and tried is not None:
+        tried = tried.loosened(search.slack)
+    kept = tried is not None and not lacks
+    search.away = withdrawn(case, path, tried, improve=lacks, kept=kept)
+    if last is None or search.away.short_m <= 0.0:
+        return path
+    mean = StepPath(
+        case.r0, case.v0, 0.5 * (path.u + last.u), case.wait_s, 0.5 * (path.t_go_s + last.t_go_s)
+    )
+    away = withdrawn(case, mean, tried, improve=False)
+    if away.short_m >= search.away.short_m:
+        return path
+    search.away = away
+    return mean
 
 
 def _hopeless(

@@ -38,6 +38,7 @@ from avsreplay.plan.withdrawal import (
     Space,
     Tried,
     certified,
+    escapes_at,
     sampled,
 )
 
@@ -54,7 +55,7 @@ FAR = 2e4
 # slack of the withdrawals in units of that of the other constraints: they are corrected later
 SOFT = 1.0
 # margin of withdrawals that the programme requires, in resolutions of their certificate
-RESERVE_RESOLUTIONS = 2.0
+RESERVE_RESOLUTIONS = 0.5
 BUFFER_OF_EXTENT = 1e-5  # length below which an excess is rounding
 THRUST_SHARE = (
     1.0 - 1e-5
@@ -72,7 +73,8 @@ class Case:
             reference decides.
         begin_c: (3,) position in {C} where the thrust begins.
         start: (5,) margins there.
-        space: What a planned withdrawal keeps clear of; None where no clearance is required.
+        space: What a programme keeps withdrawals clear of; None where no clearance is required.
+        stated: What they keep clear of in every plan that is found, and by its stated margin.
     """
 
     sampled: SampledScene
@@ -87,6 +89,7 @@ class Case:
     begin_c: Array = field(init=False)
     start: Array = field(init=False)
     space: Space | None = field(init=False)
+    stated: Space | None = field(init=False)
 
     def __post_init__(self) -> None:
         at, r = np.array([self.params.latency_s]), (self.r0 + self.params.latency_s * self.v0)[None]
@@ -94,11 +97,11 @@ class Case:
         object.__setattr__(self, "begin_c", y[0])
         found = margins(self.scene, self.limits, y, r, self.sampled.sigma(at))
         object.__setattr__(self, "start", found.values[0])
-        space = None
+        space = stated = None
         if self.limits.clearance_m is not None and self.scene.surface is not None:
-            space = Space(
-                self.sampled, self.limits, self.params.a_max_mps2, self.extent_m, planned=True
-            )
+            of = self.sampled, self.limits, self.params.a_max_mps2, self.extent_m
+            space, stated = Space(*of, planned=True), Space(*of)
+        object.__setattr__(self, "stated", stated)
         object.__setattr__(self, "space", space)
 
     @property
@@ -119,7 +122,7 @@ class Case:
     @property
     def allowed_slack_m(self) -> float:
         """Slack of the programme up to which a path is checked [m]."""
-        return max(self.buffer_m, self.reserve_m)
+        return self.buffer_m if self.space is None else 2.0 * self.space.resolution_m
 
     @property
     def a_max(self) -> float:
@@ -357,7 +360,7 @@ class Withdrawn:
         short_m: What is missing, less what the withdrawal from the start itself lacks; 0 where
             withdrawals are not required [m].
         rows: Rows that require the margin; empty where they are not needed.
-        tried: The instants.
+        tried: The instants; None where withdrawals are not required.
         escapes: (m, 4) start instants [s] in time order and directions of the withdrawals; None
             where they are not known.
     """
@@ -365,29 +368,40 @@ class Withdrawn:
     margin_m: float = math.nan
     short_m: float = 0.0
     rows: tuple[PointRows, ...] = ()
-    tried: Tried = field(default_factory=Tried.first)
+    tried: Tried | None = None
     escapes: Array | None = None
 
 
 def withdrawn(
-    case: Case, path: RobotPath, tried: Tried, since_s: float = 0.0, improve: bool = True
+    case: Case,
+    path: RobotPath,
+    tried: Tried | None = None,
+    since_s: float = 0.0,
+    improve: bool = True,
+    kept: bool = False,
 ) -> Withdrawn:
     """Return the withdrawals from some instants of a path.
 
     Args:
         case: The problem; withdrawals are left out on the coarse grid.
         path: The path.
-        tried: The instants.
+        tried: The instants; None: the first ones.
         since_s: Time between its begin and the instant of planning [s].
         improve: Search better directions where the margin is negative.
+        kept: The path is the solution of a programme that required the margin at these instants:
+            what is missing is added to their reserves.
     """
     if case.space is None or case.coarse or not case.limits.abort:
         return Withdrawn()
-    below = FAR * case.buffer_m
-    found, tried = sampled(case.space, path, tried, case.wait_s, since_s, improve, below)
+    below, tried = FAR * case.buffer_m, tried or Tried.first(case.reserve_m)
+    found, tried, owner = sampled(case.space, path, tried, case.wait_s, since_s, improve, below)
     least = _accepted(case.space, found)
     short = max(least - found.margin_m, 0.0)
-    rows = _withdrawal_rows(case, case.space, path.t_go_s - since_s, found, least, tried.reserve_m)
+    if kept:
+        tried = tried.tightened(found, owner, least)
+    rows = _withdrawal_rows(
+        case, case.space, path.t_go_s - since_s, found, least + tried.reserve[owner]
+    )
     return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
 
 
@@ -400,18 +414,27 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
         path: The path.
         away: Withdrawals from some instants of about the same path.
     """
-    if case.space is None or case.coarse or not case.limits.abort or away.short_m > 0.0:
+    if (space := case.stated) is None or away.tried is None:
         return away
-    start = Tried(away.tried.share[:1], away.tried.d[:1])
-    least = _accepted(case.space, sampled(case.space, path, start, case.wait_s)[0])
+    if away.short_m > case.reserve_m:  # far from what is stated
+        return away
+    start = Tried(away.tried.share[:1], away.tried.d[:1], away.tried.reserve[:1])
+    least = _accepted(space, sampled(space, path, start, case.wait_s)[0])
     escapes = away.tried.escapes(case.wait_s, path.t_go_s)
-    found = certified(case.space, path, case.wait_s, escapes, least)
+    found = certified(space, path, case.wait_s, escapes, least)
     short, length = max(least - found.margin_m, 0.0), path.t_go_s - case.wait_s
-    poor = found.margins_m < least + case.space.resolution_m
-    share = (found.worst.t[poor] - case.wait_s) / length
-    tried = away.tried.also(share, found.worst.push[poor] / case.space.a_max, short)
-    rows = _withdrawal_rows(case, case.space, path.t_go_s, found, least, tried.reserve_m)
-    return Withdrawn(found.margin_m, short, (rows,), tried, found.escapes)
+    poor = found.margins_m < least + case.reserve_m
+    if short <= 0.0:
+        return replace(away, margin_m=found.margin_m, short_m=0.0, escapes=found.escapes)
+    at = found.worst.t[poor]
+    missing = np.maximum(least - found.margins_m[poor], 0.0)
+    tried = away.tried.also((at - case.wait_s) / length, escapes_at(escapes, at), missing)
+    return replace(
+        withdrawn(case, path, tried, improve=False),
+        short_m=short,
+        margin_m=found.margin_m,
+        escapes=found.escapes,
+    )
 
 
 def _accepted(space: Space, found: Certificate) -> float:
@@ -421,14 +444,15 @@ def _accepted(space: Space, found: Certificate) -> float:
 
 
 def _withdrawal_rows(
-    case: Case, space: Space, end_s: float, found: Certificate, least_m: float, reserve_m: float
+    case: Case, space: Space, end_s: float, found: Certificate, required: Array
 ) -> PointRows:
-    """Rows that keep withdrawals at a margin; of those from about the same instant and about the
-    same time after it the worst.
+    """Rows that keep withdrawals at the margins ``required`` (m,); of those from about the same
+    instant and about the same time after it the worst.
     """
     limits, length = case.limits, end_s - case.wait_s
-    reserve = least_m + max(case.reserve_m + reserve_m, space.resolution_m)
-    near = np.flatnonzero(found.margins_m < max(FAR * case.buffer_m, reserve))
+    # what is missing is gained by moves of the path that also reduce larger margins
+    far = space.enough_m + 2.0 * float(np.maximum(required - found.margins_m, 0.0).max(initial=0.0))
+    near = np.flatnonzero(found.margins_m < required + far)
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
     after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
     late = np.round(after ** (1.0 / DENSER) * COMPARED)
@@ -454,7 +478,7 @@ def _withdrawal_rows(
         interval,
         np.clip(at - interval, 0.0, 1.0),
         in_a,
-        found.margins_m[k] - reserve - coast,
+        found.margins_m[k] - required[k] - coast,
         rate,
         np.full(len(k), SOFT),
         lead,

@@ -269,7 +269,7 @@ class Space:
             Lower bounds (m,) over the ranges of start instants, the smallest margins (m,) found in
             the middle, and their times (m,).
         """
-        lower, upper, at = self.kernel(_last_s(m)).least(m.table, target_m).T
+        lower, upper, at = self.kernel(_last_s(m)).least(m.table, target_m).T.copy()
         return lower, upper, at
 
     def escapes(
@@ -399,23 +399,27 @@ def _chosen(
     (m, 3); where one does not reach the goal all directions are compared, with ``search``.
     """
     r, v = path.at(t)
-
-    def bounded(d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
-        m = _bounded(space.escapes(t, half, (r, v, u), d), path)
-        return m, *space.least(m, goal)
-
     unknown = np.isnan(d[:, 0])
     if unknown.any():
         d = d.copy()
         d[unknown] = space.directions(t[unknown], r[unknown], v[unknown], d[unknown])
-    found = bounded(d)
-    poor = found[2] < goal
-    if not search or not poor.any():
-        return found
-    other = d.copy()
-    other[poor] = space.directions(t[poor], r[poor], v[poor], d[poor])
-    again = bounded(other)
-    return bounded(np.where((again[2] > found[2])[:, None], other, d))
+
+    def bounded(k: NDArray[np.integer], d: Array) -> tuple[Manoeuvres, Array, Array, Array]:
+        m = _bounded(space.escapes(t[k], half[k], (r[k], v[k], u[k]), d), path)
+        return m, *space.least(m, goal)
+
+    m, lower, upper, at = bounded(np.arange(len(t)), d)
+    poor = np.flatnonzero(upper < goal)
+    if not search or not len(poor):
+        return m, lower, upper, at
+    other = bounded(poor, space.directions(t[poor], r[poor], v[poor], d[poor]))
+    better = other[2] > upper[poor]
+    k = poor[better]
+    for values, found in zip((lower, upper, at), other[1:], strict=True):
+        values[k] = found[better]
+    order = np.r_[np.delete(np.arange(len(t)), k), k]
+    m = joined([m.of(order[: len(t) - len(k)]), other[0].of(better)]).of(np.argsort(order))
+    return m, lower, upper, at
 
 
 def coasting(space: Space, path: RobotPath, begin_s: float) -> Certificate:
@@ -503,26 +507,32 @@ class Tried:
     Attributes:
         share: (m,) instants as fractions of the flight.
         d: (m, 3) directions of the escapes in {A}; NaN: none yet.
-        reserve_m: Margin that is required there besides, for the instants between [m].
+        reserve: (m,) margin that the programme requires of each [m]: it grows by what is found to
+            be missing, as the margins are not linear in the path.
     """
 
     share: Array
     d: Array
-    reserve_m: float = 0.0
+    reserve: Array
 
     @classmethod
-    def first(cls) -> Tried:
-        """Return ``STARTS`` instants, denser towards the end, where the robot is near."""
+    def first(cls, reserve_m: float) -> Tried:
+        """Return ``STARTS`` instants, denser towards the end, where the robot is near.
+
+        Args:
+            reserve_m: Margin that is required at first [m].
+        """
         share = 1.0 - (1.0 - np.arange(STARTS) / STARTS) ** 1.7
-        return cls(share, np.full((STARTS, 3), math.nan))
+        return cls(share, np.full((STARTS, 3), math.nan), np.full(STARTS, reserve_m))
 
     @classmethod
-    def near(cls, escapes: Array | None, begin_s: float, end_s: float) -> Tried:
+    def near(cls, escapes: Array | None, begin_s: float, end_s: float, reserve_m: float) -> Tried:
         """Return the first instants of a part of a path with the escapes that it carries."""
-        first = cls.first()
+        first = cls.first(reserve_m)
         if escapes is None:
             return first
-        return cls(first.share, escapes_at(escapes, begin_s + (end_s - begin_s) * first.share))
+        d = escapes_at(escapes, begin_s + (end_s - begin_s) * first.share)
+        return replace(first, d=d)
 
     def escapes(self, begin_s: float, end_s: float) -> Array:
         """Return the escapes for the ranges between the instants, see ``escapes_at``."""
@@ -531,14 +541,38 @@ class Tried:
         begins = begin_s + (end_s - begin_s) * 0.5 * (share + np.r_[share[:1], share[:-1]])
         return np.column_stack([begins, self.d[order]])
 
-    def also(self, share: Array, d: Array, short_m: float) -> Tried:
-        """Return these instants and others (n,) with their directions (n, 3), where the margin was
-        short.
+    def also(self, share: Array, d: Array, short_m: Array) -> Tried:
+        """Return these instants and others (n,) with their directions (n, 3); the reserve there, or
+        that of an instant nearby, is larger by what is missing ``short_m`` (n,) [m].
         """
-        apart = np.abs(share[:, None] - self.share).min(axis=1) > 0.1 / STARTS
+        distance = np.abs(share[:, None] - self.share)
+        near, apart = distance.argmin(axis=1), distance.min(axis=1) > 0.1 / STARTS
+        more = np.zeros(len(self.share))
+        np.maximum.at(more, near[~apart], short_m[~apart])
         _, new = np.unique(np.round(share[apart] * STARTS * 5.0), return_index=True)
-        share, d = np.r_[self.share, share[apart][new]], np.r_[self.d, d[apart][new]]
-        return Tried(share, d, self.reserve_m + short_m)
+        return Tried(
+            np.r_[self.share, share[apart][new]],
+            np.r_[self.d, d[apart][new]],
+            np.r_[self.reserve + more, self.reserve.min() + short_m[apart][new]],
+        )
+
+    def tightened(self, found: Certificate, owner: NDArray[np.integer], least_m: float) -> Tried:
+        """Return the instants with a larger reserve where the margin is below ``least_m``.
+
+        Args:
+            found: Margins of the withdrawals.
+            owner: (n,) number of the instant of each.
+            least_m: Margin that is required [m].
+        """
+        margin = np.full(len(self.share), math.inf)
+        np.minimum.at(margin, owner, found.margins_m)
+        return replace(self, reserve=self.reserve + np.maximum(least_m - margin, 0.0))
+
+    def loosened(self, slack_m: float) -> Tried:
+        """Return the instants with reserves that are smaller by a slack that the programme
+        needs [m].
+        """
+        return replace(self, reserve=np.maximum(self.reserve - slack_m, 0.0))
 
 
 def sampled(
@@ -549,8 +583,9 @@ def sampled(
     since_s: float = 0.0,
     improve: bool = True,
     below_m: float = 0.0,
-) -> tuple[Certificate, Tried]:
-    """Return the withdrawals from instants of a path, with their margins at instants only.
+) -> tuple[Certificate, Tried, NDArray[np.integer]]:
+    """Return the withdrawals from instants of a path, with their margins at instants and the
+    smallest one of each, the instants, and the number of the instant of each manoeuvre.
 
     Args:
         space: The target.
@@ -570,9 +605,17 @@ def sampled(
         d = space.directions(t, r, v, d, 0.0)
     m = space.escapes(t, np.zeros(len(t)), (r, v, np.zeros_like(r)), d)
     margins, tau = space.margins(m, below_m)
-    k, i = np.nonzero((margins < below_m) | (margins == margins.min(axis=1)[:, None]))
-    found = Certificate(float(margins.min()), m.of(k), tau[k, i], margins[k, i], math.inf)
-    return found, replace(tried, d=m.push / space.a_max)
+    _, least, at = space.least(m, space.resolution_m)
+    k, i = np.nonzero(margins < below_m)
+    owner = np.r_[k, np.arange(len(t))]
+    found = Certificate(
+        min(float(least.min()), float(margins.min())),
+        m.of(owner),
+        np.r_[tau[k, i], at],
+        np.r_[margins[k, i], least],
+        math.inf,
+    )
+    return found, replace(tried, d=m.push / space.a_max), owner
 
 
 def withdrawal(

@@ -5,7 +5,7 @@ approach cones, the target, where the approach began, and the grasp point.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,21 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[tuple[int, Array]]:
     return [(k, part) for k, part in parts if len(part) > 1 and np.isfinite(part).all()]
 
 
+def _scaled(points: Array) -> tuple[float, Callable[[Array], Array]]:
+    """The scale [px/m] at which points (n, 2) fit a panel, and the function that places points of
+    the same plane in the panel [px].
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = np.array([PANEL_WIDTH_PX, PANEL_HEIGHT_PX]) - 2 * PANEL_BORDER_PX
+    scale = float(np.min(room / np.maximum(high - low, 1e-6)))
+
+    def place(points: Array) -> Array:
+        x, y = (points - 0.5 * (low + high)).T * scale
+        return np.round(np.stack([0.5 * PANEL_WIDTH_PX + x, 0.5 * PANEL_HEIGHT_PX - y], axis=1), 1)
+
+    return scale, place
+
+
 def approach_picture(
     rows: Sequence[Row], view: View | None, header: Mapping[str, Any]
 ) -> dict[str, Any] | None:
@@ -92,21 +107,9 @@ def approach_picture(
         ("turned by 90° about the axis", np.cross(axis, side)),
     ):
         flat = np.stack([axis, second], axis=1)
-        shown = [body @ flat, *(line @ flat for line in lines), *outlines, np.zeros((1, 2))]
-        panels.append((name, shown[0], shown[1 : 1 + len(lines)], np.concatenate(shown)))
-    low = np.min([p[3].min(axis=0) for p in panels], axis=0)
-    high = np.max([p[3].max(axis=0) for p in panels], axis=0)
-    scale = float(
-        np.min(
-            (np.array([PANEL_WIDTH_PX, PANEL_HEIGHT_PX]) - 2 * PANEL_BORDER_PX)
-            / np.maximum(high - low, 1e-6)
-        )
-    )
-
-    def place(points: Array) -> Array:
-        x, y = (points - 0.5 * (low + high)).T * scale
-        return np.round(np.stack([0.5 * PANEL_WIDTH_PX + x, 0.5 * PANEL_HEIGHT_PX - y], axis=1), 1)
-
+        panels.append((name, body @ flat, [line @ flat for line in lines]))
+    shown = [part for _, flat_body, flat_lines in panels for part in (flat_body, *flat_lines)]
+    scale, place = _scaled(np.concatenate([*shown, *outlines, np.zeros((1, 2))]))
     bar_m = max((b for b in _BARS_M if b * scale <= 0.3 * PANEL_WIDTH_PX), default=_BARS_M[0])
     return {
         "width": PANEL_WIDTH_PX,
@@ -132,7 +135,7 @@ def approach_picture(
                 "start": place(flat_lines[0][:1])[0].tolist(),
                 "grasp": place(np.zeros((1, 2)))[0].tolist(),
             }
-            for name, flat_body, flat_lines, _ in panels
+            for name, flat_body, flat_lines in panels
         ],
     }
 

@@ -319,27 +319,20 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int, paired: bool) 
     said = [
         f"{word} in {', '.join(map(_said, listed))}" for word, listed in found.items() if listed
     ]
-    word = (
-        ("mixed" if len(said) == 2 else "worse" if found["worse"] else "better")
-        if said
-        else "no evidence"
+    word = "no evidence"
+    if said:
+        word = "mixed" if len(said) == 2 else "worse" if found["worse"] else "better"
+    changed = ", ".join(
+        _said(c)
+        for c in changes
+        if c.metric in COMPARED_METRICS and c.word == "changed" and _mentioned(c)
     )
-    changed = [
-        c for c in changes if c.metric in COMPARED_METRICS and c.word == "changed" and _mentioned(c)
-    ]
     if not paired:
-        differ = ", ".join(map(_said, changed))
-        return (
-            word,
-            (
-                f"the main metrics differ in {differ}"
-                if differ
-                else "the main metrics differ by less than 10 %"
-            ),
-        )
+        differ = f"in {changed}" if changed else "by less than 10 %"
+        return word, f"the main metrics differ {differ}"
     said = said or ["no evidence of a difference in the main metrics"]
     if changed:
-        said.append(f"changed, without an interval: {', '.join(map(_said, changed))}")
+        said.append(f"changed, without an interval: {changed}")
     return word, "; ".join(said)
 
 

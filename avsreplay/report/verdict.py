@@ -43,6 +43,7 @@ LEAST_GROWN_DEG = 0.25
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SAME_ERROR_SPREAD = 0.2
 ALIASED_SHARE = 0.1  # share of the scans whose poses two angular rates explain
+SURE_EVENT_LOG_ODDS = 6.0  # of an event of the whole log from which it is stated
 FIT_CHECK_OF_EXTENT = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -153,6 +154,7 @@ def verdict_of(
             (*_errors(rows, extent_m), *_growth(rows, extent_m)) if summary.healthy else ()
         ),  # without a used scan there is no estimate to judge
         _faults(summary, extent_m),
+        _by_all_poses(header),
         _filter(rows, summary),
         _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
     )
@@ -374,6 +376,16 @@ def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             f" at {begin:.1f} s"
         )
         yield Concern(Grade.CHECK, text)
+
+
+def _by_all_poses(header: Mapping[str, Any]) -> Iterator[Concern]:
+    """Events of the whole log that no row contains: more poses show them than those up to a row."""
+    record = header.get("smoothed")
+    found = record.get("events") if isinstance(record, Mapping) else None
+    for event in found if isinstance(found, list) else ():
+        sure = isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT_LOG_ODDS
+        if sure and event.get("first_known_s") is None:
+            yield Concern(Grade.CHECK, f"by all poses of the log: {event.get('words', '')}")
 
 
 def _new_starts(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:

@@ -271,18 +271,12 @@ def read_view(path: str | Path) -> View:
 
 
 def _view(arrays: dict[str, Spool]) -> View:
+    """The view that arrays hold. Raises ValueError where they do not fit to one another."""
     if "cloud_intensity" not in arrays:  # earlier versions
         arrays["cloud_intensity"] = Spool("f4")
         for block in arrays["cloud_residual"].blocks():
             arrays["cloud_intensity"].extend(np.full(len(block), np.nan, np.float32))
-    for name in ("vertices", "cloud_points", "path_points"):
-        if not all((np.abs(block) < LARGEST_STORED).all() for block in arrays[name].blocks()):
-            raise ValueError("points that are not finite or too far away")
-    values = ("cloud_points", "cloud_residual", "cloud_intensity")
-    for name, sizes in (*((each, "cloud_size") for each in values), ("path_points", "path_size")):
-        _check_sizes(arrays[sizes], len(arrays[name]))
-    if len(arrays["cloud_seq"]) != len(arrays["cloud_size"]):
-        raise ValueError("sizes of other clouds")
+    _check_arrays(arrays)
     whole = {
         name: each.read(0, len(each))
         for name, each in arrays.items()
@@ -303,6 +297,18 @@ def _view(arrays: dict[str, Spool]) -> View:
     )
     clouds = {name: arrays[name] for name in _CLOUDS}
     return View(vertices, faces, CloudTable((), clouds), paths)
+
+
+def _check_arrays(arrays: Mapping[str, Spool]) -> None:
+    """Raise ValueError where points are not finite, or sizes are not those of the parts."""
+    for name in ("vertices", "cloud_points", "path_points"):
+        if not all((np.abs(block) < LARGEST_STORED).all() for block in arrays[name].blocks()):
+            raise ValueError("points that are not finite or too far away")
+    values = ("cloud_points", "cloud_residual", "cloud_intensity")
+    for name, sizes in (*((each, "cloud_size") for each in values), ("path_points", "path_size")):
+        _check_sizes(arrays[sizes], len(arrays[name]))
+    if len(arrays["cloud_seq"]) != len(arrays["cloud_size"]):
+        raise ValueError("sizes of other clouds")
 
 
 def _check_sizes(sizes: Spool, count: int) -> None:

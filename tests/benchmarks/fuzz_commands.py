@@ -34,7 +34,7 @@ from fuzz_workers import Campaign, Check, report, run_campaign
 from avsreplay import log
 from avsreplay.cli.main import SUMMARIES, group
 from avsreplay.errors import AvsError
-from avsreplay.log import GrowingLog
+from avsreplay.log import GrowingLog, growing
 from avsreplay.report.result import write_manifest
 from avsreplay.simulate import scenario
 
@@ -289,7 +289,7 @@ def build(folder: Path) -> None:
     scenario.MAX_SCANS = (
         2000  # more are refused as those above the limit are, not recorded for hours
     )
-    log.GrowingLog, log._POLL_S, log._OPENING_DURATIONS = WrittenLog, 0.0, 0.0
+    log.GrowingLog, growing._POLL_S, growing._OPENING_DURATIONS = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {
         "scenario.toml": SCENARIO,

@@ -126,7 +126,7 @@ def candidates(problem: Problem, fit: Fit, found: Passed) -> Iterator[tuple[floa
 
 
 def search(problem: Problem, fit: Fit) -> list[Fit]:
-    """Sets of events by falling evidence, the best first; those much less likely are left out."""
+    """Sets of events that were compared, each once, by falling evidence."""
     sets = [fit]
     best = fit
     while len(best.events) < _MOST_EVENTS:
@@ -145,8 +145,11 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
         if total(problem, top) <= total(problem, best):
             break
         best = top
-    sets.sort(key=lambda f: -total(problem, f))
-    return sets
+    out: list[Fit] = []
+    for each in sorted(sets, key=lambda f: -total(problem, f)):
+        if not any(_same(each.events, other.events) for other in out):
+            out.append(each)
+    return out
 
 
 def proposals(problem: Problem, fit: Fit) -> list[tuple[float, Event]]:
@@ -186,6 +189,17 @@ def _at_frequency(problem: Problem, fit: Fit, kind: Kind, hz: float) -> tuple[fl
     gain, size = shock_gain(W.T @ found.score[0], W.T @ found.information[0] @ W, None, kind.most)
     event = Event(kind, 0, 0.5, float(size), hz)
     return float(gain) + odds(problem, event), event
+
+
+def _same(a: Sequence[Event], b: Sequence[Event]) -> bool:
+    """Whether two sets have the same events, with onsets in the same or neighbouring intervals."""
+    left = list(b)
+    for event in a:
+        near = next((e for e in left if _alike(e, event)), None)
+        if near is None:
+            return False
+        left.remove(near)
+    return not left
 
 
 def _alike(a: Event, b: Event) -> bool:
