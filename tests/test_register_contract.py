@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from avsreplay.cli.backends import backends_command
 from avsreplay.errors import CheckFailed, MissingBackend, UsageError
 from avsreplay.geometry import Pose, exp, log
-from avsreplay.records import Fit
+from avsreplay.records import AlignStatus, Fit
 from avsreplay.register import backend
 from avsreplay.register.backend import HornBackend
 from avsreplay.register.contract import LAWS, Bench, check, repeats
@@ -185,3 +185,51 @@ def test_frames_are_not_mixed() -> None:
     np.testing.assert_allclose(
         found.T_ac.apply(corner), bench.T_ac.R @ corner + bench.T_ac.t, atol=1e-6
     )
+
+
+class _Counted(_Guesser):
+    """Horn's ICP under another name; counts its calls."""
+
+    calls = 0
+
+    def __init__(self, target: backend.Target) -> None:
+        self._horn = HornBackend(target)
+
+    def align(self, points, guess: Pose) -> Fit:
+        _Counted.calls += 1
+        return self._horn.align(points, guess)
+
+
+class _Leaving(_Counted):
+    """Leaves every pose by a quarter turn."""
+
+    def align(self, points, guess: Pose) -> Fit:
+        found = self._horn.align(points, guess)
+        return Fit(Pose(exp([0.0, 0.0, 1.5]), found.T_ca.t) @ found.T_ca, 5, True)
+
+
+def test_a_back_end_is_not_called_for_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a guess, the back end registers only the pose that is accepted; a scan without the
+    target does not reach it.
+    """
+    _install(monkeypatch, _Counted)
+    bench = Bench("fake")
+    _Counted.calls = 0
+    found = bench.registrar.acquire(bench.scan)
+    turn, _ = bench.gap(bench.T_ac, found.T_ac)
+    assert found.status is AlignStatus.ALIGNED
+    assert turn < 0.001
+    assert _Counted.calls == 1
+    cloud = bench.T_ac.t + bench.surface.extent * np.random.default_rng(1).normal(size=(500, 3))
+    bench.registrar.register(cloud, bench.T_ac)
+    assert _Counted.calls == 1
+
+
+def test_a_back_end_that_leaves_the_accepted_pose_is_not_converged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _install(monkeypatch, _Leaving)
+    bench = Bench("fake")
+    found = bench.registrar.acquire(bench.scan)
+    assert found.status is AlignStatus.NOT_CONVERGED
+    assert "another pose" in found.message

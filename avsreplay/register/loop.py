@@ -184,9 +184,12 @@ class Loop:
         if not self.grader.foreign or at.by_backend:
             return
         found = self._graded(case, at.T_ca, by_backend=True)
-        if found.measured and not self.poses.same(found.T_ac.inverse(), at.T_ca):
+        failed = found.status is AlignStatus.FAILED
+        if not failed and not self.poses.same(found.T_ac.inverse(), at.T_ca):
             status = AlignStatus.NOT_CONVERGED
             found = replace(found, status=status, covariance=None, message=LEFT)
+            self._replace(case, found, by_backend=True)
+            return
         self._replace(case, found, by_backend=True)
         self._examine(case)
         if at.searched:
