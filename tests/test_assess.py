@@ -68,9 +68,9 @@ def test_a_grasp_point_that_cannot_be_reached_is_found_before_the_run(given, wor
 
 
 def test_the_task_in_one_line_states_its_tolerances_in_mm():
-    given = {"position_m": 0.0123, "speed_mps": 0.0045, "angle_deg": 1.5, "radius_m": 0.07}
+    given = {"position_m": 0.012349, "speed_mps": 0.0045549, "angle_deg": 1.5, "radius_m": 0.07}
     text = task(*body(), opening_m=0.25, **given).text
-    assert "within 12.3 mm, 4.5 mm/s and 1.5 deg" in text
+    assert "within 12.3 mm, 4.55 mm/s and 1.5 deg" in text
     assert "opening 250 mm, radius 70 mm" in text
 
 

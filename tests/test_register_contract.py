@@ -209,20 +209,21 @@ class _Leaving(_Counted):
 
 
 def test_a_back_end_is_not_called_for_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a guess, the back end registers only the pose that is accepted; a scan without the
-    target does not reach it.
+    """Without a guess, or with one far off, the back end registers only the pose that is accepted;
+    a scan without the target does not reach it.
     """
     _install(monkeypatch, _Counted)
     bench = Bench("fake")
     _Counted.calls = 0
-    found = bench.registrar.acquire(bench.scan)
-    turn, _ = bench.gap(bench.T_ac, found.T_ac)
-    assert found.status is AlignStatus.ALIGNED
-    assert turn < 0.001
-    assert _Counted.calls == 1
+    far = bench.T_ac @ Pose(exp([0.0, 1.0, 0.0]), np.zeros(3))
+    for found in (bench.registrar.acquire(bench.scan), bench.registrar.register(bench.scan, far)):
+        turn, _ = bench.gap(bench.T_ac, found.T_ac)
+        assert found.status is AlignStatus.ALIGNED
+        assert turn < 0.001
+    assert _Counted.calls == 2
     cloud = bench.T_ac.t + bench.surface.extent * np.random.default_rng(1).normal(size=(500, 3))
     bench.registrar.register(cloud, bench.T_ac)
-    assert _Counted.calls == 1
+    assert _Counted.calls == 2
 
 
 def test_a_back_end_that_leaves_the_accepted_pose_is_not_converged(

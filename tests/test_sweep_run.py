@@ -252,6 +252,51 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_a_campaign_whose_scheduler_is_killed_is_resumed(campaign, reference, tmp_path):
+    """The command ends with one line and keeps the runs that are done."""
+    start = [sys.executable, "-m"]
+    listed = ["--port", "0", "--no-dashboard", "--scheduler-file", tmp_path / "scheduler.json"]
+    scheduler = subprocess.Popen(
+        [*start, "distributed.cli.dask_scheduler", *map(str, listed)], stderr=subprocess.DEVNULL
+    )
+    while not (tmp_path / "scheduler.json").exists():
+        assert scheduler.poll() is None
+        time.sleep(0.05)
+    address = json.loads((tmp_path / "scheduler.json").read_text())["address"]
+    worker = subprocess.Popen(
+        [*start, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"],
+        stderr=subprocess.DEVNULL,
+        cwd=tmp_path,
+        env=os.environ | {"AVSREPLAY_ARITHMETIC": "native"},
+    )
+    out, journal = tmp_path / "out", tmp_path / "out" / "journal.txt"
+    args = ["sweep", str(campaign), "-o", str(out), "--scheduler", address]
+    command = subprocess.Popen(
+        [sys.executable, "-m", "avsreplay", *args],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"AVSREPLAY_ARITHMETIC": "native"},
+    )
+    try:
+        while command.poll() is None and not (
+            journal.is_file() and journal.read_bytes().count(b"\n") > 1
+        ):
+            time.sleep(0.02)
+        scheduler.kill()
+        _, err = command.communicate(timeout=300)
+    finally:
+        for process in (scheduler, worker, command):
+            process.kill()
+            process.wait()
+    if command.returncode:  # not where all runs were done before the scheduler ended
+        assert command.returncode == 3, err
+        assert err.splitlines()[-1].startswith("avsreplay: Dask scheduler: it ended before")
+    assert sweep(campaign, out, "--workers", "0").exit_code == 0
+    assert results(out) == reference
+
+
+@pytest.mark.slow
 def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     text = SMALL.replace("repeats = 3", "repeats = 1")
     text += (

@@ -163,12 +163,10 @@ class Loop:
         self._replace(case, found, by_backend)
 
     def _hopeful(self, case: Case, T_ca: Pose) -> bool:
-        """Whether a back end of another library is called at a pose: few points confirm it."""
-        if not self.grader.foreign:
-            return True
-        hopeful, work = self.screen.confirms(case.points, T_ca.inverse())
-        case.work.spend(work)
-        return hopeful
+        """Whether a back end of another library is called at a pose: few points confirm it. As of
+        its alignment, the work is not counted, so that hypotheses do not depend on the back end.
+        """
+        return not self.grader.foreign or self.screen.confirms(case.points, T_ca.inverse())[0]
 
     def _replace(self, case: Case, found: Alignment, by_backend: bool) -> None:
         """An alignment becomes the candidate; what is known of other poses stays."""

@@ -215,7 +215,7 @@ def run_tasks(
 
     Raises:
         MissingBackend: Dask is needed and not installed.
-        UnreadableInput: The scheduler does not answer.
+        UnreadableInput: The scheduler does not answer, or ended before the runs did.
     """
     if workers == 0 and scheduler is None:
         yield from _here(tasks, work)
@@ -322,6 +322,9 @@ def _collected(future: Any) -> RunResult:
     if future.status == "finished":
         outcome: RunResult = future.result()
         return outcome
+    if future.status != "error":  # cancelled or lost: nothing is known of the run
+        hint = "the finished runs are saved; start it and give the same command"
+        raise UnreadableInput("it ended before the runs did", where="Dask scheduler", hint=hint)
     return crashed(str(future.key).removeprefix("run-"), future.exception())
 
 

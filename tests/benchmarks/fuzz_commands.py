@@ -535,7 +535,7 @@ def _line(text: str) -> str:
 
 
 def campaign(
-    number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 1000
+    number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 100
 ) -> Campaign:
     """Run the mutations of a campaign in batches."""
 
