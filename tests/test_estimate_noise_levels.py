@@ -19,7 +19,7 @@ from avsreplay.estimate.disturbance_density import density_in_use
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import (
-    MOST_POINTS,
+    MOST_NORMAL_POINTS,
     NO_LEVELS,
     NoiseLevels,
     _of_positions,
@@ -58,7 +58,7 @@ def levels_of(found, truth, rounds: int = 4) -> tuple[NoiseLevels, Problem]:
     """Levels after some estimates that start from one another."""
     poses, chart, levels = poses_of(found), to_chart(truth), NO_LEVELS
     for _ in range(rounds):
-        points = normal_points(poses, chart, levels.factors(0.0), MOST_POINTS, scatter=True)
+        points = normal_points(poses, chart, levels.factors(0.0), MOST_NORMAL_POINTS, scatter=True)
         problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
         problem.core.descend(40, 1e-3)
         chart = problem.chart
@@ -132,7 +132,7 @@ def test_a_given_density_is_not_changed() -> None:
     world = tumbling.draw(3, seconds=30.0, hz=HZ, sigma_max=0.85)
     poses = poses_of(fixes(world.states, 3))
     chart = to_chart(world.states[0])
-    points = normal_points(poses, chart, np.ones(2), MOST_POINTS, scatter=True)
+    points = normal_points(poses, chart, np.ones(2), MOST_NORMAL_POINTS, scatter=True)
     problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
     levels = whole(estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0)))
     assert (levels.torque, levels.force) == (pytest.approx(1e-5), 0.0)
@@ -159,7 +159,7 @@ def test_normal_points_know_the_noise_within_them() -> None:
     world = tumbling.draw(5, seconds=300.0, hz=HZ, sigma_max=0.85)
     poses = poses_of(fixes(world.states, 5, factor=3.0))
     points = normal_points(
-        poses, to_chart(world.states[0]), 3.0 * np.ones(2), MOST_POINTS, scatter=True
+        poses, to_chart(world.states[0]), 3.0 * np.ones(2), MOST_NORMAL_POINTS, scatter=True
     )
     assert points.within is not None
     squares, dof = points.within

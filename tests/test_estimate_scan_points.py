@@ -16,7 +16,7 @@ from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.measurement import innovation_vector
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.scan_points import FEW, latest, scan_points
+from avsreplay.estimate.scan_points import FEWEST_KEPT, latest, scan_points
 from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.records import Belief, Innovation
 
@@ -54,7 +54,9 @@ def averaging(R: tuple[np.ndarray, ...], first: np.ndarray) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize(("accepted", "doubtful"), [(1, 3), (FEW, 5), (13, 0), (40, 5), (64, 2)])
+@pytest.mark.parametrize(
+    ("accepted", "doubtful"), [(1, 3), (FEWEST_KEPT, 5), (13, 0), (40, 5), (64, 2)]
+)
 def test_the_last_scans_stay_single_and_every_scan_is_in_one_point(
     accepted: int, doubtful: int
 ) -> None:
@@ -64,8 +66,8 @@ def test_the_last_scans_stay_single_and_every_scan_is_in_one_point(
     assert sizes.sum() == len(points.point) == accepted + doubtful
     assert list(points.point) == [p for p, size in enumerate(sizes) for _ in range(size)]
     assert (sizes[len(sizes) - doubtful - min(accepted, 4) :] == 1).all()
-    assert points.single == (accepted <= FEW)
-    assert len(sizes) <= FEW + doubtful
+    assert points.single == (accepted <= FEWEST_KEPT)
+    assert len(sizes) <= FEWEST_KEPT + doubtful
     assert points.before(accepted) == len(sizes) - doubtful
 
 
@@ -122,7 +124,7 @@ def test_scans_within_some_seconds_are_kept_or_the_last_ones() -> None:
     _, slow = scans(30, hz=2.0)
     _, fast = scans(60, hz=10.0)
     _, fastest = scans(70, hz=30.0)
-    assert latest(tuple(slow)) == tuple(slow[-FEW:])
+    assert latest(tuple(slow)) == tuple(slow[-FEWEST_KEPT:])
     assert latest(tuple(fast)) == tuple(fast[-51:])
     assert latest(tuple(fastest)) == tuple(fastest[-64:])
     assert latest(tuple(fast[:5])) == tuple(fast[:5])

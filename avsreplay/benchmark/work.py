@@ -32,9 +32,15 @@ from avsreplay.run import Job, ReplayedScan, Run
 from avsreplay.sweep.campaign import RunResult
 
 FORMAT = 1  # of a run's result; one with another format is made again
-WRONG_DEG, WRONG_OF_EXTENT = 2.0, 0.02  # error of a wrong pose, as in docs/registration-results.md
-SETTLED = 0.5  # share of a log after which the errors of the estimate count
-NEAR_S, SIGMAS = 1.0, 4.0  # a reported change is that of a push if it is this near, or nearer
+WRONG_POSE_DEG, WRONG_POSE_OF_EXTENT = (
+    2.0,
+    0.02,
+)  # error of a wrong pose, as in docs/registration-results.md
+SETTLED_SHARE = 0.5  # share of a log after which the errors of the estimate count
+PUSH_NEAR_S, PUSH_SIGMAS = (
+    1.0,
+    4.0,
+)  # a reported change is that of a push if it is this near, or nearer
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +164,8 @@ class _Scorer:
         self._nees.append(pose_nees(scan.outcome.belief, scan.truth.pose))
 
     def _wrong(self, pos_m: float, rot_deg: float) -> bool:
-        limit_m = WRONG_OF_EXTENT * self._extent_m + self._log.truth_m
-        return pos_m > limit_m or rot_deg > WRONG_DEG + self._log.truth_deg
+        limit_m = WRONG_POSE_OF_EXTENT * self._extent_m + self._log.truth_m
+        return pos_m > limit_m or rot_deg > WRONG_POSE_DEG + self._log.truth_deg
 
     def _outside(self, pos_m: float, rot_deg: float) -> bool:
         limits = self._tolerance.position_m, self._tolerance.angle_deg
@@ -167,7 +173,7 @@ class _Scorer:
 
     def result(self, summary: Summary) -> dict[str, Any]:
         """Return the scores of the run by name."""
-        last = slice(int(SETTLED * len(self._errors)), None)
+        last = slice(int(SETTLED_SHARE * len(self._errors)), None)
         errors = np.array(self._errors[last], dtype=np.float64).reshape(-1, 2)
         rms = np.sqrt(np.mean(np.square(errors), axis=0)).tolist() if len(errors) else [None, None]
         nees = self._nees[last]
@@ -211,7 +217,7 @@ def events_of(summary: Summary, log: Prepared) -> dict[str, int]:
     changes = list(summary.velocity_changes)
     named = 0
     for at_s in log.pushes_s:
-        near = [c for c in changes if abs(c.t_s - at_s) <= max(NEAR_S, SIGMAS * c.t_1s_s)]
+        near = [c for c in changes if abs(c.t_s - at_s) <= max(PUSH_NEAR_S, PUSH_SIGMAS * c.t_1s_s)]
         if near:
             changes.remove(min(near, key=lambda c: abs(c.t_s - at_s)))
             named += 1

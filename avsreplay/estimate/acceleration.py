@@ -30,12 +30,14 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import UNLIKELY, Alignment, Trajectory
 from avsreplay.settings import given
 
-_FEWEST = 8  # poses of the first fit; the noise is estimated from its residuals
+_FEWEST_POSES = 8  # poses of the first fit; the noise is estimated from its residuals
 _CONFIRM = 3  # successive poses that contradict the fit end it
-_FEW = 12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
+_GATE_WIDENING = (
+    12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
+)
 # 1 sigma of the prior of all but the arm, in lengths of the arm over the duration of the poses
 _UNKNOWN = 1e3
-_PASSES = 4
+_FIT_PASSES = 4
 
 
 def accelerated(free: Trajectory, acceleration: Array) -> Trajectory:
@@ -121,10 +123,12 @@ def fit_acceleration(
         UsageError: fewer than eight poses.
     """
     measured = [(t_ns, found) for t_ns, found in measured if found.measured]
-    if len(measured) < _FEWEST:
+    if len(measured) < _FEWEST_POSES:
         what = f"only {len(measured)} poses to fit an acceleration to"
         raise UsageError(
-            what, where="estimator.fit_acceleration", hint=f"{_FEWEST} poses at least are needed"
+            what,
+            where="estimator.fit_acceleration",
+            hint=f"{_FEWEST_POSES} poses at least are needed",
         )
     times = np.array([(t_ns - measured[0][0]) * 1e-9 for t_ns, _ in measured])
     poses = [found.T_ac for _, found in measured]
@@ -144,11 +148,13 @@ def _consistent(
     """How many poses from the first on agree with one acceleration: sequential least squares
     with a gate.
     """
-    first = _System(times[:_FEWEST], poses[:_FEWEST], covariances[:_FEWEST], arm_1s_m)
+    first = _System(
+        times[:_FEWEST_POSES], poses[:_FEWEST_POSES], covariances[:_FEWEST_POSES], arm_1s_m
+    )
     mean, P, noise = first.solved()
     square, freedom = noise**2 * first.freedom, first.freedom
     outside = 0
-    for k in range(_FEWEST, len(poses)):
+    for k in range(_FEWEST_POSES, len(poses)):
         H, C = (
             _row(times[k] - times[0], poses[k]),
             _position_noise(poses[k], covariances[k], mean[9:]),
@@ -157,7 +163,7 @@ def _consistent(
         error = poses[k].t - H @ mean
         S = H @ P @ H.T + scale * C
         nis = float(error @ np.linalg.solve(S, error))
-        outside = outside + 1 if nis > UNLIKELY[3] * (1.0 + _FEW / freedom) else 0
+        outside = outside + 1 if nis > UNLIKELY[3] * (1.0 + _GATE_WIDENING / freedom) else 0
         if outside == _CONFIRM:
             return k + 1 - _CONFIRM
         if outside:
@@ -189,7 +195,7 @@ class _System:
         """
         y = np.array([pose.t for pose in self.poses]) - self.centre
         mean, scale = np.zeros(12), 1.0
-        for _ in range(_PASSES):  # the effect of the attitude's noise depends on the arm
+        for _ in range(_FIT_PASSES):  # the effect of the attitude's noise depends on the arm
             C = [
                 _position_noise(p, c, mean[9:])
                 for p, c in zip(self.poses, self.covariances, strict=True)

@@ -66,12 +66,12 @@ from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Admission, Belief, Finding, Manoeuvre
 
-_FEWEST, _MOST = 3, 5  # least and most doubtful scans at a decision
+_FEWEST_DOUBTFUL, _MOST_DOUBTFUL = 3, 5  # least and most doubtful scans at a decision
 _RMS_STEP, _LEAST_SPREAD = (
     4.0,
     0.02,
 )  # step of the log rms residual, over its spread, that shows which poses are biased
-_LEAST_RISE = (
+_LEAST_RISE_OF_NOISE = (
     2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
 )
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
@@ -183,7 +183,7 @@ class AnomalyTest:
         allowed = *self.batch.noise_levels(track), self.batch.orbit, track.levels.excluded
         used, ranked = explain(window, first, self._priors, *allowed)
         least = math.sqrt(
-            _LEAST_RISE * nis_scale(track)
+            _LEAST_RISE_OF_NOISE * nis_scale(track)
         )  # noise that the accepted poses have as well is no rise
         return used, [
             e for e in ranked if e.hypothesis is not Hypothesis.NOISIER or e.size.max() > least
@@ -209,7 +209,7 @@ class AnomalyTest:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones
         may agree by themselves.
         """
-        if len(track.doubtful) < _FEWEST:
+        if len(track.doubtful) < _FEWEST_DOUBTFUL:
             return track, Finding.OPEN
         return self._by_agreement(track)
 
@@ -219,18 +219,18 @@ class AnomalyTest:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Finding.OPEN)
         best, explained = ranked[0], ranked[0].explains
-        if doubtful < _MOST and not certain(ranked):
+        if doubtful < _MOST_DOUBTFUL and not certain(ranked):
             return in_doubt
         manoeuvre = best.hypothesis is Hypothesis.MANOEUVRE and explained
-        if manoeuvre and not best.changes and doubtful < 2 * _MOST:
+        if manoeuvre and not best.changes and doubtful < 2 * _MOST_DOUBTFUL:
             return in_doubt
         if manoeuvre and best.changes:
             reported = self._reported(track, window, best)
             if scans_after(window, best) >= FEWEST_TO_FIT:
                 return self._manoeuvred(reported, window, best), Finding.EXPLAINED
-            if doubtful < 2 * _MOST:
+            if doubtful < 2 * _MOST_DOUBTFUL:
                 return reported, Finding.OPEN
-        if doubtful < _FEWEST:
+        if doubtful < _FEWEST_DOUBTFUL:
             return in_doubt
         free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
         if free or (best.hypothesis in _USED and explained):
@@ -274,7 +274,7 @@ class AnomalyTest:
             np.array([e.innovation.rms_m for e in epochs if e.innovation.rms_m > 0.0])
             for epochs in (track.recent, track.doubtful)
         )
-        if min(len(before), len(after)) >= _FEWEST:
+        if min(len(before), len(after)) >= _FEWEST_DOUBTFUL:
             spread = max(_LEAST_SPREAD, float(np.std(np.log(before))), float(np.std(np.log(after))))
             step = float(np.log(np.median(after) / np.median(before)))
             if abs(step) > _RMS_STEP * spread:
@@ -306,10 +306,10 @@ class AnomalyTest:
             levels = self._disturbances(track)
             anew = self._initialised_anew(track, levels)
             if anew is None and levels.count:
-                anew = self._started(track, track.doubtful[-_FEWEST:], levels)
+                anew = self._started(track, track.doubtful[-_FEWEST_DOUBTFUL:], levels)
         if anew is not None:
             return anew.changed(reinitialised=track.reinitialised + 1), Finding.EXPLAINED
-        left = with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :])
+        left = with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST_DOUBTFUL :])
         return left, Finding.UNEXPLAINED
 
     def _with_rejected(self, track: Track) -> Track:
@@ -429,7 +429,7 @@ class AnomalyTest:
         """A new track from the doubtful poses alone, all or the last of them, that agree through
         free motion.
         """
-        for first in range(len(track.doubtful) + 1 - _FEWEST):
+        for first in range(len(track.doubtful) + 1 - _FEWEST_DOUBTFUL):
             anew = self._from_poses(track, track.doubtful[first:], levels)
             if anew is not None:
                 return anew

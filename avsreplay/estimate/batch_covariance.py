@@ -33,7 +33,12 @@ from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, t
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, ROUNDING, definite
 from avsreplay.estimate.mixture import Component, volumes
 from avsreplay.estimate.noise import cholesky_root
-from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
+from avsreplay.estimate.noise_levels import (
+    POSE_BLOCKS,
+    NoiseLevels,
+    mean_share,
+    pose_error_covariance,
+)
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -43,7 +48,7 @@ _TRIAL = (
     2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
 )
 _TRIES, _LOST = 6, 3.0
-_PIN_STEPS, _FEWEST_STEPS = (
+_PINNED_FIT_STEPS, _FEWEST_STEPS = (
     15,
     40,
 )  # budget of a fit with one direction fixed, and least budget of all of them
@@ -175,7 +180,7 @@ def _profile(
             break
         pin = Pin(fitted.chart, row, side, _PIN_1S)
         there, P, steps = yield from problem.pinned(
-            there, params, pin, min(_PIN_STEPS, most - spent)
+            there, params, pin, min(_PINNED_FIT_STEPS, most - spent)
         )
         spent += steps
         rise = problem.cost(there) - fitted.half_chi2
@@ -214,8 +219,8 @@ def sandwich(
     )  # P = (R' R)^-1
     white, total = Q[: 6 * n].reshape(n, 6, DIM), Q[6 * n :].T @ Q[6 * n :]
     plain = levels.factors(mean_share(points))
-    V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
-    for b in range(BLOCKS):
+    V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(POSE_BLOCKS)
+    for b in range(POSE_BLOCKS):
         rows = np.ascontiguousarray(white[:, 3 * b : 3 * b + 3]).reshape(n, -1)
         columns = rows.reshape(-1, DIM)
         found = columns.T @ (V[b] @ rows).reshape(-1, DIM)

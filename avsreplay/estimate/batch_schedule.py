@@ -59,7 +59,7 @@ _RECENT = 0.1
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
 _LEAST_TORQUE = 1e-6
-_LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
+_LONGEST_MEMORY_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _GAP = 2  # intervals between poses after which a mixture is propagated by its components
 _instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
 
@@ -282,7 +282,9 @@ class BatchSchedule:
     def _memory_ns(self, track: Track) -> int:
         """How far back a fit looks [ns]."""
         torque, half = max(self.noise_levels(track)[0], _LEAST_TORQUE), np.trace(track.R[3:, 3:])
-        return round(min(memory_s(torque, 2.0 * float(np.sqrt(half)) or 1.0), _LONGEST_S) * 1e9)
+        return round(
+            min(memory_s(torque, 2.0 * float(np.sqrt(half)) or 1.0), _LONGEST_MEMORY_S) * 1e9
+        )
 
     def _first(self, track: Track, prediction: Prediction, innovation: Innovation) -> Belief:
         """The belief after the first poses, too few for a fit."""

@@ -43,7 +43,7 @@ _SIZE_OF_NOISE = (
     500.0  # error of size that noise causes, over (rms / extent)^2: 30 to 500 on five meshes
 )
 _SIZE_1S = 1e-3  # standard error of the size from one scan that is added to the stated one
-_LEAST_SCANS, _ALIKE, _SIGMAS = (
+_LEAST_SCANS, _ALIKE_NEIGHBOURS, _SIGMAS = (
     12,
     4.0,
     4.0,
@@ -111,7 +111,7 @@ class ModelErrors:
         if n < _LEAST_SCANS:
             return 0.0
         mean = first / weight
-        variance = _ALIKE * max(second / weight - mean * mean, 0.0) / n
+        variance = _ALIKE_NEIGHBOURS * max(second / weight - mean * mean, 0.0) / n
         return math.sqrt(
             max(mean * mean - _SIGMAS**2 * variance - (_SIZE_OF_NOISE * squares / n) ** 2, 0.0)
         )

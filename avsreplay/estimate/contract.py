@@ -30,10 +30,10 @@ POSES, PERIOD_S, BODIES = 80, 0.5, 6
 POSITION_1S_M, ATTITUDE_1S_RAD = 0.002, np.radians(0.1)  # errors of the simulated poses
 # of the given belief, by block: half angle, rad/s, m, m/s, ratios, m, half angle
 START_1S = np.repeat([0.02, 0.02, 0.02, 0.005, 0.05, 0.02, 0.02], [3, 3, 3, 3, 2, 3, 3])
-SETTLED = 30  # poses after which the errors are compared with the covariance
-SAME_M, SAME_RAD = 1e-6, 1e-6  # equal but for rounding
+SETTLED_POSES = 30  # poses after which the errors are compared with the covariance
+ROUNDING_M, ROUNDING_RAD = 1e-6, 1e-6  # equal but for rounding
 MEAN_NEES = (0.3, 2.5)  # allowed mean of the squared error over its variance, per direction
-LATER_S = 10.0  # a forecast is compared with the motion this long after the last pose
+FORECAST_S = 10.0  # a forecast is compared with the motion this long after the last pose
 SEED = 20
 NS = 1_000_000_000
 
@@ -149,7 +149,9 @@ def _same(law: str, pairs: Sequence[tuple[Belief, Belief]]) -> LawResult:
     found = np.array([_difference(a, b) for a, b in pairs])
     away, turned = found.max(axis=0).tolist()
     return LawResult(
-        law, away <= SAME_M and turned <= SAME_RAD, f"{away:.1e} m, {turned:.1e} rad at most"
+        law,
+        away <= ROUNDING_M and turned <= ROUNDING_RAD,
+        f"{away:.1e} m, {turned:.1e} rad at most",
     )
 
 
@@ -228,7 +230,7 @@ def _accuracy(bodies: Sequence[Stream], runs: Sequence[Sequence[Belief]]) -> Law
 def _consistency(bodies: Sequence[Stream], runs: Sequence[Sequence[Belief]]) -> LawResult:
     squares = []
     for body, run in zip(bodies, runs, strict=True):
-        for x, belief in zip(body.truth[SETTLED:], run[SETTLED:], strict=True):
+        for x, belief in zip(body.truth[SETTLED_POSES:], run[SETTLED_POSES:], strict=True):
             e = innovation_vector(belief.x, x.T_ac)
             S = _pose_covariance(belief)
             squares.append(float(e @ np.linalg.solve(S, e)) / 6.0)
@@ -256,12 +258,12 @@ def _forecast(name: str, bodies: Sequence[Stream]) -> LawResult:
             seen = estimator.innovate(prior, alignment)
             track, _ = estimator.step(track, prior, seen, Admission.ADMITTED, False)
         belief = estimator.published(track)
-        sigma = float(estimator.track_forecast(track, np.array([LATER_S])).pos_1s_m[0])
-        there = estimator.motion(belief)(np.array([LATER_S]))[0][0]
-        truth = propagate_state(body.truth[-1], LATER_S)[0].T_ac.t
+        sigma = float(estimator.track_forecast(track, np.array([FORECAST_S])).pos_1s_m[0])
+        there = estimator.motion(belief)(np.array([FORECAST_S]))[0][0]
+        truth = propagate_state(body.truth[-1], FORECAST_S)[0].T_ac.t
         inside += bool(np.linalg.norm(there - truth) <= 4.0 * sigma)
     return LawResult(
         "the forecast contains the later motion",
         inside >= len(bodies) - 1,
-        f"{inside} of {len(bodies)} within 4 sigma after {LATER_S:g} s",
+        f"{inside} of {len(bodies)} within 4 sigma after {FORECAST_S:g} s",
     )

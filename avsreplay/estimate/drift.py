@@ -33,7 +33,7 @@ from avsreplay.estimate.driven_motion import fit_jointly, is_bounded
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import (
-    MOST_POINTS,
+    MOST_NORMAL_POINTS,
     NO_LEVELS,
     NoiseLevels,
     disturbed_likelihood,
@@ -52,15 +52,17 @@ _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
 # log odds over one step of the velocity and random disturbances: 3 less 0.5, the gain of the
 # likeliest by Wilks' theorem
 _CONSTANT = 2.5
-_ROUNDS = 3  # largest number of joint fits with another onset or kind
-_LEAST_GAIN = (
+_MOST_JOINT_FITS = 3  # largest number of joint fits with another onset or kind
+_RELINEARISED_GAIN = (
     0.5  # decrease of the cost (half chi-square) above which another linearisation follows
 )
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
-_SMALL = 0.1  # prior 1 sigma of a change that is compared with a drift, over that of a manoeuvre
-_NO_WEIGHT = 1e-3  # probability of an onset hypothesis that is left out
+_SMALL_CHANGE = (
+    0.1  # prior 1 sigma of a change that is compared with a drift, over that of a manoeuvre
+)
+_NEGLIGIBLE_ONSET = 1e-3  # probability of an onset hypothesis that is left out
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 
 
@@ -120,7 +122,7 @@ def find_drift(
     )
     share = 1.0 / (1.0 + math.exp(min(odds, 700.0)))
     both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
-    likely = tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT)
+    likely = tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NEGLIGIBLE_ONSET)
     return DriftFound(likely, best.width * widths, within.spread_s)
 
 
@@ -218,7 +220,7 @@ def _improved(
     one. ``only``: the onsets that are tried.
     """
     frame = begin
-    for k in range(_ROUNDS + 1):
+    for k in range(_MOST_JOINT_FITS + 1):
         onsets = (
             _onsets(frame.points.times_s, frame.onset_s if k else None) if only is None else only
         )
@@ -229,7 +231,7 @@ def _improved(
             and best.onset_s == frame.onset_s
             and bool(np.array_equal(best.u != 0.0, frame.u != 0.0))
         )
-        if best.log_odds < _FOUND or same or k == _ROUNDS:
+        if best.log_odds < _FOUND or same or k == _MOST_JOINT_FITS:
             break
         open_ = np.where(best.u != 0.0, widths, 0.0)
         start = np.where(best.u != 0.0, frame.u, 0.0)
@@ -237,7 +239,7 @@ def _improved(
             poses, frame.chart, prior, factors, best.onset_s, start, open_
         )
         yield _size(closer)
-        if closer.cost > frame.cost - _LEAST_GAIN and (
+        if closer.cost > frame.cost - _RELINEARISED_GAIN and (
             only is None or k
         ):  # the first of given onsets may be worse
             break
@@ -280,7 +282,7 @@ def _evidence(
     ``widths`` is the prior of the constant one; None for random ones.
     """
     problem = frame.problem
-    points = normal_points(frame.poses, frame.chart, problem.factors, MOST_POINTS)
+    points = normal_points(frame.poses, frame.chart, problem.factors, MOST_NORMAL_POINTS)
     coarse = Problem(points, problem.prior, problem.factors, frame.chart, np.inf)
     kinds, open_ = [k for k in (0, 1) if drift.u[3 * k : 3 * k + 3].any()], np.flatnonzero(drift.u)
     likely = []
@@ -371,7 +373,7 @@ def _step_odds(frame: DrivenFit, params: EstimatorParams, noise: float) -> float
     """Log odds over free motion of the most likely single change of the velocities: it may
     explain the poses better.
     """
-    times, widths = frame.points.times_s, _SMALL * np.repeat(params.change_1s, 3)
+    times, widths = frame.points.times_s, _SMALL_CHANGE * np.repeat(params.change_1s, 3)
     instants = 0.5 * (times[1:] + times[:-1])
     found = _explained(
         frame, _products(frame, step_columns(frame, instants)), instants, widths, noise

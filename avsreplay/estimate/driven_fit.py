@@ -22,7 +22,7 @@ from avsreplay.estimate.driven import drift_equivalents, drive_of
 from avsreplay.estimate.dynamics import translated
 from avsreplay.estimate.error_state import DIM, REACHED
 from avsreplay.estimate.noise_levels import (
-    MOST_POINTS,
+    MOST_NORMAL_POINTS,
     NoiseLevels,
     estimate_levels,
     pose_error_covariance,
@@ -223,7 +223,9 @@ def levels_of(
         positions: as in ``estimate_levels``.
     """
     old, kinds = fitted.problem, np.flatnonzero(fitted.u)
-    points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS, scatter=True)
+    points = normal_points(
+        fitted.poses, fitted.chart, old.factors, MOST_NORMAL_POINTS, scatter=True
+    )
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
     return (

@@ -31,7 +31,7 @@ from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
-_PASSES, _SMALL = (
+_LINEARISATIONS, _SMALL_STEP_SIGMAS = (
     10,
     0.1,
 )  # most linearisations; size of a step, in 1 sigma, after which none follows
@@ -42,7 +42,7 @@ _LAST_STEPS, _LAST_GAIN = (
     20,
     0.004,
 )  # most steps of a descent from a motion that is near; least decrease: 0.1 sigma
-_JOINT_STEPS, _LEAST_GAIN = (
+_JOINT_STEPS, _LEAST_JOINT_GAIN = (
     60,
     0.05,
 )  # most steps of a joint fit; decrease of its cost below which it ends
@@ -50,7 +50,7 @@ _JOINT_STEPS, _LEAST_GAIN = (
 # away
 _COARSE = 0.1
 _DAMPING, _MOST_DAMPING = 1e-3, 1e8  # damping of Levenberg-Marquardt: first value, largest value
-_PIN, _PIN_STEPS, _LEAST_RISE = (
+_PIN, _PROFILE_STEPS, _LEAST_PROFILE_RISE = (
     0.1,
     20,
     1.0,
@@ -174,14 +174,14 @@ def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     for side in (-2.0, 2.0):
         joint.measure(row, side / _PIN + float(row @ fitted.u))
         joint.linearise(chart.moved(side * step[:DIM]).flat, u + side * step[_U])
-        yield from _descended(joint, len(seen), _PIN_STEPS, 0.0)
-        if joint.cost - cost < _LEAST_RISE:
+        yield from _descended(joint, len(seen), _PROFILE_STEPS, 0.0)
+        if joint.cost - cost < _LEAST_PROFILE_RISE:
             return False
     return True
 
 
 def _descended(
-    joint: _motion.Driven, count: int, most: int, share: float, least: float = _LEAST_GAIN
+    joint: _motion.Driven, count: int, most: int, share: float, least: float = _LEAST_JOINT_GAIN
 ) -> Parts[int]:
     """Descend to the minimum of a cost of ``count`` poses, and return the number of steps, at most
     ``most``.
@@ -276,7 +276,7 @@ def driven_motion(
     joint.linearise(chart.flat, u)
     yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
     chart, u = Chart(joint.chart), joint.u
-    for k in range(_PASSES):  # first about the motion of the fit, then about the one found
+    for k in range(_LINEARISATIONS):  # first about the motion of the fit, then about the one found
         off = np.concatenate([-chart.minus(prior.mean), -u, [fitted.onset_s - onset_s]])
         motion = replace(motion, chart=chart, u=u, onset_s=onset_s)
         v, P = _smoothed(motion, seen, float(seen.times_s[0]), off, before)
@@ -284,8 +284,8 @@ def driven_motion(
         if not np.isfinite(v).all() or float(np.abs(v[:DIM]).max()) > LARGEST_MOVE:
             break
         size = _size(v, P)
-        if size < _SMALL or (k == 0 and size < _NEAR):
-            return replace(motion, v=v if size < _SMALL else np.zeros_like(v), P=P)
+        if size < _SMALL_STEP_SIGMAS or (k == 0 and size < _NEAR):
+            return replace(motion, v=v if size < _SMALL_STEP_SIGMAS else np.zeros_like(v), P=P)
         chart, u, onset_s = chart.moved(v[:DIM]), u + v[_U], max(0.0, onset_s + float(v[_ONSET]))
     return None
 

@@ -22,7 +22,9 @@ DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
 # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
 ROUNDING = 1e-9
-_LEAST = 1e-9  # least eigenvalue of a product of a root with itself, in the same units
+_LEAST_ROOT_EIGENVALUE = (
+    1e-9  # least eigenvalue of a product of a root with itself, in the same units
+)
 _SMALLEST = 1e-300 * np.eye(DIM)
 # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 LARGEST_MOVE = 1e3
@@ -116,10 +118,10 @@ def definite(P: Array) -> Array:
 
 
 def definite_product(root: Array) -> Array:
-    """Root root' with its eigenvalues, in units of its variances, raised to ``_LEAST``, so that it
-    has an inverse.
+    """Root root' with its eigenvalues, in units of its variances, raised to
+    ``_LEAST_ROOT_EIGENVALUE``, so that it has an inverse.
     """
     scale = np.linalg.norm(root, axis=1)
     values, axes = np.linalg.eigh((root / scale[:, None]) @ (root / scale[:, None]).T)
-    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
+    half = axes * np.sqrt(np.maximum(values, _LEAST_ROOT_EIGENVALUE)) * scale[:, None]
     return np.asarray(half @ half.T)

@@ -44,7 +44,7 @@ OVER_FREE, OVER_NEXT = (
 # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _NONLINEAR = 2.0
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
-_INSTANTS, _FEWER, _LONG = (
+_MANOEUVRE_INSTANTS, _FEWER, _LONG = (
     8,
     4,
     9,
@@ -52,7 +52,7 @@ _INSTANTS, _FEWER, _LONG = (
 _LONGEST_SPREAD = (
     6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
 )
-_FINE, _REFINEMENTS, _NO_WEIGHT = (
+_FINE, _REFINEMENTS, _NEGLIGIBLE_EVIDENCE = (
     16,
     5,
     1e-4,
@@ -171,7 +171,7 @@ def _manoeuvre(
     """
     edges, lengths = window.edges_s[:-1], np.diff(window.edges_s)
     n = len(lengths)
-    count = _INSTANTS if n < _LONG else _FEWER
+    count = _MANOEUVRE_INSTANTS if n < _LONG else _FEWER
     instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
     columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
@@ -296,7 +296,7 @@ def _located(
     columns, first, last = None, 0.0, float(window.times_s[-1])
     for _ in range(_REFINEMENTS):
         weight = np.exp(single - single.max())
-        held = np.flatnonzero(weight > _NO_WEIGHT * weight.sum())
+        held = np.flatnonzero(weight > _NEGLIGIBLE_EVIDENCE * weight.sum())
         low = first if held[0] == 0 else float(instants[held[0] - 1])
         high = last if held[-1] + 1 == len(instants) else float(instants[held[-1] + 1])
         if columns is not None and high - low > 0.5 * (last - first):
@@ -315,7 +315,7 @@ def _located(
         math.sqrt(float(share @ (instants - after_s) ** 2)),
         (last - first) / _FINE / math.sqrt(12.0),
     )
-    used = share > _NO_WEIGHT
+    used = share > _NEGLIGIBLE_EVIDENCE
     _, sizes, C = log_evidence(white, free, columns[used], scale)
     held = share[used] / share[used].sum()
     size = held @ sizes

@@ -34,7 +34,7 @@ from avsreplay.estimate.error_state import DIM, RHO, VEL, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND, cholesky_root
-from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
+from avsreplay.estimate.noise_levels import MOST_NORMAL_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -362,7 +362,7 @@ def improved_levels(
         ~gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors)
     )
     for _ in range(2):  # normal points about the given motion, then about the fitted one
-        points = normal_points(poses, chart, gate, MOST_POINTS, scatter=True)
+        points = normal_points(poses, chart, gate, MOST_NORMAL_POINTS, scatter=True)
         problem = Problem(
             points, prior, factors, chart, np.inf
         )  # residuals with disturbances have the weight 1

@@ -150,7 +150,9 @@ def _difference(position: Triple, other: Triple, q: Quad) -> Array:
     return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
 
 
-_LEAST = 1e-12  # least eigenvalue of a repaired covariance, in units of its variances
+_LEAST_REPAIRED_EIGENVALUE = (
+    1e-12  # least eigenvalue of a repaired covariance, in units of its variances
+)
 
 
 def innovation_of(
@@ -246,7 +248,7 @@ def _repaired(S: Array, R: Array) -> Array:
     """R plus the positive part of S - R, where rounding of a very large P has made S indefinite."""
     scale = np.sqrt(np.abs(np.diagonal(S)) + np.diagonal(R))
     values, axes = np.linalg.eigh((S - R) / np.outer(scale, scale))
-    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
+    half = axes * np.sqrt(np.maximum(values, _LEAST_REPAIRED_EIGENVALUE)) * scale[:, None]
     return np.asarray(half @ half.T + R)
 
 

@@ -37,7 +37,7 @@ _FREE_RAD = (
 )
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
 _LEVEL_DOF = 10.0  # degrees of freedom with which the level of the last fit counts in the window
-_MOST_COMMON = 0.8  # largest share from errors of the model: the views of two scans differ
+_MOST_COMMON_SHARE = 0.8  # largest share from errors of the model: the views of two scans differ
 _LAGS = (5, 10, 20, 40)
 _CALM = (
     7.0  # log likelihood ratio of the usual noise over the risen one from which the rise has ended
@@ -348,7 +348,7 @@ class Noise:
         lean = _EDGE_LEAN * alignment.inliers * (alignment.rms_m / self._extent_m) ** 2
         edges = lean / (1.0 + lean)
         return (
-            max(edges, min(counted * systematic_share(alignment), _MOST_COMMON))
+            max(edges, min(counted * systematic_share(alignment), _MOST_COMMON_SHARE))
             if counted
             else edges
         )

@@ -48,19 +48,21 @@ from avsreplay.estimate.normal_points import PositionRows, error_parts
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
-MOST_POINTS = 24  # normal points of an estimate
+MOST_NORMAL_POINTS = 24  # normal points of an estimate
 FEWEST = 12  # poses from which the levels are estimated
 _CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
 _STEP = 3.0  # largest factor on a variance in one step
-_SMALL = 0.3  # part of its standard deviation below which a disturbance may become zero
+_VANISHING_PART = 0.3  # part of its standard deviation below which a disturbance may become zero
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
-_WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
+_WORK = (
+    2 * MOST_NORMAL_POINTS**3
+)  # sum of cubes of the numbers of points over the steps of an estimate
 _MOST_STEPS = 6
 _ESTABLISHED = 3.0  # log evidence of a random disturbance that the poses show
 # the same from which it is reported: the poses of free bodies reach it in none of 40 logs
 _REPORTED = 10.0
 _LARGEST = 4.0  # largest squared residual with disturbances over the mean one
-BLOCKS = 2  # attitude, position
+POSE_BLOCKS = 2  # attitude, position
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,7 @@ def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) ->
     return np.array(
         [
             (levels.white[b] * white + levels.common[b] * common) / factors[b] ** 2
-            for b in range(BLOCKS)
+            for b in range(POSE_BLOCKS)
         ]
     )
 
@@ -148,7 +150,7 @@ def estimate_levels(
     fewer poses, in parts.
 
     Args:
-        points: normal points, at most ``MOST_POINTS``.
+        points: normal points, at most ``MOST_NORMAL_POINTS``.
         problem: their cost, linearised at the fit.
         levels: the last estimate.
         claimed: only the disturbances are estimated.
@@ -235,7 +237,7 @@ def disturbed_likelihood(
     candidates.
 
     Args:
-        points: normal points, at most ``MOST_POINTS``.
+        points: normal points, at most ``MOST_NORMAL_POINTS``.
         problem: their cost, linearised at the fit.
         levels: variance components; those of the errors of the poses and of the other disturbance
             are used.
@@ -323,7 +325,7 @@ def _extended(data: Residuals, effects: Array, size: Array) -> Residuals:
 
 def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
     """Covariances (3n, 3n) of the errors of the poses, attitude and position."""
-    return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(BLOCKS)]
+    return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(POSE_BLOCKS)]
 
 
 def _disturbances(
@@ -397,7 +399,7 @@ def _priors(points: Poses) -> list[tuple[float, float]]:
     points.
     """
     out, share = [], mean_share(points)
-    for b in range(BLOCKS):
+    for b in range(POSE_BLOCKS):
         dof, total = _CLAIMED_DOF, _CLAIMED_DOF
         if points.within is not None:
             dof, total = (
@@ -427,7 +429,7 @@ def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) 
     old, new = theta[free], theta[free] + inverse @ (score[free] / scale) / scale
     started = np.where(old > 0.0, np.clip(new, old / factor, old * factor), np.maximum(new, 0.0))
     started = np.where(disturbance[free], np.minimum(started, DENSITIES[-1] ** 2), started)
-    small = disturbance[free] & (new <= 0.0) & (old * scale < _SMALL)
+    small = disturbance[free] & (new <= 0.0) & (old * scale < _VANISHING_PART)
     out[free] = np.where(small, 0.0, started)
     out[:4] = np.clip(out[:4], 1.0 / _MOST_FACTOR, _MOST_FACTOR)
     return out

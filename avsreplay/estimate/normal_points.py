@@ -27,10 +27,10 @@ _POINTS, _SPAN_RAD = (
     128,
     0.25,
 )  # most normal points, and least rotation over which poses are joined [rad]
-_FEW = 48  # poses up to which none are joined
+_MOST_UNJOINED = 48  # poses up to which none are joined
 _NEIGHBOURS = 5  # poses with whose median a pose is compared
 # squared difference of a gross error over the median of all poses, or over its expectation
-_GROSS = 100.0
+_GROSS_RATIO = 100.0
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _FREE = (1e2, 1e3, 1e1)  # 1 sigma of arm [m], position [m] and velocity [m/s] before the positions
 _LEAST_M = 1e-6  # least 1 sigma of a displacement [m]
@@ -171,7 +171,7 @@ def normal_points(
         scatter: with the scatter of the poses about their normal points (``Poses.within``).
     """
     n, rate = len(poses), float(np.linalg.norm(reference.w_c))
-    if n <= min(most, _FEW):
+    if n <= min(most, _MOST_UNJOINED):
         return poses
     first = _parts(rate * (poses.times_s - poses.times_s[0]), most)
     d = poses.residuals(Problem(poses, _ANY_PRIOR, factors), reference)
@@ -207,7 +207,7 @@ def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
         :, :, 0
     ]
     squares = (white * white).sum(axis=1)
-    return np.asarray(squares > _GROSS * max(float(np.median(squares)), 6.0))
+    return np.asarray(squares > _GROSS_RATIO * max(float(np.median(squares)), 6.0))
 
 
 def _parts(turned: Array, most: int) -> NDArray[np.int64]:
@@ -219,7 +219,7 @@ def _parts(turned: Array, most: int) -> NDArray[np.int64]:
         most: number of normal points.
     """
     n = len(turned)
-    span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // min(most, _FEW))
+    span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // min(most, _MOST_UNJOINED))
     out, angles = [0], turned.tolist()
     while (next_ := min(bisect_left(angles, angles[out[-1]] + span), out[-1] + size)) < n:
         out.append(next_)

@@ -20,8 +20,11 @@ from avsreplay.errors import value_class
 from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array
 
-FEW = 12  # accepted scans that are kept at least, and up to which none are combined
-_LONGEST_S, _MOST = 5.0, 64  # accepted scans that are kept: those within this time, so many at most
+FEWEST_KEPT = 12  # accepted scans that are kept at least, and up to which none are combined
+_KEPT_SCANS_S, _MOST_KEPT = (
+    5.0,
+    64,
+)  # accepted scans that are kept: those within this time, so many at most
 # latest accepted scans that are not combined; of the older points two each have 2, 4, 8 ... scans
 _SINGLE = 4
 
@@ -90,7 +93,7 @@ def scan_points(R: Sequence[Array], accepted: int) -> ScanPoints:
         accepted: number of scans before the doubtful ones, which are not combined.
     """
     first, size, left = list(range(len(R))), 2, accepted - _SINGLE
-    if accepted > FEW:
+    if accepted > FEWEST_KEPT:
         older = []
         while left > 0:
             for _ in range(2):
@@ -110,11 +113,11 @@ def scan_points(R: Sequence[Array], accepted: int) -> ScanPoints:
 
 
 def latest(scans: tuple[Epoch, ...]) -> tuple[Epoch, ...]:
-    """Return the accepted scans that are kept: the last ``FEW``, or all within some seconds
+    """Return the accepted scans that are kept: the last ``FEWEST_KEPT``, or all within some seconds
     where these are more.
     """
-    since_ns = scans[-1].prediction.belief.t_ns - round(1e9 * _LONGEST_S)
-    first = max(0, len(scans) - _MOST)
-    while first < len(scans) - FEW and scans[first].prediction.belief.t_ns < since_ns:
+    since_ns = scans[-1].prediction.belief.t_ns - round(1e9 * _KEPT_SCANS_S)
+    first = max(0, len(scans) - _MOST_KEPT)
+    while first < len(scans) - FEWEST_KEPT and scans[first].prediction.belief.t_ns < since_ns:
         first += 1
     return scans[first:]

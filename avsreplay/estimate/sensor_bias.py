@@ -31,7 +31,7 @@ from avsreplay.estimate.scan_window import (
 from avsreplay.estimate.track import Epoch, SensorBias
 from avsreplay.geometry import Array
 
-_MOST = 12  # scans of a bias that are compared
+_MOST_COMPARED = 12  # scans of a bias that are compared
 # 1 sigma of the change of an offset from scan to scan, because the view changes, over its size
 _VARIES = 0.02
 _QUIETER = (
@@ -116,8 +116,8 @@ def compared(
     """Return the error with its last scan among those that are compared, and a manoeuvre that
     explains them instead.
 
-    At most ``_MOST`` scans of the error are kept. Then every second one is left out, and the next
-    ones are added half as often, so that a slow growth of the offset is found as well.
+    At most ``_MOST_COMPARED`` scans of the error are kept. Then every second one is left out, and
+    the next ones are added half as often, so that a slow growth of the offset is found as well.
 
     Args:
         bias: after the last scan.
@@ -130,7 +130,7 @@ def compared(
     if bias.left_out + 1 < bias.spacing or not bias.before:
         return replace(bias, left_out=bias.left_out + 1), None
     since, spacing = (*bias.since, bias.last), bias.spacing
-    if len(since) > _MOST:
+    if len(since) > _MOST_COMPARED:
         since, spacing = since[::2], 2 * spacing
     window, ranked = compare((*bias.before, *since), len(bias.before))
     best, odds = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence

@@ -35,7 +35,7 @@ _NO_NOISE, _NO_MOTION = frozen(np.zeros((6, 6))), frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
 # largest change of the other rotations if a rotation that is first determined turns the track
 _TURN_WITHIN_RAD = 0.2
-_ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
+_SAME_MOTION_COSINE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 
 @value_class
@@ -205,7 +205,9 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
     scale = np.repeat([length_m, 1.0], 3)[:, None]
     (a, _), (b, _) = (np.linalg.qr(scale * each) for each in (first, other))
     left, cosines, _ = np.linalg.svd(a.T @ b)
-    return frozen(2.0 * length_m * (a @ left[:, : len(cosines)][:, cosines > _ALIKE]) / scale)
+    return frozen(
+        2.0 * length_m * (a @ left[:, : len(cosines)][:, cosines > _SAME_MOTION_COSINE]) / scale
+    )
 
 
 def undetermined(track: Track, innovation: Innovation, used: bool, length_m: float) -> Array:

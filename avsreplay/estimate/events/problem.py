@@ -46,7 +46,7 @@ _PRIOR_DOF = 6.0  # weight of the claimed variances, in measured numbers
 _COMMON_DOF = 3.0  # the same of the claimed common errors
 _LEAST_DENSITY = 1e-9  # of random disturbances [rad/s^1.5, m/s^1.5]: without effect over a log
 _LEAST_COMMON = 1e-3  # least variance of common errors over that of the others
-_MOST_COMMON = 1e3  # largest one
+_LARGEST_COMMON = 1e3  # largest one
 _LARGEST_RAD = 0.5  # largest step of the attitude
 _LARGEST_LOG = 1.0  # largest step of the logarithm of inertia
 
@@ -236,7 +236,7 @@ class Problem:
             traces = np.float64(size @ np.einsum("kii->k", found.information[:, part, part]))
             claimed = _COMMON_DOF * self.claimed_common / levels.common[b]
             ratio = (squares + claimed) / (traces + _COMMON_DOF)
-            common[b] = np.clip(levels.common[b] * ratio, _LEAST_COMMON, _MOST_COMMON)
+            common[b] = np.clip(levels.common[b] * ratio, _LEAST_COMMON, _LARGEST_COMMON)
         densities = []
         for value, G in ((levels.torque, flow.torque), (levels.force, flow.force)):
             b_ = np.einsum("kip,ki->kp", G, found.score[:, :20])

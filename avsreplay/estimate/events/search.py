@@ -21,17 +21,17 @@ _LATE = (0.1, 0.3, 0.5, 0.7, 0.9)  # instants of an onset that are compared, as 
 _QUIET = 0.1  # factor on disturbances for the second search
 _DISTURBED = 2.0  # loss of log evidence by it from which random disturbances act
 _TRIED = 3  # kinds of which the best event is fitted
-_LEAST_GAIN = -4.0  # log odds at fixed noise from which an event is fitted
+_LEAST_LOG_ODDS_TRIED = -4.0  # log odds at fixed noise from which an event is fitted
 _FIRST_CYCLES = 0.75  # in a log, of the lowest frequency that is compared
 _STEP_CYCLES = 0.5  # between two of them
 _MOST_FREQUENCIES = 40
 _FINER = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # cycles in a log by which a frequency is improved
-_INSTANTS = 10  # over which the odds of a kind are divided that acts over the whole log
+_WHOLE_LOG_INSTANTS = 10  # over which the odds of a kind are divided that acts over the whole log
 _MOST_EVENTS = 8
 _CERTAIN = 6.0  # log odds from which an event is kept without a fit of the set without it
 _MARGIN = 3.0  # log odds that an event must add: fits end within about this of their maximum
 _START_ROUNDS = 25  # most improvements of the first fit
-_ROUNDS = 8  # of a further one, which begins at another fit
+_FURTHER_FIT_ROUNDS = 8  # of a further one, which begins at another fit
 _START_DENSITY = 0.1  # random torque of the start, by which the rate changes within a radian
 
 
@@ -87,7 +87,7 @@ def _rates(poses: Poses) -> tuple[Array, Array]:
 
 def odds(problem: Problem, event: Event) -> float:
     """Log prior odds of an event: those of its kind, divided over the instants."""
-    instants = len(problem.times) if event.kind.anywhere else _INSTANTS
+    instants = len(problem.times) if event.kind.anywhere else _WHOLE_LOG_INSTANTS
     return event.kind.odds - math.log(instants)
 
 
@@ -132,7 +132,9 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
     while len(best.events) < _MOST_EVENTS:
         tried: list[Fit] = []
         for value, event in proposals(problem, best):
-            if value >= _LEAST_GAIN and not any(_alike(event, f.events[-1]) for f in tried):
+            if value >= _LEAST_LOG_ODDS_TRIED and not any(
+                _alike(event, f.events[-1]) for f in tried
+            ):
                 tried.append(_settled(problem, best, (*best.events, event)))
         sets += tried
         top = max(tried, key=lambda f: total(problem, f), default=None)
@@ -210,7 +212,7 @@ def _settled(problem: Problem, fit: Fit, events: Sequence[Event]) -> Fit:
     """The fit of another set, begun from this one, with the onsets and scales of its events
     found anew.
     """
-    out = problem.fit(fit.charts, fit.levels, events, fit.wrong, _ROUNDS)
+    out = problem.fit(fit.charts, fit.levels, events, fit.wrong, _FURTHER_FIT_ROUNDS)
     for _ in range(2):
         moved = tuple(relocated(problem, out, e) for e in out.events)
         if all(
@@ -218,7 +220,7 @@ def _settled(problem: Problem, fit: Fit, events: Sequence[Event]) -> Fit:
             for a, b in zip(moved, out.events, strict=True)
         ):
             break
-        out = problem.fit(out.charts, out.levels, moved, out.wrong, _ROUNDS)
+        out = problem.fit(out.charts, out.levels, moved, out.wrong, _FURTHER_FIT_ROUNDS)
     return out
 
 
