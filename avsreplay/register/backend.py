@@ -47,7 +47,7 @@ TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 NO_LIMIT = 2**62  # of point searches
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
-SETTLED, RADIUS_OF_EXTENT = (
+SETTLED_ERROR_OF_GATE, RADIUS_OF_EXTENT = (
     0.05,
     0.25,
 )  # of the rejection distance over the root of the points; usual rms radius
@@ -56,7 +56,7 @@ ROUGH_OF_GATE = (
     0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
 )
 # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-LEAST_POINTS = 2000
+LEAST_BUDGET_POINTS = 2000
 ALIGN_WORK, WITHIN_WORK = (
     (20_000, 8),
     (30_000, 15),
@@ -250,7 +250,7 @@ class HornBackend(Backend):
         within: dict[str, Any] = {"n_max": most, "n_plane": plane, "few": few, "tighten": 0.0}
         # A third of the rejection distance is the noise; a small share of the error that it leaves
         # need not be reached.
-        error = SETTLED * gate_m / np.sqrt(max(len(points), 1))
+        error = SETTLED_ERROR_OF_GATE * gate_m / np.sqrt(max(len(points), 1))
         limits, rad = self._rules[False], error / (RADIUS_OF_EXTENT * self._index.extent_m)
         within.update(
             gate_m=gate_m,
@@ -285,7 +285,7 @@ class HornBackend(Backend):
 
 def _most(work: tuple[int, int], points: int) -> int:
     """The most point searches of an alignment."""
-    return work[0] + work[1] * max(points, LEAST_POINTS)
+    return work[0] + work[1] * max(points, LEAST_BUDGET_POINTS)
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:

@@ -23,10 +23,10 @@ from avsreplay.register.evidence import robust_noise
 
 # A difference of the mean costs below so many standard errors is due to chance. A smaller value
 # accepts more poses that have a rival.
-SIGMAS = 5.0
+CHANCE_SIGMAS = 5.0
 OFF = 2.0  # a point farther from the model than this many widths is off it
-CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
-LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
+CONTRADICTING_RAYS = 0.1  # share of the rays that contradict the true pose, at least
+DECIDING_LOG_RATIO = 20.0  # log likelihood ratio that decides
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 
 
@@ -55,7 +55,7 @@ def least_noise(found: Sequence[Measured]) -> float:
     return min(robust_noise(each.distance) for each in found)
 
 
-def as_good(best: Array, other: Array, margin: float, sigmas: float = SIGMAS) -> bool:
+def as_good(best: Array, other: Array, margin: float, sigmas: float = CHANCE_SIGMAS) -> bool:
     """Return whether the mean excess of the costs (n,) of another pose over those of the best one
     is below so many standard errors, or below the margin.
     """
@@ -75,7 +75,7 @@ def decides(better: Measured, other: Measured, width_m: float, complete: bool) -
             count.
     """
     a, b, off = better.distance, other.distance, OFF * width_m
-    share = max(CONTRADICTING, float(np.mean((a > width_m) & (b > width_m))))
+    share = max(CONTRADICTING_RAYS, float(np.mean((a > width_m) & (b > width_m))))
     if share >= 0.5:
         return False
     rays_for = (
@@ -88,7 +88,7 @@ def decides(better: Measured, other: Measured, width_m: float, complete: bool) -
         + better.passed
         + (better.empty if complete else 0.0)
     )
-    enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
+    enough = (rays_for - against) * np.log((1.0 - share) / share) >= DECIDING_LOG_RATIO
     return bool(enough and against <= MOST_AGAINST * rays_for)
 
 

@@ -31,8 +31,11 @@ from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
-POINTS = 3000
-SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal except for rounding and the stopping rule
+SCAN_POINTS = 3000
+STOPPED_RAD, STOPPED_OF_EXTENT = (
+    np.radians(0.01),
+    5e-5,
+)  # equal except for rounding and the stopping rule
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20
 DETAIL = 200  # characters of a detail
@@ -68,7 +71,7 @@ class Bench:
         self.scale = scale
         self.surface = boxes(scale)
         self.T_ac = example_pose(scale)
-        self.scan = self.T_ac.apply(view(self.surface, POINTS, self.T_ac.inverse().t))
+        self.scan = self.T_ac.apply(view(self.surface, SCAN_POINTS, self.T_ac.inverse().t))
         self.guess = self.T_ac @ Pose(
             exp(np.radians([2.0, -1.5, 1.0])),
             self.surface.extent * np.array([0.006, -0.005, 0.004]),
@@ -135,7 +138,7 @@ def inverse(bench: Bench) -> LawResult:
     surface.
     """
     found = bench.registrar.register(bench.scan, bench.guess)
-    there = found.T_ac.apply(view(bench.surface, POINTS, bench.T_ac.inverse().t))
+    there = found.T_ac.apply(view(bench.surface, SCAN_POINTS, bench.T_ac.inverse().t))
     off = _rms(np.linalg.norm(there - bench.scan, axis=1)) / bench.surface.extent
     back = (
         _rms(bench.registrar.distance(bench.scan, found.T_ac, bench.surface.extent))
@@ -408,7 +411,7 @@ def _ability(law: str, bench: Bench, start: Pose, **how: Any) -> LawResult:
 
 def _same(law: str, bench: Bench, first: Pose, second: Pose) -> LawResult:
     turn, shift = bench.gap(first, second)
-    held = bool(turn < SAME_RAD and shift < SAME_OF_EXTENT)
+    held = bool(turn < STOPPED_RAD and shift < STOPPED_OF_EXTENT)
     return LawResult(law, held, f"{np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
 
 

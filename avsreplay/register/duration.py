@@ -28,9 +28,9 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.size import (
     LARGEST_ERROR,
+    MATCH_ROUNDS,
     PATCHES_OF_EXTENT,
-    ROUNDS,
-    SIGMAS,
+    SIZE_SIGMAS,
     Rows,
     clustered,
     joined,
@@ -41,12 +41,12 @@ from avsreplay.register.size import (
 )
 from avsreplay.register.surface_index import SurfaceIndex
 
-EVERY, MOST_SCANS, LEAST_SCANS = (
+MEASURED_EVERY, MOST_MEASURED, LEAST_SCANS = (
     2,
     24,
     8,
 )  # aligned scans of which one is measured at first; measured scans
-BIAS_SCANS, BLOCKS = 4, 6  # scans for the bias of the noise, and blocks of the jackknife
+BIAS_SCANS, JACKKNIFE_BLOCKS = 4, 6  # scans for the bias of the noise, and blocks of the jackknife
 MOST_WEIGHT = 4.0  # largest weight of a scan for the size, in units of the median weight
 LEAST_OF_PERIOD = 0.02  # least duration that is reported, over the period
 
@@ -107,7 +107,7 @@ class Durations:
 
     measured: list[tuple[OrderedScan, ScanDuration]] = field(default_factory=list)
     offered: int = 0
-    stride: int = EVERY
+    stride: int = MEASURED_EVERY
     open: bool = True
 
     def wanted(self) -> bool:
@@ -123,8 +123,8 @@ class Durations:
         self.measured.append((scan, found))
         if len(self.measured) >= LEAST_SCANS:
             mean, sigma, period = self._mean()
-            self.open = abs(mean) + SIGMAS * sigma > LEAST_OF_PERIOD * period
-        if len(self.measured) == MOST_SCANS:
+            self.open = abs(mean) + SIZE_SIGMAS * sigma > LEAST_OF_PERIOD * period
+        if len(self.measured) == MOST_MEASURED:
             self.measured, self.stride = self.measured[::2], 2 * self.stride
 
     def result(self, index: SurfaceIndex) -> Duration | None:
@@ -145,7 +145,7 @@ class Durations:
 
     @staticmethod
     def _significant(mean: float, sigma: float, period: float) -> bool:
-        return abs(mean) >= max(LEAST_OF_PERIOD * period, SIGMAS * sigma)
+        return abs(mean) >= max(LEAST_OF_PERIOD * period, SIZE_SIGMAS * sigma)
 
     def _mean(self) -> tuple[float, float, float]:
         """The mean duration weighted by its variance, its standard error, and the period [s]."""
@@ -161,10 +161,10 @@ class Durations:
 
 def _mean_of(values: Array, weight: Array) -> tuple[float, float]:
     """Weighted mean of values (n,), and its standard error by the jackknife over blocks."""
-    block = np.arange(len(values)) * BLOCKS // len(values)
+    block = np.arange(len(values)) * JACKKNIFE_BLOCKS // len(values)
     without = [
         float(weight[block != k] @ values[block != k] / weight[block != k].sum())
-        for k in range(BLOCKS)
+        for k in range(JACKKNIFE_BLOCKS)
     ]
     return float(weight @ values / weight.sum()), spread_of(np.array(without))
 
@@ -213,7 +213,7 @@ def _fitted(
 ) -> tuple[float, float, Rows] | None:
     """Duration, size less 1, and rows of the last round."""
     duration, delta, moved, rows = 0.0, 0.0, Pose.identity(), None
-    for _ in range(ROUNDS):
+    for _ in range(MATCH_ROUNDS):
         q = moved.apply(p - duration * motion) / (1.0 + delta)
         if (found := least_squares(index, q, camera_c, motion)) is None:
             return None

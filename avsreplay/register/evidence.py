@@ -32,12 +32,15 @@ from avsreplay.register.sampling import Rays, sample_evenly
 from avsreplay.register.surface_index import kernel_module
 
 RAYS = 2000  # of a scan, with which poses are compared
-PATCH_OF_EXTENT = 0.03  # side of the cubes of the model whose rays are one observation
-NEAR_OF_EXTENT, BESIDE_OF_EXTENT = 0.05, 0.04  # distances that are measured, and that are beside
+OBSERVATION_OF_EXTENT = 0.03  # side of the cubes of the model whose rays are one observation
+MEASURED_OF_EXTENT, BESIDE_OF_EXTENT = (
+    0.05,
+    0.04,
+)  # distances that are measured, and that are beside
 # width over the extent over which the points of a wrong minimum are spread, and the least spread of
 # a right one
-WRONG_OF_EXTENT, RIGHT_OF_EXTENT = 0.006, 0.001
-CONTRADICTING = 0.03  # share of the patches of the right pose that contradict it
+WRONG_SPREAD_OF_EXTENT, RIGHT_SPREAD_OF_EXTENT = 0.006, 0.001
+CONTRADICTING_PATCHES = 0.03  # share of the patches of the right pose that contradict it
 SHARES = 0.3  # weight of the shares of patches that are on the model, hidden, and not measured
 CONTINUES = 0.02  # share of the edges of the right pose beyond which the surface continues
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
@@ -49,14 +52,17 @@ LEAST_NOISE, MOST_NOISE = 0.0006, 0.012  # noise over the extent
 THROUGH, THROUGH_OF_EXTENT = 4.0, 0.012  # a ray passed through: so many sigmas, and at least
 NEIGHBOURS = 8  # returns next to one in the image, of which so many
 ISOLATED, ISOLATED_OF_EXTENT, SPACINGS = 2, 0.03, 2.5  # are near it, and how near
-AROUND, SAME_PLACE = 0.75, 0.1  # extents around the middle of the model, and between such places
+REGION_OF_EXTENT, SAME_PLACE = (
+    0.75,
+    0.1,
+)  # extents around the middle of the model, and between such places
 HOLE = 1.4  # a direction has no return if none is within so many spacings of the rays
 PIXELS = 70  # of the image of the model at most, along its longer side
-LEAST_COSINE = 0.2  # of the incidence at which a return is expected
-LEAST_RAYS = 20  # near the model; with fewer a pose is not measured
+EXPECTED_COSINE = 0.2  # of the incidence at which a return is expected
+LEAST_RAYS_NEAR = 20  # near the model; with fewer a pose is not measured
 NEIGHBOUR_OF_EXTENT = 0.1  # neighbouring rays whose points on the model are nearer share an error
 BEFORE_OF_EXTENT = 0.25  # a return that hides the model is this much nearer, as a rule
-SURFACE_POINTS = 800  # of the model, which bound its image
+IMAGE_POINTS = 800  # of the model, which bound its image
 LEAST_MEAN, LEAST_SURE = 0.8, 1.0  # of the log likelihood ratio per patch: accepted, ends a search
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
 LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may be elsewhere
@@ -69,7 +75,7 @@ GOES_ON = (
 )
 CONTRADICTED = "the scan contradicts the pose: "
 TURNED_AWAY = "most points are on faces that face away from the camera"
-TOO_FEW = f"fewer than {LEAST_RAYS} of its points are near the model"
+TOO_FEW = f"fewer than {LEAST_RAYS_NEAR} of its points are near the model"
 PLANES = (1.0, 2.0, 3.0, 5.0)  # standard deviations between the classes of points on the model
 
 
@@ -111,11 +117,13 @@ class Evidence:
         scan.
         """
         on = float(self.on.sum())
-        spread = np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
+        spread = np.hypot(self.spread_m / self.extent_m, RIGHT_SPREAD_OF_EXTENT)
         tail = 4.0 * float(self.on[2]) + 9.0 * float(self.on[3])
-        against = (self.beside + self.through + self.elsewhere) * np.log(CONTRADICTING)
+        against = (self.beside + self.through + self.elsewhere) * np.log(CONTRADICTING_PATCHES)
         return float(
-            on * np.log(WRONG_OF_EXTENT / spread) + SHARES * (self._shares - 0.5 * tail) + against
+            on * np.log(WRONG_SPREAD_OF_EXTENT / spread)
+            + SHARES * (self._shares - 0.5 * tail)
+            + against
         )
 
     @property
@@ -173,14 +181,17 @@ class Evidence:
         allowed = -SHARES * self._shares / self.patches if hidden else 0.0
         if self.mean + allowed >= LEAST_MEAN:
             return ""
-        on, spread = float(self.on.sum()), np.hypot(self.spread_m / self.extent_m, RIGHT_OF_EXTENT)
+        on, spread = (
+            float(self.on.sum()),
+            np.hypot(self.spread_m / self.extent_m, RIGHT_SPREAD_OF_EXTENT),
+        )
         against = {
             "neighbouring points have the same distance from it": on
-            * np.log(spread / RIGHT_OF_EXTENT),
-            "points beside the model": -self.beside * np.log(CONTRADICTING),
+            * np.log(spread / RIGHT_SPREAD_OF_EXTENT),
+            "points beside the model": -self.beside * np.log(CONTRADICTING_PATCHES),
             "surface that is not in the scan, and points off the model": -self.elsewhere
-            * np.log(CONTRADICTING),
-            "rays that pass through it": -self.through * np.log(CONTRADICTING),
+            * np.log(CONTRADICTING_PATCHES),
+            "rays that pass through it": -self.through * np.log(CONTRADICTING_PATCHES),
             GOES_ON: -self.continued * np.log(CONTINUES / 0.5),
             f"distances to the model spread by {self.noise_m:.3g} m": 0.5
             * SHARES
@@ -256,7 +267,7 @@ class Observed:
         for place, seen, region in self._regions:
             if seen is sees and np.linalg.norm(place - middle) < SAME_PLACE * extent_m:
                 return region
-        p, radius = np.asarray(self.points, dtype=np.float64), AROUND * extent_m
+        p, radius = np.asarray(self.points, dtype=np.float64), REGION_OF_EXTENT * extent_m
         within = np.einsum("ij,ij->i", p - middle, p - middle) < radius**2
         away = float(np.linalg.norm(middle))
         if sees and away > radius:
@@ -274,26 +285,26 @@ class EvidenceModel:
         self._target, self._extent = target, target.surface.extent
         vertices = target.surface.vertices
         self._middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        self._points = sample_evenly(target.surface, SURFACE_POINTS)[0]
+        self._points = sample_evenly(target.surface, IMAGE_POINTS)[0]
 
     def at(self, scan: Observed, T_ca: Pose) -> Evidence | None:
-        """Return what the rays of a scan say of a pose; None with fewer than ``LEAST_RAYS`` near
-        the model.
+        """Return what the rays of a scan say of a pose; None with fewer than ``LEAST_RAYS_NEAR``
+        near the model.
         """
         target, L, index = self._target, self._extent, self._target.index
         middle = T_ca.inverse().apply(self._middle[None])[0]
         may_be = target.visibility.may_be_camera(T_ca)
         seen = scan.around(middle, L, may_be)
         p = T_ca.apply(seen.points)
-        most = min(NEAR_OF_EXTENT * L, index.reach_m)
+        most = min(MEASURED_OF_EXTENT * L, index.reach_m)
         near = np.flatnonzero(index.distances(seen.points, T_ca, most, False, 1, 0.0)[0] < most)
-        if len(near) < LEAST_RAYS:
+        if len(near) < LEAST_RAYS_NEAR:
             return None
         camera = target.visibility.camera_c(index, seen.points[near], T_ca)
         found = index.closest(p, camera_c=camera, most_m=most)
         distance = np.sqrt(np.minimum(found.d2, most**2))
         close = found.d2 < most**2
-        if np.count_nonzero(close) < LEAST_RAYS:
+        if np.count_nonzero(close) < LEAST_RAYS_NEAR:
             return None
         noise = float(np.clip(robust_noise(distance[close]), LEAST_NOISE * L, MOST_NOISE * L))
         z = distance / noise
@@ -303,13 +314,15 @@ class EvidenceModel:
         if camera is not None:
             ranges, cosine, _ = self._cast(T_ca.t, D)
             hit = np.isfinite(ranges)
-            slant = THROUGH * noise / np.maximum(cosine, LEAST_COSINE)
+            slant = THROUGH * noise / np.maximum(cosine, EXPECTED_COSINE)
             through = hit & (seen.ranges - ranges > np.maximum(slant, THROUGH_OF_EXTENT * L))
         on = ~through & close & (z < PLANES[-1])
         beside = ~through & ~on & (distance < BESIDE_OF_EXTENT * L)
         hidden = hit & ~through & ~on & ~beside
         # returns near the model that do not explain its absence elsewhere by hiding it
-        around = np.einsum("ij,ij->i", p - self._middle, p - self._middle) < (AROUND * L) ** 2
+        around = (
+            np.einsum("ij,ij->i", p - self._middle, p - self._middle) < (REGION_OF_EXTENT * L) ** 2
+        )
         stray = around & ~(on | beside | through)
         stray &= ~hidden | (ranges - seen.ranges < BEFORE_OF_EXTENT * L)
         rays = max(1, int(np.count_nonzero(on | beside | through)))
@@ -326,7 +339,7 @@ class EvidenceModel:
             np.concatenate([at[known], missing]),
             np.concatenate([kind[known], np.full(len(missing), 7)]),
             np.concatenate([np.ones(int(known.sum())), np.full(len(missing), weight)]),
-            PATCH_OF_EXTENT * L,
+            OBSERVATION_OF_EXTENT * L,
         )
         spread = 0.0
         if len(target.surface.faces):
@@ -374,7 +387,7 @@ class EvidenceModel:
         none = np.empty((0, 3)), 1.0, (0.0, 0.0)
         q = T_ca.inverse().apply(self._points) @ seen.axes.T
         q = q[q[:, 2] > 0.1 * np.linalg.norm(q, axis=1)]
-        if len(q) < LEAST_RAYS:
+        if len(q) < LEAST_RAYS_NEAR:
             return none
         uv = q[:, :2] / q[:, 2:]
         low, high = uv.min(axis=0), uv.max(axis=0)
@@ -391,7 +404,7 @@ class EvidenceModel:
         hit = np.isfinite(ranges)
         angle, nearest = (each[:, 0] for each in seen.tree.query(np.ascontiguousarray(G), 1))
         empty = angle > HOLE * seen.pitch
-        missing = hit & empty & (cosine > LEAST_COSINE)
+        missing = hit & empty & (cosine > EXPECTED_COSINE)
         places = T_ca.t + D[missing] * ranges[missing, None]
         I = np.arange(len(G)).reshape(shape)
         pairs = np.concatenate(
@@ -431,7 +444,7 @@ class EvidenceModel:
             T_ca.t + D[a] * ranges[a, None],
             goes_on.astype(np.intp),
             np.ones(len(a)),
-            PATCH_OF_EXTENT * L,
+            OBSERVATION_OF_EXTENT * L,
             2,
         )
         return places, (pitch / seen.pitch) ** 2, (float(counts[1]), float(counts[0]))
@@ -473,13 +486,13 @@ def _by_patch(
 def _shared(seen: Region, e: Array, foot: Array, on: NDArray[np.bool_], near_m: float) -> float:
     """The rms [m] of the part of the residuals (n,) that neighbouring rays on the model share."""
     k = np.flatnonzero(on)
-    if len(k) <= LEAST_RAYS:
+    if len(k) <= LEAST_RAYS_NEAR:
         return 0.0
     d = np.ascontiguousarray(seen.places[k])
     other = kernel_module().PointTree(d).query(d, min(4, len(k)))[1][:, 1:]
     near = np.linalg.norm(foot[k][:, None] - foot[k][other], axis=2) < near_m
     products = (e[k][:, None] * e[k][other])[near]
-    shared = float(np.mean(products)) if len(products) > LEAST_RAYS else 0.0
+    shared = float(np.mean(products)) if len(products) > LEAST_RAYS_NEAR else 0.0
     return float(np.sqrt(max(shared, 0.0)))
 
 

@@ -56,7 +56,7 @@ COARSE_OF_EXTENT, MIDDLE_OF_EXTENT, MOST_OF_EXTENT = (
     0.02,
     0.05,
 )  # distances of unexplained points; the largest
-START_OF_EXTENT, FALL = (
+FIRST_GATE_OF_EXTENT, GATE_FALL = (
     0.3,
     0.7,
 )  # rejection distance of the first pass, and its factor from pass to pass
@@ -82,7 +82,7 @@ SYMMETRIC, SYMMETRIES = (
     6,
 )  # largest unexplained share of the surface turned onto itself; most motions tried
 # a point that an exact symmetry carries is this near the surface; share of points that may not be
-EXACT_OF_EXTENT, MOST_INEXACT = 0.002, 0.02
+CARRIED_OF_EXTENT, MOST_UNCARRIED = 0.002, 0.02
 TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = (
     6,
@@ -90,8 +90,8 @@ RIVALS, RIVAL_WITHIN = (
 )  # poses that are registered to the end: share of unexplained points over the least
 # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
 FAVOURED = 5.0
-REFINED_POINTS = 500  # fine points with which the last poses are registered
-STOP_RAD, STOP_OF_EXTENT = (
+LAST_FINE_POINTS = 500  # fine points with which the last poses are registered
+ENDED_RAD, ENDED_OF_EXTENT = (
     1e-4,
     1e-4,
 )  # a pass that moves the pose by less ends a registration, as poses are compared
@@ -114,7 +114,7 @@ REGISTERED_SHARE, REGISTERED_WORK = (
     0.8,
     10,
 )  # of the work left, for the last poses; usual cost for each fine point
-APART = 0.6  # usual share of different starts
+DIFFERENT_STARTS = 0.6  # usual share of different starts
 SHIFTS, SHIFT_OF_EXTENT = (
     6,
     0.3,
@@ -176,9 +176,9 @@ class GlobalSearch:
         self.spent, self.most, self.registered = (
             0,
             2**62,
-            REFINED_POINTS,
+            LAST_FINE_POINTS,
         )  # work of the round, its limit; points
-        coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
+        coarse = replace(target.limits, eps_rad=ENDED_RAD, eps_m=ENDED_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
             for passes in (FIRST_FINE, FINE_PASSES)
@@ -201,7 +201,7 @@ class GlobalSearch:
         halved = p.starts // KEPT_AFTER_FIRST * (1 + SECOND_PASSES)
         halved += p.starts // KEPT_AFTER_SECOND * (1 + COARSE_PASSES - SECOND_PASSES)
         looked = few * (starts * (1 + FIRST_PASSES) // stride + halved)
-        looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_FIRST) // MIDDLE_STRIDE
+        looked += some * int(DIFFERENT_STARTS * MIDDLE_STARTS) * (1 + MIDDLE_FIRST) // MIDDLE_STRIDE
         looked += some * KEPT_IN_MIDDLE * (1 + MIDDLE_PASSES - MIDDLE_FIRST)
         looked += some * len(self.symmetries) * (1 + TURNED_PASSES)
         return ROUND_WORK + looked // LOOK_UPS
@@ -230,7 +230,7 @@ class GlobalSearch:
         """
         self.most = min(int(REGISTERED_SHARE * left), left - kept)
         self.spent = self._looked(len(points), number)
-        self.registered = REFINED_POINTS // (
+        self.registered = LAST_FINE_POINTS // (
             2 if left < SHORT * self.work(len(points), number) else 1
         )
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
@@ -285,27 +285,31 @@ class GlobalSearch:
         more points.
         """
         p, L, threads = self._params, self._extent, self._target.limits.threads
-        coarse = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
-        middle = (FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
-        narrow = START_OF_EXTENT * FALL**FIRST_PASSES
+        coarse = (GATE_FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
+        middle = (GATE_FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
+        narrow = FIRST_GATE_OF_EXTENT * GATE_FALL**FIRST_PASSES
         poses, costs = self.field.refine(
-            np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
+            np.ascontiguousarray(few[::stride]),
+            starts,
+            FIRST_PASSES,
+            FIRST_GATE_OF_EXTENT * L,
+            *coarse,
         )
         poses = best_of(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
         poses, costs = self.field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
         poses, narrow = (
             best_of(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)),
-            narrow * FALL**SECOND_PASSES,
+            narrow * GATE_FALL**SECOND_PASSES,
         )
         poses, costs = self.field.refine(
             few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse
         )
         poses = self.poses.different(best_of(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
-        narrow = START_OF_EXTENT * FALL**FIRST_PASSES
+        narrow = FIRST_GATE_OF_EXTENT * GATE_FALL**FIRST_PASSES
         poses, costs = self.field.refine(
             some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle
         )
-        poses, narrow = best_of(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
+        poses, narrow = best_of(poses, costs, KEPT_IN_MIDDLE), narrow * GATE_FALL**MIDDLE_FIRST
         poses, costs = self.field.refine(
             some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle
         )
@@ -327,7 +331,7 @@ class GlobalSearch:
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
             return found
-        rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
+        rule = (GATE_FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         starts = np.concatenate([first.matrix[None], self.symmetries @ first.matrix])
         turned, costs = self.field.refine(some, starts, TURNED_PASSES, width, *rule)
         near = 1 + np.flatnonzero(costs[1:] < costs[0] + RIVAL_WITHIN)
@@ -369,7 +373,7 @@ class GlobalSearch:
         starts = self._starts(self.middle, [None], np.zeros((1, 3)))
         few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
-        rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
+        rule = (GATE_FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
         poses, costs = self.field.refine(points, poses, 0, self._extent, *rule)
         apart = [not self.poses.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         best, width = poses[apart & (costs < SYMMETRIC)], COARSE_OF_EXTENT * self._extent
@@ -380,8 +384,8 @@ class GlobalSearch:
     def _is_exact(self, points: Array, T: Array) -> bool:
         """Whether a motion (4, 4) carries nearly all points (n, 3) of the surface onto it."""
         moved = np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
-        off = self._target.index.closest(moved).d2 > (EXACT_OF_EXTENT * self._extent) ** 2
-        return bool(np.count_nonzero(off) <= MOST_INEXACT * len(points))
+        off = self._target.index.closest(moved).d2 > (CARRIED_OF_EXTENT * self._extent) ** 2
+        return bool(np.count_nonzero(off) <= MOST_UNCARRIED * len(points))
 
     def measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Measured:
         """Return the distances of points (n, 3) in {A} at a pose, at most ``most`` extents."""

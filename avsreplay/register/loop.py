@@ -29,7 +29,7 @@ from avsreplay.register.generators.turns import NearestImage, Turns, TurnsOfGues
 from avsreplay.register.generators.weak_directions import WeakDirections
 from avsreplay.register.grading import FAR_RAD, POOR_OF_GATE, Grader
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis, Refine
-from avsreplay.register.near_symmetry import LEAST_RAYS, NearSymmetry, prepared
+from avsreplay.register.near_symmetry import LEAST_OFF_MODEL, NearSymmetry, prepared
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
@@ -350,7 +350,7 @@ class Loop:
         at = case.at
         if at.beside or at.missing or at.reason or not at.accepted:
             return
-        if case.unknown.size or at.found.points - at.found.inliers >= LEAST_RAYS:
+        if case.unknown.size or at.found.points - at.found.inliers >= LEAST_OFF_MODEL:
             turns = TurnsOfGuess(self._target, self.symmetry)
             if turns.needed(case):
                 self._draw(case, turns)

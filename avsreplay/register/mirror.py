@@ -37,12 +37,12 @@ from avsreplay.register.sampling import directions, sample_evenly
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
-MOST_SCANS, APART = (
+MOST_REFLECTED, DIRECTION_COSINE = (
     6,
     np.cos(np.radians(30.0)),
 )  # scans that are compared, from directions so far apart
-REFINED_POINTS = 600  # of a scan, with which the poses are chosen and refined
-PLANES, PLANE_POINTS, SURFACE_POINTS = (
+REFLECTED_POINTS = 600  # of a scan, with which the poses are chosen and refined
+MIRROR_PLANES, PLANE_TEST_POINTS, REFLECTED_SURFACE_POINTS = (
     200,
     100,
     400,
@@ -55,7 +55,7 @@ REFLECTIONS, SAME_TRACE = (
     6,
     1.0 + 2.0 * np.cos(np.radians(5.0)),
 )  # most reflections, and rotation between them
-WIDTH_OF_EXTENT, ROUGHLY, UNCARRIED = (
+TRUNCATION_OF_EXTENT, ROUGHLY, UNCARRIED = (
     0.03,
     0.5,
     0.3,
@@ -66,7 +66,7 @@ TO_MODEL = (
     (0.02, 5),
 )  # rejection distances [extent] and passes of a reflected surface
 TO_SCAN = ((0.03, 4), (0.015, 4), (0.008, 6))  # and of a scan
-TRIED, TRIED_OF_EXTENT = (
+REFINED_REFLECTIONS, TRIED_OF_EXTENT = (
     2,
     0.02,
 )  # reflections of which a scan is refined, and truncation to choose them
@@ -80,8 +80,8 @@ PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = (
     0.381966,
     4,
 )  # side of a patch, its offset, and fewest points
-CONTRADICTING = 0.1  # share of the patches that contradict the true shape
-LEAST_LIKELIHOOD, MOST_AGAINST = (
+CONTRADICTING_SHAPE = 0.1  # share of the patches that contradict the true shape
+MIRROR_LOG_RATIO, MOST_AGAINST = (
     6.0,
     0.25,
 )  # log likelihood ratio that decides; patches against over those for it
@@ -125,7 +125,7 @@ def from_another_side(T_cs: Pose, kept: Sequence[SeenScan], middle: Array) -> bo
     than those kept.
     """
     sight = _sight(T_cs, middle)
-    return all(float(sight @ _sight(each.T_cs, middle)) < APART for each in kept)
+    return all(float(sight @ _sight(each.T_cs, middle)) < DIRECTION_COSINE for each in kept)
 
 
 def _sight(T_cs: Pose, middle: Array) -> Array:
@@ -135,7 +135,7 @@ def _sight(T_cs: Pose, middle: Array) -> Array:
 
 def wanted(kept: Sequence[SeenScan]) -> bool:
     """Return whether more scans are needed."""
-    return len(kept) < MOST_SCANS
+    return len(kept) < MOST_REFLECTED
 
 
 def reflected(points: NDArray[Any]) -> NDArray[Any]:
@@ -190,10 +190,10 @@ def _searched(registrar: Registrar, scan: SeenScan, before: _Compared) -> _Compa
 
 def _decide(compared: Sequence[_Compared], extent_m: float, sign: float = 1.0) -> bool:
     """Whether scans decide for the mirror image, or with a ``sign`` of -1 for the model."""
-    most = float(np.log((1.0 - CONTRADICTING) / CONTRADICTING))
+    most = float(np.log((1.0 - CONTRADICTING_SHAPE) / CONTRADICTING_SHAPE))
     ratio = sign * np.clip(0.5 * NOISE**2 * _by_patch(compared, extent_m), -most, most)
     gain, against = float(ratio[ratio > 0.0].sum()), -float(ratio[ratio < 0.0].sum())
-    return gain - against > LEAST_LIKELIHOOD and against < MOST_AGAINST * gain
+    return gain - against > MIRROR_LOG_RATIO and against < MOST_AGAINST * gain
 
 
 def reflections(surface: Surface, index: SurfaceIndex) -> Array:
@@ -206,13 +206,13 @@ def reflections(surface: Surface, index: SurfaceIndex) -> Array:
     Returns:
         (k, 4, 4) in {C}, all different, with determinants of -1.
     """
-    points = sample_evenly(surface, SURFACE_POINTS)[0]
-    few, middle = points[:: max(1, len(points) // PLANE_POINTS)], points.mean(axis=0)
-    normals = directions(2 * PLANES)[:PLANES]  # a half of the sphere
-    planes = np.tile(np.eye(4), (PLANES, 1, 1))
+    points = sample_evenly(surface, REFLECTED_SURFACE_POINTS)[0]
+    few, middle = points[:: max(1, len(points) // PLANE_TEST_POINTS)], points.mean(axis=0)
+    normals = directions(2 * MIRROR_PLANES)[:MIRROR_PLANES]  # a half of the sphere
+    planes = np.tile(np.eye(4), (MIRROR_PLANES, 1, 1))
     planes[:, :3, :3] -= 2.0 * normals[:, :, None] * normals[:, None, :]
     planes[:, :3, 3] = 2.0 * normals * (normals @ middle)[:, None]
-    cost = _uncarried(index, few, planes, 2.0 * WIDTH_OF_EXTENT)
+    cost = _uncarried(index, few, planes, 2.0 * TRUNCATION_OF_EXTENT)
     chosen = list[int]()
     for k in np.argsort(cost, kind="stable").tolist():
         if len(chosen) < NEAR_PLANES and all(
@@ -226,7 +226,7 @@ def reflections(surface: Surface, index: SurfaceIndex) -> Array:
             for T in moved
         ]
         moved = np.reshape(ended, (-1, 4, 4))
-        cost = _uncarried(index, points, moved, WIDTH_OF_EXTENT)
+        cost = _uncarried(index, points, moved, TRUNCATION_OF_EXTENT)
         order = np.argsort(cost, kind="stable")
         moved = _different(moved[order[cost[order] < most]])
     return moved[:REFLECTIONS]
@@ -284,8 +284,8 @@ def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> 
     def of_image(T: Pose) -> float:
         return float(np.mean(distance(some_of_image, T, TRIED_OF_EXTENT) ** 2))
 
-    some, some_of_image = _some(points, REFINED_POINTS), _some(image, REFINED_POINTS)
-    best = sorted(map(Pose.from_matrix, starts), key=of_image)[:TRIED]
+    some, some_of_image = _some(points, REFLECTED_POINTS), _some(image, REFLECTED_POINTS)
+    best = sorted(map(Pose.from_matrix, starts), key=of_image)[:REFINED_REFLECTIONS]
     ended = [_refined(index, some_of_image, T, TO_SCAN, sided) for T in best]
     own, mirrored = (
         _refined(index, some, scan.T_cs, TO_SCAN, sided),

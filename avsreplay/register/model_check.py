@@ -41,7 +41,7 @@ from avsreplay.register.backend import (
 )
 from avsreplay.register.duration import (
     BIAS_SCANS,
-    BLOCKS,
+    JACKKNIFE_BLOCKS,
     MOST_WEIGHT,
     Duration,
     Durations,
@@ -61,7 +61,7 @@ from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import POSTPONED
 from avsreplay.register.size import (
     MOST_OF_MODEL,
-    SIGMAS,
+    SIZE_SIGMAS,
     fitted_size,
     matched_points,
     noise_bias,
@@ -84,11 +84,11 @@ __all__ = [
     "measured_alignment",
 ]
 
-POINTS = 1500  # points used of each scan
+CHECKED_POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = (
     0.001  # least error of size that is reported; a single scan cannot show so small a one
 )
-EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
+CHECKED_EVERY, MOST_CHECKED, LEAST_SCANS = 3, 60, 8
 ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that would be reported
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 _MIRRORED = (
@@ -197,7 +197,11 @@ class ModelCheck:
         if found.covariance is not None and found.systematic is not None:
             share = float(np.trace(np.linalg.solve(found.covariance, found.systematic))) / 6.0
             self._systematic += share
-        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and self._size_open:
+        if (
+            self._aligned % CHECKED_EVERY == 1
+            and len(self._deltas) < MOST_CHECKED
+            and self._size_open
+        ):
             self._measure(scan, found.T_ac)
         if scan.places is not None and self._durations.wanted():
             self._measure_duration(scan, scan.places, found.T_ac)
@@ -238,9 +242,11 @@ class ModelCheck:
             t_s = 1e-9 * (place.t_ns - self._places[0].t_ns)
             row = np.column_stack([np.eye(3), t_s * np.eye(3), place.R, -place.change])
             A[k], y[k] = row / max(place.sigma_m, least), place.at / max(place.sigma_m, least)
-        block = np.arange(len(y)) * BLOCKS // len(y)
+        block = np.arange(len(y)) * JACKKNIFE_BLOCKS // len(y)
         delta, left = _last_unknown(A, y)
-        without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(BLOCKS)])
+        without = np.array(
+            [_last_unknown(A[block != k], y[block != k])[0] for k in range(JACKKNIFE_BLOCKS)]
+        )
         uniform = _last_unknown(A[:, :, :9], y)[1]
         return (
             (1.0 + delta, spread_of(without)) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
@@ -262,7 +268,7 @@ class ModelCheck:
         self._places.append(
             _Place(scan.t_ns, T_ac.t + T_ac.R @ moved, T_ac.R @ change, T_ac.R, sigma_m)
         )
-        if len(self._places) == MOST_SCANS:
+        if len(self._places) == MOST_CHECKED:
             self._places, self._stride = self._places[::2], 2 * self._stride
 
     def _mean(self) -> tuple[float, float, Array]:
@@ -329,7 +335,7 @@ class ModelCheck:
         return T_ca.t if scan.sensor is None else (T_ca @ scan.sensor).t
 
     def _measure(self, scan: Scan, T_ac: Pose) -> None:
-        p, camera_c = self._on_model(scan, T_ac, POINTS), self._camera(scan, T_ac.inverse())
+        p, camera_c = self._on_model(scan, T_ac, CHECKED_POINTS), self._camera(scan, T_ac.inverse())
         measured = None if p is None else fitted_size(self._registrar.index, p, camera_c)
         if p is not None and measured is not None and measured.sigma > 0.0:
             self._deltas.append(measured.delta)
@@ -337,7 +343,7 @@ class ModelCheck:
             self._points.append((p, camera_c))
             if len(self._deltas) >= ENOUGH_SCANS:
                 mean, spread, _ = self._mean()
-                self._size_open = not abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
+                self._size_open = not abs(mean) + SIZE_SIGMAS * spread < _LEAST_RUN_ERROR
 
     def _on_model(self, scan: Scan, T_ac: Pose, count: int) -> Array | None:
         """About ``count`` points (n, 3) in {C} at the instant of the scan; None if their
@@ -419,7 +425,7 @@ class ModelCheck:
 
 def _size_note(found: tuple[float, float] | None) -> tuple[str, ...]:
     """The text for a size with its standard error; empty if it is right."""
-    if found is None or abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
+    if found is None or abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIZE_SIGMAS * found[1]):
         return ()
     error = abs(found[0] - 1.0)
     small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")

@@ -27,24 +27,28 @@ from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
 from avsreplay.register.work import TEST_WORK, healthy_work
 
-VERSION = 12  # version of the kept data of a model
-SAMPLES, DENSER, MOST_MARKS = 4000, 5, 500  # points to find marks, times as many around them, kept
+MARKS_VERSION = 12  # version of the kept data of a model
+SAMPLES, MARK_DENSITY, MOST_MARKS = (
+    4000,
+    5,
+    500,
+)  # points to find marks, times as many around them, kept
 # Most work of a search of all samples [point searches]: of a model with long thin faces, at which
 # a search costs up to a hundred times as much, fewer points are sampled, which misses small marks.
 SAMPLES_WORK = 40_000
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
-TRIED = 16  # motions of a kind by which the marks are found
-AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
+TRIED_MOTIONS = 16  # motions of a kind by which the marks are found
+MARK_SPACINGS = 2.0  # more points are sampled within so many spacings of a point on a mark
 # a point within this (over the extent), or within three sigma of the noise, is on the model
-NEAR = 0.004
-LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
+ON_MODEL_OF_EXTENT = 0.004
+MARK_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 # an exact symmetry carries all but this share of the surface to within this of it, over the extent
 EXACT_OF_EXTENT, MOST_INEXACT = 5e-4, 5e-4
-LEAST_RAYS = 8  # fewer points off the model decide nothing
+LEAST_OFF_MODEL = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
-MOST_POINTS, SCREENED = (
+MOST_COMPARED_POINTS, SCREENED = (
     6000,
     150,
 )  # points of the scan; those on and off the model with which all motions are compared
@@ -113,9 +117,9 @@ class NearSymmetry:
         share, area = float(moved.mean()), 0.5 * float(np.linalg.norm(normals, axis=1).sum())
         if not moved.any() or share >= MOST_MARKED:
             return none, np.array([share, 0.0])
-        dense, normals = sample(surface, DENSER * self._samples)
+        dense, normals = sample(surface, MARK_DENSITY * self._samples)
         apart = kernel_module().PointTree(points[moved]).query(dense)[0][:, 0]
-        around = np.flatnonzero(apart < AROUND * np.sqrt(area / self._samples))
+        around = np.flatnonzero(apart < MARK_SPACINGS * np.sqrt(area / self._samples))
         marks = around[self._carried_off(dense[around], 1.0)]
         stride = max(1, -(-len(marks) // MOST_MARKS))
         found = np.stack([dense[marks[::stride]], normals[marks[::stride]]])
@@ -127,7 +131,7 @@ class NearSymmetry:
         """
         moved, width = np.zeros(len(points), dtype=bool), OFF * self._gate
         for motions in self._kinds:
-            for T in motions[:: max(1, len(motions) // TRIED)]:
+            for T in motions[:: max(1, len(motions) // TRIED_MOTIONS)]:
                 if moved.mean() >= most:
                     return moved
                 moved[~moved] = self._distances(points[~moved], T[None], width)[0] >= width
@@ -170,7 +174,7 @@ class NearSymmetry:
 
     def compared_work(self, points: int, poses: int) -> int:
         """Return the usual cost of comparing so many poses by the rays of a scan."""
-        return poses * (min(points, MOST_POINTS) + RAY_WORK * len(self._marks))
+        return poses * (min(points, MOST_COMPARED_POINTS) + RAY_WORK * len(self._marks))
 
     def after_search(self, points: int) -> int:
         """Return the usual cost of what follows a search for a scan of so many points, in point
@@ -188,8 +192,12 @@ class NearSymmetry:
         )
 
     def rays(self, scan: NDArray[np.floating]) -> Rays:
-        """Return the rays of at most about ``MOST_POINTS`` points of a scan (n, 3) in {A}."""
-        return Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
+        """Return the rays of at most about ``MOST_COMPARED_POINTS`` points of a scan (n, 3) in
+        {A}.
+        """
+        return Rays(
+            np.asarray(scan[:: max(1, len(scan) // MOST_COMPARED_POINTS)], dtype=np.float64)
+        )
 
     def decided(
         self, found: list[Measured], complete: bool
@@ -210,7 +218,7 @@ class NearSymmetry:
         return max(self._gate, self._near(least_noise(found)))
 
     def _near(self, noise_m: float) -> float:
-        return max(NEAR * self._target.index.extent_m, 3.0 * noise_m)
+        return max(ON_MODEL_OF_EXTENT * self._target.index.extent_m, 3.0 * noise_m)
 
     def images(self, T_ca: Pose) -> list[Pose]:
         """Return the poses onto which the exact symmetries of the model carry a pose, where they
@@ -239,9 +247,9 @@ class NearSymmetry:
         """Return the best poses that the near-symmetries give, registered, and at how many of them
         the marks were tested.
 
-        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays more than at the pose
-        pass through a mark. ``better``: only poses that explain more rays, by ``LEAST_RAYS`` at
-        least; also those turned by a few degrees, because a body of revolution with marks has a
+        Of equal ones those are taken at which fewer than ``LEAST_OFF_MODEL`` rays more than at the
+        pose pass through a mark. ``better``: only poses that explain more rays, by
+        ``LEAST_OFF_MODEL`` at least; also those turned by a few degrees, because a body of revolution with marks has a
         minimum wherever a mark of the model meets some of the points.
         """
         stride, tested = self._stride, 0
@@ -262,8 +270,8 @@ class NearSymmetry:
             if (
                 better
             ):  # where rays pass through marks, also poses that the few points do not exclude
-                most_cost = passed - LEAST_RAYS
-                cost -= SCREEN_SIGMAS * np.sqrt(excess**2 @ weights**2) * (passed > LEAST_RAYS)
+                most_cost = passed - LEAST_OFF_MODEL
+                cost -= SCREEN_SIGMAS * np.sqrt(excess**2 @ weights**2) * (passed > LEAST_OFF_MODEL)
             order = np.argsort(cost, kind="stable")
             for k in order[cost[order] < most_cost]:
                 start = Pose.from_matrix(motions[k]) @ T_ca
@@ -271,7 +279,7 @@ class NearSymmetry:
                     continue
                 tested += 1
                 if self._passed(rays, start, stride)[0] < min(
-                    passed + LEAST_RAYS, most_cost - cost[k]
+                    passed + LEAST_OFF_MODEL, most_cost - cost[k]
                 ):
                     kept.append(start)
                 if len(kept) == most:
@@ -322,7 +330,7 @@ class NearSymmetry:
         away = self._marks[::stride] - T_ca.t
         far = np.linalg.norm(away, axis=1)
         away /= far[:, None]
-        seen = np.flatnonzero(np.einsum("ij,ij->i", away, self._normals[::stride]) < -LEAST_COSINE)
+        seen = np.flatnonzero(np.einsum("ij,ij->i", away, self._normals[::stride]) < -MARK_COSINE)
         first = self._target.index.cast(T_ca.t, away[seen])[0]
         return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
 
@@ -347,7 +355,7 @@ def prepared(
     kernel, surface, limits, path = kernel_module(), target.surface, target.limits, None
     if folder is not None:
         layout = (
-            f"{kernel.LAYOUT} {VERSION} {target.visibility.sided} {params.starts}"
+            f"{kernel.LAYOUT} {MARKS_VERSION} {target.visibility.sided} {params.starts}"
             f" {limits.gate_m.hex()}"
         )
         path = index_cache.cache_path(

@@ -35,7 +35,7 @@ from avsreplay.settings import Settings, setting
 TIGHTEN = 3.0  # the gate of the reference in units of the rms of the last pass
 MIN_INLIERS = 6
 SETTLED_GATE = 0.01  # the gate has settled once a pass changes it by less than this share
-SETTLED = 10.0  # steps end at this many eps, because the covariances are not smooth in the pose
+STEP_EPS = 10.0  # steps end at this many eps, because the covariances are not smooth in the pose
 SETTLED_OF_GATE = 0.01
 FINE_CALLS = 6  # calls with the finest map, each with at most n_max iterations
 # 1e-4 as by default in the library, whose last steps change from one map point to the next
@@ -234,8 +234,8 @@ class SmallGicpBackend(Backend):
                 max_correspondence_distance=reach,
                 num_threads=1,
                 max_iterations=self._limits.n_max,
-                rotation_epsilon=SETTLED * self._limits.eps_rad,
-                translation_epsilon=SETTLED * self._limits.eps_m,
+                rotation_epsilon=STEP_EPS * self._limits.eps_rad,
+                translation_epsilon=STEP_EPS * self._limits.eps_m,
             )
             T_ca, passes = Pose.from_matrix(found.T_target_source), passes + int(found.iterations)
         return Fit(

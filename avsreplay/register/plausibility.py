@@ -17,7 +17,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
 from avsreplay.register.evidence import (
-    AROUND,
+    REGION_OF_EXTENT,
     TOO_FEW,
     Evidence,
     EvidenceModel,
@@ -37,13 +37,13 @@ LEAST_SCAN_OF_EXTENT = (
 SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
 # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
 PREDICTED = 1.0
-NEAR_OF_EXTENT, MOST_HIDDEN = (
+HIDDEN_NEAR_OF_EXTENT, MOST_HIDDEN = (
     0.05,
     0.5,
 )  # where fewer points are nearer, the noise at a predicted pose is theirs
 # a scan narrower than so much of the model, in one of four directions of the image, shows a part of
 # it
-PARTIAL = 0.8
+PARTIAL_IMAGE = 0.8
 MOST_OTHER_SIZE = 0.1  # error of the size of the model with which a pose can be accepted
 LEAST_COMPARED = 30  # with fewer points the noise is that of all
 
@@ -100,7 +100,7 @@ class PlausibilityTest:
         """
         middle = guess.apply(self._middle[None])[0]
         away = np.asarray(scan, dtype=np.float64) - middle
-        near = np.einsum("ij,ij->i", away, away) < (AROUND * self._extent) ** 2
+        near = np.einsum("ij,ij->i", away, away) < (REGION_OF_EXTENT * self._extent) ** 2
         return scan if near.all() or np.count_nonzero(near) < LEAST_COMPARED else scan[near]
 
     def noise(self, distance: Array, T_ca: Pose, guess: Pose | None) -> float:
@@ -110,7 +110,7 @@ class PlausibilityTest:
         The latter only at the predicted pose ``guess``: elsewhere the points near the model may be
         so by chance.
         """
-        near = distance[distance < NEAR_OF_EXTENT * self._extent]
+        near = distance[distance < HIDDEN_NEAR_OF_EXTENT * self._extent]
         few = LEAST_COMPARED <= len(near) < MOST_HIDDEN * len(distance)
         return robust_noise(near if few and self.predicted(T_ca, guess) else distance)
 
@@ -132,7 +132,7 @@ class PlausibilityTest:
         """
         if not self._visibility.may_be_camera(T_ca):
             return False
-        return bool(kernel_module().is_narrower(points, T_ca.matrix, self._points, PARTIAL))
+        return bool(kernel_module().is_narrower(points, T_ca.matrix, self._points, PARTIAL_IMAGE))
 
     def turned_away(self, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether most points (n, 3) in {A} are on faces that face away from a camera at the

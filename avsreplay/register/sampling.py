@@ -40,14 +40,17 @@ BIMODAL = (
     2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 )
 # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
-PARTIAL = 0.85
+PARTIAL_OF_EXTENT = 0.85
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
 GROUPED = 3000  # points of a scan in which connected groups are looked for
 MOST_SEGMENTS = 3
 MOST_ATTEMPTS = MOST_SEGMENTS + 3
 VOXEL_OF_EXTENT = 0.04
-LEAST_SHARE, LEAST_POINTS = 0.05, 60  # least size of a part: share of the scan, and points
-PLANES, TRIALS, PLANE_POINTS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 400, 0.01, 0.2
+LEAST_PART_SHARE, LEAST_PART_POINTS = (
+    0.05,
+    60,
+)  # least size of a part: share of the scan, and points
+PLANES_LEFT_OUT, TRIALS, RANSAC_POINTS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 400, 0.01, 0.2
 
 
 def sample(surface: Surface, count: int) -> tuple[Array, Array]:
@@ -237,7 +240,7 @@ def attempts(
     """
     size = geometry.bounding_diagonal(target)
     first, next_one = (
-        (1, 0) if size < PARTIAL * extent_m else (0, 1)
+        (1, 0) if size < PARTIAL_OF_EXTENT * extent_m else (0, 1)
     )  # a part of the target is not at its centroid
     yield target, first
     small = size <= LARGER * extent_m or found()  # probably the target alone
@@ -258,8 +261,8 @@ def segments(points: Array, extent_m: float) -> Iterator[Array]:
     planes. What is not part of anything larger comes first as a whole: the visible parts of one
     target need not touch each other.
     """
-    least = max(LEAST_POINTS, int(LEAST_SHARE * len(points)))
-    parts = sorted(_small_parts(points, extent_m, PLANES), key=len, reverse=True)
+    least = max(LEAST_PART_POINTS, int(LEAST_PART_SHARE * len(points)))
+    parts = sorted(_small_parts(points, extent_m, PLANES_LEFT_OUT), key=len, reverse=True)
     connected = [part for part in parts if len(part) >= STRAY_POINTS]
     if len(connected) > 1:
         together = np.concatenate(connected)
@@ -297,7 +300,7 @@ def _without_plane(points: Array, width_m: float) -> Array:
     Seeded RANSAC.
     """
     rng = np.random.Generator(np.random.PCG64(0))
-    few = points[:: max(1, len(points) // PLANE_POINTS)]
+    few = points[:: max(1, len(points) // RANSAC_POINTS)]
     triples = few[rng.integers(len(few), size=(TRIALS, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     lengths = np.linalg.norm(normals, axis=1)

@@ -1,8 +1,8 @@
 """Poses measured and registered by part of a scan, cheaply enough for many hypotheses.
 
 A graduated registration takes point-to-plane passes while the rejection distance falls
-geometrically from ``START_OF_EXTENT`` (or the reach) to ``STOP_OF_EXTENT`` of the extent. The
-falling distance rejects outliers, which the rms rule of the normal alignment cannot do if they are
+geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``SCREEN_STOP_OF_EXTENT`` of the
+extent. The falling distance rejects outliers, which the rms rule of the normal alignment cannot do if they are
 the majority. Poses are compared by truncated squared distances at a common width.
 """
 
@@ -23,14 +23,17 @@ from avsreplay.register.surface_index import IcpParams
 from avsreplay.register.work import CALL_WORK, LEAST_RATIO, STAGE_WORK
 
 POINTS = PART  # points of the scan by which hypotheses are screened
-FEW = 150  # points that show whether a guess is hopeful
-START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004  # first and last rejection distance over the extent
-FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
+HOPEFUL_POINTS = 150  # points that show whether a guess is hopeful
+SCREEN_START_OF_EXTENT, SCREEN_STOP_OF_EXTENT = (
+    0.05,
+    0.004,
+)  # first and last rejection distance over the extent
+SCREEN_FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 # A pose replaces the first of several with a cost below this share of its cost. Nearer to 1, poses
 # are exchanged by the chance of noise.
 BETTER_THAN = 0.9
 # points nearer than so many widths are near; a rest is another object if most of these are on
-NEAR, MOSTLY = 5.0, 0.9
+NEAR_WIDTHS, MOSTLY = 5.0, 0.9
 
 
 @value_class
@@ -57,7 +60,7 @@ class Screened:
         are.
         """
         on, near = (
-            int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR)
+            int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR_WIDTHS)
         )
         return on >= MOSTLY * near
 
@@ -72,7 +75,7 @@ class Screen:
     def __init__(self, target: Target, test: PlausibilityTest) -> None:
         self._target, self._test = target, test
         self._extent = target.surface.extent
-        self.narrow_m = START_OF_EXTENT * self._extent
+        self.narrow_m = SCREEN_START_OF_EXTENT * self._extent
         self.wide_m = max(target.limits.reach_m, self.narrow_m)
         self._stages = {start: self._stages_from(start) for start in (self.narrow_m, self.wide_m)}
 
@@ -81,9 +84,9 @@ class Screen:
         test.
         """
         gates, gate = [], start_m
-        while gate > STOP_OF_EXTENT * self._extent:
+        while gate > SCREEN_STOP_OF_EXTENT * self._extent:
             gates.append(gate)
-            gate *= FALL
+            gate *= SCREEN_FALL
         rule = IcpParams(
             n_max=PASSES, n_plane=PASSES, tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * self._extent
         )
@@ -128,7 +131,7 @@ class Screen:
         """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are
         mostly on the model; and the work.
         """
-        few = scan[:: max(1, len(scan) // FEW)]
+        few = scan[:: max(1, len(scan) // HOPEFUL_POINTS)]
         found = self.graduated(few, guess.inverse(), self.wide_m)
         width = max(self._target.limits.gate_m, 3.0 * found.noise_m)
         on = float(np.mean(found.distance < width))
@@ -142,7 +145,9 @@ class Screen:
         pose.
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
-        return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
+        return max(
+            min(self._target.limits.gate_m, SCREEN_STOP_OF_EXTENT * self._extent), 3.0 * noise
+        )
 
     def least(self, found: list[Screened]) -> Screened:
         """Return the pose of least cost, but the first one if none has a clearly lower cost."""

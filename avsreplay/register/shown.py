@@ -27,7 +27,7 @@ LEAST_OF_LARGEST = 0.05
 POSTPONED = (
     "the search for a pose is postponed, because the searches of the scans before found none"
 )
-POINTS = 2000  # of a scan, from which its shape is measured
+SHAPE_POINTS = 2000  # of a scan, from which its shape is measured
 
 
 class Effort(Enum):
@@ -47,7 +47,7 @@ def shown(points: NDArray[Any]) -> Array | None:
     Returns:
         None with fewer than four points.
     """
-    part = np.asarray(points[:: max(1, len(points) // POINTS)], dtype=np.float64)
+    part = np.asarray(points[:: max(1, len(points) // SHAPE_POINTS)], dtype=np.float64)
     part = part[np.isfinite(part).all(axis=1)]
     if len(part) < 4:
         return None

@@ -35,7 +35,10 @@ MOST_OF_MODEL = (
     1.3  # diameter of a scan over that of the model above which more than the target is in view
 )
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
-LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
+LEAST_ERROR, SIZE_SIGMAS = (
+    0.005,
+    4.0,
+)  # least |delta| that is reported, by itself and in standard errors
 # from so many standard errors on, the covariance of the pose contains the change with the size
 LIKELY_SIGMAS = 2.0
 SIZE_UNSEEN = (
@@ -44,8 +47,8 @@ SIZE_UNSEEN = (
 UNSEEN_ERROR = (
     0.03  # a view in which a larger error would not be significant does not determine the size
 )
-WIDTH_OF_EXTENT, POINTS = 0.02, 600  # larger residuals are not used
-ROUNDS, MOST_ROUNDS, SMALL_STEP = (
+USED_OF_EXTENT, SIZE_POINTS = 0.02, 600  # larger residuals are not used
+MATCH_ROUNDS, MOST_ROUNDS, SMALL_STEP = (
     3,
     20,
     2e-4,
@@ -85,7 +88,7 @@ class SizeError:
     @property
     def significant(self) -> bool:
         """Whether delta is larger than 0.5 % and than four standard errors."""
-        return abs(self.delta) > max(LEAST_ERROR, SIGMAS * self.sigma)
+        return abs(self.delta) > max(LEAST_ERROR, SIZE_SIGMAS * self.sigma)
 
     @property
     def likely(self) -> bool:
@@ -105,7 +108,7 @@ def size_remark(size: SizeError | None, size_1s: float) -> str:
     if size is not None and size.significant:
         larger = "larger" if size.delta > 0.0 else "smaller"
         return f"the scan fits a target {100.0 * abs(size.delta):.1f} % {larger} than the model"
-    error = SIGMAS * max(size_1s, 0.0 if size is None else size.sigma)
+    error = SIZE_SIGMAS * max(size_1s, 0.0 if size is None else size.sigma)
     if error <= UNSEEN_ERROR:
         return ""
     return f"{SIZE_UNSEEN} below {100.0 * error:.1f} %" if error < np.inf else SIZE_UNSEEN
@@ -125,7 +128,7 @@ def size_error(
     Returns:
         The error, without the bias of the noise if it is significant; None without a fit.
     """
-    rows = _fitted(index, T_ca.apply(points[:: max(1, len(points) // POINTS)]), camera_c)
+    rows = _fitted(index, T_ca.apply(points[:: max(1, len(points) // SIZE_POINTS)]), camera_c)
     if rows is None or not (found := _size_of(index, rows)).significant:
         return None if rows is None else found
     bias = _bias_of(index, rows, camera_c)
@@ -205,7 +208,9 @@ def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
 
 
 def _bias_of(index: SurfaceIndex, rows: Rows, camera_c: Array | None) -> float:
-    found = [_rounds(index, noisy, camera_c, ROUNDS) for noisy in noisy_points(rows, camera_c)]
+    found = [
+        _rounds(index, noisy, camera_c, MATCH_ROUNDS) for noisy in noisy_points(rows, camera_c)
+    ]
     return float(np.mean([LARGEST_ERROR if each is None else each[0] for each in found]))
 
 
@@ -235,7 +240,7 @@ def normal_jacobian(p: Array, n: Array) -> Array:
 
 def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> Rows | None:
     """The rows of the last round."""
-    if (begun := _rounds(index, p, camera_c, ROUNDS - 1)) is None:
+    if (begun := _rounds(index, p, camera_c, MATCH_ROUNDS - 1)) is None:
         return None
     delta, moved = begun
     if (found := least_squares(index, moved.apply(p) / (1.0 + delta), camera_c)) is None:
@@ -253,7 +258,7 @@ def _rounds(
     """
     delta, moved = 0.0, Pose.identity()
     rule = (
-        WIDTH_OF_EXTENT * index.extent_m,
+        USED_OF_EXTENT * index.extent_m,
         LEAST_RESIDUALS,
         NORMAL_QUANTILE,
         CAUCHY,
@@ -333,7 +338,7 @@ def matched_points(
     Normals and closest points (k, 3), residuals and square roots of their Cauchy weights (k,),
     their robust 1 sigma.
     """
-    found = index.closest(p, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
+    found = index.closest(p, camera_c=camera_c, most_m=USED_OF_EXTENT * index.extent_m)
     near = np.isfinite(found.d2)
     if np.count_nonzero(near) < LEAST_RESIDUALS:
         return None

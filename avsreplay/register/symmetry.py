@@ -44,8 +44,8 @@ LEAST_COST, LEAST_TEETH = (
     0.02,
     5,
 )  # median cost, below which a body is one of revolution; fewest teeth
-PRODUCTS, ROUNDS = 96, 4  # most motions of a finite group, and rounds of products
-WIDTH_OF_EXTENT, DIFFERENT_RAD = (
+PRODUCTS, PRODUCT_ROUNDS = 96, 4  # most motions of a finite group, and rounds of products
+CARRIED_WIDTH_OF_EXTENT, DIFFERENT_RAD = (
     0.03,
     np.radians(3.0),
 )  # distance beyond which a point is not carried onto the surface
@@ -123,9 +123,9 @@ def _group(search: GlobalSearch, index: SurfaceIndex, points: Array, found: Arra
 
     Each product is registered, so that errors do not add up.
     """
-    width = WIDTH_OF_EXTENT * index.extent_m
+    width = CARRIED_WIDTH_OF_EXTENT * index.extent_m
     group = [np.eye(4), *found]
-    for _ in range(ROUNDS):
+    for _ in range(PRODUCT_ROUNDS):
         larger = list(group)
         for product in (a @ b for a in group for b in found):
             if len(larger) > PRODUCTS:

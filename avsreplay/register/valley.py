@@ -17,7 +17,10 @@ from avsreplay.register.backend import Target
 from avsreplay.register.generators.weak_directions import weak_motions
 from avsreplay.register.screening import Screen
 
-STEPS, POINTS = 8, 250  # steps of half a gate each way along the two directions; points
+VALLEY_STEPS, VALLEY_POINTS = (
+    8,
+    250,
+)  # steps of half a gate each way along the two directions; points
 VALLEY_WORK = 16_000  # cost of the search along the valley [point searches]
 
 
@@ -27,13 +30,17 @@ def along_valley(
     """Return the best pose along the two directions that points (n, 3) in {A} determine least, or
     the registered pose itself; and the work.
     """
-    few = points[:: max(1, len(points) // POINTS)]
+    few = points[:: max(1, len(points) // VALLEY_POINTS)]
     weak, work = weak_motions(target, screen, few, T_ca, 2)
     work += VALLEY_WORK
     if weak is None:
         return T_ca, work
     width, middle = screen.width(weak.at), weak.centre
-    steps = 0.5 * target.limits.gate_m * np.delete(np.arange(-STEPS, STEPS + 1), STEPS)
+    steps = (
+        0.5
+        * target.limits.gate_m
+        * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+    )
     tried = np.concatenate(
         [np.zeros((1, 6)), np.multiply.outer(steps, weak.motions).reshape(-1, 6)]
     )

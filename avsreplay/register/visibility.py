@@ -41,7 +41,7 @@ FROM_BEHIND, LEAST_ONE_SIDED = (
 )  # share of the views of a patch; share of the area with one side
 FRONT, BACK, BOTH = 1, 2, 3
 CENTROID_CELL = 0.02  # of the image in which the nearest points are seen, over the extent
-VERSION = 1  # of the rule for the sides of open parts, for the cache
+SIDES_VERSION = 1  # of the rule for the sides of open parts, for the cache
 
 
 class Visibility:
@@ -210,7 +210,7 @@ def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface
     closed, opened = faces[part < 0], faces[part >= 0]
     kernel, path = kernel_module(), None
     if cache_dir is not None:
-        layout = f"{kernel.LAYOUT} sides {VERSION}"
+        layout = f"{kernel.LAYOUT} sides {SIDES_VERSION}"
         path = index_cache.cache_path(
             cache_dir, layout, surface.vertices, surface.faces, surface.extent
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
-from avsreplay.register.backend import LEAST_POINTS
+from avsreplay.register.backend import LEAST_BUDGET_POINTS
 from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 
@@ -20,7 +20,7 @@ GRADE_WORK, POINTS_GRADED = (
     8000,
     2,
 )  # the quality of a pose: point searches in all, and points of which each takes one
-NEAR_POINTS, NEAR_OF_EXTENT = (
+NEAR_POINTS, ORDINARY_NOISE_OF_EXTENT = (
     500,
     0.002,
 )  # points with the noise of an ordinary scan that show the cost of a search
@@ -63,7 +63,7 @@ def healthy_work(points: int, near: float) -> int:
         near: cost of a search near the model, see ``near_work``.
     """
     n, (fixed, each), (searches, passes) = (
-        max(points, LEAST_POINTS),
+        max(points, LEAST_BUDGET_POINTS),
         HEALTHY_FIXED,
         HEALTHY_SEARCHED,
     )
@@ -80,7 +80,7 @@ def near_work(surface: Surface, index: SurfaceIndex) -> float:
     """
     points, normals = sample(surface, NEAR_POINTS)
     points = points[:: max(1, len(points) // NEAR_POINTS)]
-    near = points + NEAR_OF_EXTENT * index.extent_m * normals[: len(points)]
+    near = points + ORDINARY_NOISE_OF_EXTENT * index.extent_m * normals[: len(points)]
     return index.distances(near, Pose.identity(), np.inf, False, 1, 0.0)[1] / len(near)
 
 

@@ -21,14 +21,14 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import Target
 from avsreplay.register.global_search import (
     COARSE_OF_EXTENT,
-    FALL,
     FINE_POINTS,
     FIRST_PASSES,
+    GATE_FALL,
+    LAST_FINE_POINTS,
     LOOK_UPS,
     MIDDLE_OF_EXTENT,
     MIDDLE_POINTS,
     MODEL_POINTS,
-    REFINED_POINTS,
     REGISTERED_WORK,
     RIVAL_AFTER,
     best_of,
@@ -40,7 +40,7 @@ from avsreplay.register.poses import SAME_RAD
 from avsreplay.register.sampling import sample_evenly, thin_to
 from avsreplay.register.work import LEAST_RATIO, NOT_COMPARED
 
-POINTS, STEP_OF_EXTENT, STEPS = (
+START_POINTS, STEP_OF_EXTENT, STEPS_EACH_WAY = (
     50,
     0.06,
     12,
@@ -52,7 +52,7 @@ MOST = (
 )  # starts that are kept after the first passes: those turned by near-symmetries, and the others
 MOST_STARTS = 1200  # with more of them their distance is larger
 SECOND, LAST = 4, 6  # passes with the distance SECOND_GATE, and of the best with more points
-COMPARED_FIRST, COMPARED = (
+COMPARED_FIRST, REGISTERED_STARTS = (
     16,
     4,
 )  # poses that are compared with more points, and that are registered to the model
@@ -100,15 +100,17 @@ class Displaced(Generator):
             points: of the scan.
             partial: the scan shows a part of the target.
         """
-        registered = REGISTERED_WORK * min(on, REFINED_POINTS)
-        compared = self._symmetry.compared_work(points, 1 + COMPARED)
-        return FIXED_WORK + POINT_WORK[partial] * POINTS + registered + compared
+        registered = REGISTERED_WORK * min(on, LAST_FINE_POINTS)
+        compared = self._symmetry.compared_work(points, 1 + REGISTERED_STARTS)
+        return FIXED_WORK + POINT_WORK[partial] * START_POINTS + registered + compared
 
     def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
-        """Yield at most ``COMPARED`` poses that explain the points on the model nearly as well."""
+        """Yield at most ``REGISTERED_STARTS`` poses that explain the points on the model nearly
+        as well.
+        """
         rays, T_ca = self._symmetry.rays(case.points), case.at.T_ca
         on = self._test.measure(rays.points, T_ca) < self._gate
-        compared = self._symmetry.compared_work(len(rays.points), 1 + COMPARED)
+        compared = self._symmetry.compared_work(len(rays.points), 1 + REGISTERED_STARTS)
         found, work = self._poses(
             rays.points[on], T_ca, self._partial(case), case.work.left - compared
         )
@@ -127,7 +129,7 @@ class Displaced(Generator):
         measured = [replace(each, distance=each.distance[on]) for each in measured]
         best, as_near, open_ = self._symmetry.decided(measured, not partial)
         # there may be more of them, which were not compared
-        rivals = as_near if len(as_near) >= COMPARED else open_
+        rivals = as_near if len(as_near) >= REGISTERED_STARTS else open_
         kept = replace(at, rivals=tuple(each.T_ca for each in rivals))
         moved = not self._symmetry.poses.same(best.T_ca, at.T_ca)
         return (Hypothesis(best.T_ca) if moved else None), kept
@@ -138,17 +140,18 @@ class Displaced(Generator):
         After most of the work that is ``left`` no pose is registered.
         """
         search = self._search
-        search.spent, search.registered = 0, REFINED_POINTS
+        search.spent, search.registered = 0, LAST_FINE_POINTS
         L, width = self._extent, MIDDLE_OF_EXTENT * self._extent
         threads = self._target.limits.threads
         few, some, fine = (
-            np.ascontiguousarray(thin_to(points, n)) for n in (POINTS, MIDDLE_POINTS, FINE_POINTS)
+            np.ascontiguousarray(thin_to(points, n))
+            for n in (START_POINTS, MIDDLE_POINTS, FINE_POINTS)
         )
         sight = self._target.visibility.direction_to_camera(points)
         facing = self._target.visibility.sided and sight is not None
-        starts = self._displaced(few, T_ca, sight, STEPS if partial else 1)
+        starts = self._displaced(few, T_ca, sight, STEPS_EACH_WAY if partial else 1)
         looked = len(few[::2]) * sum(map(len, starts)) * 3
-        rule = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
+        rule = (GATE_FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         kept = []
         for each, most in zip(starts, MOST, strict=True):
             poses, costs = search.field.refine(
@@ -166,7 +169,7 @@ class Displaced(Generator):
         costs, search.spent = np.minimum(d2 / width**2, 1.0).mean(axis=1), d2.size
         poses = search.poses.different(best_of(poses, costs, len(poses)), COMPARED_FIRST, 0.5)
         looked += len(some) * len(poses) * (1 + LAST)
-        rule = (FALL, 0.01 * L, width, facing, threads)
+        rule = (GATE_FALL, 0.01 * L, width, facing, threads)
         poses, _ = search.field.refine(some, poses, LAST, 2.0 * width, *rule)
         search.most = left - FIXED_WORK - looked // LOOK_UPS
         first, *found = [
@@ -181,7 +184,7 @@ class Displaced(Generator):
         ]
         others = [
             Pose.from_matrix(T)
-            for T in search.poses.different(np.stack(near), 1 + COMPARED, 0.5)[1:]
+            for T in search.poses.different(np.stack(near), 1 + REGISTERED_STARTS, 0.5)[1:]
         ]
         ended = search.to_the_end(fine, others, width)[0]
         return [each.T_ca for each in ended], FIXED_WORK + looked // LOOK_UPS + search.spent

@@ -17,7 +17,7 @@ from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
 from avsreplay.register.screening import Screen, Screened
 from avsreplay.register.work import FAR_WORK
 
-TURN_RAD = np.radians(4.0)  # rotation of the turned starts
+RESTART_TURN_RAD = np.radians(4.0)  # rotation of the turned starts
 EQUAL = 1e-9  # two starts with entries nearer than this (lengths: times the extent) are one
 LEAST_TO_TURN = 0.2  # share of the points on the model at the best pose, to try turned starts
 KEPT_SCANS = 2  # work that is kept, in ordinary registrations
@@ -79,7 +79,7 @@ class Restarts(Generator):
             centre = base.apply(centre_a)
             for axis in np.eye(3):
                 for sign in (1.0, -1.0):
-                    turn = geometry.exp(sign * TURN_RAD * axis)
+                    turn = geometry.exp(sign * RESTART_TURN_RAD * axis)
                     yield Pose(turn, centre - geometry.matrix(turn) @ centre) @ base, narrow
 
 

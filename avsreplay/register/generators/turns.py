@@ -15,7 +15,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import motions_outside
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis, Refine
-from avsreplay.register.near_symmetry import LEAST_RAYS, NearSymmetry
+from avsreplay.register.near_symmetry import LEAST_OFF_MODEL, NearSymmetry
 from avsreplay.register.poses import ONE_MINIMUM
 from avsreplay.register.symmetry import FINALISTS
 from avsreplay.register.work import TEST_WORK
@@ -90,7 +90,7 @@ class TurnsOfGuess(Turns):
     def needed(self, case: Case) -> bool:
         """Return whether enough points are off the model, or some motion is not known."""
         found, near = case.at.found, self._symmetry.near
-        least = LEAST_RAYS if near else max(LEAST_RAYS, MANY_OFF * found.points)
+        least = LEAST_OFF_MODEL if near else max(LEAST_OFF_MODEL, MANY_OFF * found.points)
         off = found.points - found.inliers >= least
         return case.at.accepted and (self._open(case).size > 0 or off) and self._symmetry.turned
 

@@ -27,15 +27,15 @@ from avsreplay.register.generators.restarts import screened
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
-from avsreplay.register.screening import STOP_OF_EXTENT, Screen, Screened
+from avsreplay.register.screening import SCREEN_STOP_OF_EXTENT, Screen, Screened
 from avsreplay.register.work import FAR_WORK, LAST_WORK, NOT_COMPARED
 
-POINTS = 300  # points that are registered from displaced poses
+DISPLACED_POINTS = 300  # points that are registered from displaced poses
 DIRECTIONS = 3  # weak directions, each both ways
 DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
-# As ``comparison.SIGMAS``, for minima beside the pose, of which the guess excludes most. With that
-# value a right pose of a scan that shows 30 % of a target was not accepted.
-SIGMAS = 4.0
+# As ``comparison.CHANCE_SIGMAS``, for minima beside the pose, of which the guess excludes most.
+# With that value a right pose of a scan that shows 30 % of a target was not accepted.
+BESIDE_SIGMAS = 4.0
 LEAST_INLIERS = 6  # which determine a pose
 UNMOVED = 0.25  # a pose nearer to its guess, in gates, is not compared
 RADIUS_OF_EXTENT = 0.25  # usual rms radius of a scan over the extent
@@ -119,7 +119,7 @@ class WeakDirections(Generator):
     def work(self, case: Case | None = None) -> int:  # noqa: ARG002
         """Return the usual cost of the minima around a pose."""
         passes = self._screen.passes(self._screen.narrow_m)
-        return int((1 + 2 * DIRECTIONS) * FAR_WORK * passes * POINTS)
+        return int((1 + 2 * DIRECTIONS) * FAR_WORK * passes * DISPLACED_POINTS)
 
     def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
         """Yield the candidate so far and the minima around it; of a degenerate view only the other
@@ -134,7 +134,7 @@ class WeakDirections(Generator):
         """Yield a pose, and those registered after a displacement towards the camera and along
         ``count`` directions both ways, while the work besides ``kept`` allows it.
         """
-        few = case.few[:: max(1, len(case.few) // POINTS)]
+        few = case.few[:: max(1, len(case.few) // DISPLACED_POINTS)]
         weak, work = weak_motions(self._target, self._screen, few, T_ca, count)
         yield Hypothesis.of(self._screen.measure(case.few, T_ca), work)
         self._complete, dearest = True, 0  # work of one registration so far
@@ -172,11 +172,11 @@ class WeakDirections(Generator):
         if not self._complete:
             return None, replace(at, missing=NOT_COMPARED)
         best, width = self._screen.least(minima), 3.0 * min(each.noise_m for each in minima)
-        width = max(STOP_OF_EXTENT * self._extent, width)
+        width = max(SCREEN_STOP_OF_EXTENT * self._extent, width)
         others = (e for e in minima if not self._poses.same(best.T_ca, e.T_ca, ONE_MINIMUM))
         aligned = at.found.status is AlignStatus.ALIGNED
         beside = aligned and any(
-            as_good(best.costs(width), each.costs(width), 0.0, SIGMAS) for each in others
+            as_good(best.costs(width), each.costs(width), 0.0, BESIDE_SIGMAS) for each in others
         )
         chosen = None if best is minima[0] else Hypothesis(best.T_ca, at=best)
         return chosen, replace(at, beside=beside)
