@@ -523,7 +523,6 @@ def _accepted(case: Case, path: StepPath, over: Array, search: _Search) -> None:
     """Take the path without terminal errors where the other constraints hold, with its
     withdrawals, which are proven where it would be the best path.
     """
-    path = path.ending_at(case.scene.goal)
     allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
     if not feasible(case, path, over.max(), allowed):
         return
@@ -566,7 +565,7 @@ def _converged(
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
         stuck, search.slack = found.slack > 0.9 * search.slack, found.slack
-        path = last = _damped(case, path, last, search)
+        path = last = _damped(case, path.ending_at(case.scene.goal), last, search)
         t, over = path.t_go_s - case.wait_s, excess(case, path)
         search.idle += 1
         if found.slack <= case.allowed_slack_m:
@@ -600,7 +599,7 @@ def _damped(case: Case, path: StepPath, last: StepPath | None, search: _Search) 
         return path
     mean = StepPath(
         case.r0, case.v0, 0.5 * (path.u + last.u), case.wait_s, 0.5 * (path.t_go_s + last.t_go_s)
-    )
+    ).ending_at(case.scene.goal)
     away = withdrawn(case, mean, tried, improve=False)
     if away.short_m >= search.away.short_m:
         return path
