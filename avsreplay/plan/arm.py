@@ -33,21 +33,21 @@ from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
 from avsreplay.plan.robot import Limits, RobotParams
 
-INSTANTS = 81  # instants of the last metres
+PATH_INSTANTS = 81  # instants of the last metres
 STARTS = 32  # joint configurations from which the inverse kinematics of the capture begins
-ITERATIONS = 200
+JOINT_ITERATIONS = 200
 STALLED = 10  # iterations without a smaller error that end the inverse kinematics
 POSE_ERROR = 1e-8  # largest error of the inverse kinematics [m, rad]
 DAMPING = 1e-3
 CAPTURES = 16  # plans that are tried until the joints can fly one
-GRID_S = 0.25  # spacing of the instants at which the reach is bounded
+REACH_GRID_S = 0.25  # spacing of the instants at which the reach is bounded
 # interval between a capture that the joints miss and one that they follow at which the search ends
 CLOSE_S = 0.1
-STEP_S = 1.0  # spacing of the capture instants
+CAPTURE_STEP_S = 1.0  # spacing of the capture instants
 APPROACH = 9  # poses on the axis of the corridor at which a capture instant is tried
 QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins
 SLOWEST = 0.1  # smallest share of the largest acceleration
-SAME_RAD = 1e-4  # joints of the capture that differ by less belong to one branch
+SAME_BRANCH_RAD = 1e-4  # joints of the capture that differ by less belong to one branch
 JUMP_RAD = 0.5  # a larger change of a joint between two instants is another branch
 
 
@@ -134,7 +134,7 @@ class Arm:
             limits: Resolved limits: the pose of the base.
             horizon_s: Latest capture [s after the instant of planning].
         """
-        times = np.arange(0.0, horizon_s + GRID_S, GRID_S)
+        times = np.arange(0.0, horizon_s + REACH_GRID_S, REACH_GRID_S)
         missing = np.array(
             [
                 self.missing_m(pose)
@@ -154,7 +154,7 @@ class Arm:
         pin, model, data = self._pin, self._model, self._data
         goal = pin.SE3(geometry.matrix(target.q), np.asarray(target.t))
         q, least, since = np.array(start, dtype=np.float64), math.inf, 0
-        for _ in range(ITERATIONS):
+        for _ in range(JOINT_ITERATIONS):
             pin.framesForwardKinematics(model, data, q)
             error = pin.log6(data.oMf[self._frame].actInv(goal)).vector
             size = float(np.abs(error).max())
@@ -188,7 +188,7 @@ class Arm:
         Raises:
             ValueError: The scene has no attitude.
         """
-        times = np.linspace(last_metres_s(path, scene, limits), path.t_go_s, INSTANTS)
+        times = np.linspace(last_metres_s(path, scene, limits), path.t_go_s, PATH_INSTANTS)
         r = path.at(times)[0]
         poses = self._poses(scene, limits, times, r)
         best = self._farthest(poses, self._starts() if starts is None else starts)
@@ -342,7 +342,7 @@ class Arm:
         corridor ahead of it during the time ``lead_s`` before, with a distance that decreases with
         the square of the time to the capture.
         """
-        times = np.arange(after_s + STEP_S, horizon_s, STEP_S)
+        times = np.arange(after_s + CAPTURE_STEP_S, horizon_s, CAPTURE_STEP_S)
         goal = scene.goal(times)[0]
         near = [self.missing_m(pose) <= 0.0 for pose in self._poses(scene, limits, times, goal)]
         axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
@@ -389,7 +389,9 @@ class Arm:
         best, ends = list[Array](), list[Array]()
         for start in starts:
             end = self.inverse(poses[-1], start)
-            if end is None or any(float(np.abs(end - other).max()) < SAME_RAD for other in ends):
+            if end is None or any(
+                float(np.abs(end - other).max()) < SAME_BRANCH_RAD for other in ends
+            ):
                 continue
             ends.append(end)
             traced = self._traced(poses, end)

@@ -24,9 +24,9 @@ from avsreplay.plan.path import MOTION_FACTOR, CostatePath
 from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.records import Trajectory
 
-GRID_S = 0.1  # spacing of the samples of the relative attitude
-STEP_S = 1e-3  # step of the difference quotients of the attitude [s]
-INSTANTS = 201  # instants at which the angular acceleration of a turn is checked
+ATTITUDE_GRID_S = 0.1  # spacing of the samples of the relative attitude
+DIFFERENCE_S = 1e-3  # step of the difference quotients of the attitude [s]
+CHECKED_INSTANTS = 201  # instants at which the angular acceleration of a turn is checked
 SAME_TIME_S = 1e-3  # a capture this soon after the turn is delayed by it
 REDUCTIONS = 8  # largest number of reductions of the bound on psi''
 
@@ -78,7 +78,7 @@ class Turn:
         Args:
             t: Time [s after t_ns].
         """
-        rate: Array = _rates(self.at, np.array([max(t, STEP_S)]))[0]
+        rate: Array = _rates(self.at, np.array([max(t, DIFFERENCE_S)]))[0]
         return rate
 
 
@@ -141,18 +141,22 @@ def angular_acceleration(turn: Turn) -> float:
         turn: The turn; it must have a path.
     """
     edge_s = (
-        6.0 * STEP_S
+        6.0 * DIFFERENCE_S
     )  # the quotients at the ends are those just inside the turn, where the largest often is
-    times = np.linspace(edge_s, max(turn.ready_s(0.0) - edge_s, edge_s), INSTANTS)
-    rates = _rates(turn.at, np.concatenate([times - 5.0 * STEP_S, times + 5.0 * STEP_S]))
+    times = np.linspace(edge_s, max(turn.ready_s(0.0) - edge_s, edge_s), CHECKED_INSTANTS)
+    rates = _rates(
+        turn.at, np.concatenate([times - 5.0 * DIFFERENCE_S, times + 5.0 * DIFFERENCE_S])
+    )
     before, after = rates[: len(times)], rates[len(times) :]
-    return float(np.linalg.norm(after - before, axis=1).max(initial=0.0)) / (10.0 * STEP_S)
+    return float(np.linalg.norm(after - before, axis=1).max(initial=0.0)) / (10.0 * DIFFERENCE_S)
 
 
 def _rates(attitude: Attitude, times: Array) -> Array:
     """Return the angular rates (n, 3) in the body's axes [rad/s] by central differences."""
-    step = geometry.multiply(geometry.conjugate(attitude(times - STEP_S)), attitude(times + STEP_S))
-    return np.asarray(geometry.log(step) / (2.0 * STEP_S))
+    step = geometry.multiply(
+        geometry.conjugate(attitude(times - DIFFERENCE_S)), attitude(times + DIFFERENCE_S)
+    )
+    return np.asarray(geometry.log(step) / (2.0 * DIFFERENCE_S))
 
 
 def _relative(
@@ -164,7 +168,7 @@ def _relative(
     A rotation by theta about e is also one by theta - 2 pi; ``winding`` selects the branch at the
     begin.
     """
-    times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / GRID_S) + 1)
+    times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / ATTITUDE_GRID_S) + 1)
     psi = np.array(geometry.log(geometry.multiply(geometry.conjugate(q0), target(times))))
     size = np.maximum(np.linalg.norm(psi, axis=1, keepdims=True), 1e-12)
     branches = (
@@ -246,7 +250,7 @@ def without_turn(
         params: Largest acceleration of the end-effector, latency and horizon.
         t_ns: Instant of planning.
     """
-    times = np.arange(STEP_S, params.horizon_s + GRID_S, GRID_S)
+    times = np.arange(DIFFERENCE_S, params.horizon_s + ATTITUDE_GRID_S, ATTITUDE_GRID_S)
     rates = np.linalg.norm(_rates(target, times), axis=1)
     begun = float(np.linalg.norm(before.rate((t_ns - before.t_ns) * 1e-9 + params.latency_s)))
     missing = rates - begun - accel_radps2 * np.maximum(times - params.latency_s, 0.0)

@@ -49,14 +49,14 @@ from avsreplay.plan.rendezvous import PlanParams, finer, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.withdrawal import COAST_S, Space, Tried, certified, safety
 
-ITERATIONS = 14  # largest number of iterations of one initial path
+MOST_ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 ROUGH_TOLERANCE = (
     2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
 )
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
-LATER, LATER_S = (
+RENEWED_LATER, RENEWED_LATER_S = (
     1.02,
     0.1,
 )  # a renewed plan that is later than the earlier one by more starts the full search
@@ -316,7 +316,7 @@ def _best_path(
         again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
         enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
         best = _refined(again, *warm, rough=True, enough_s=enough_s)
-        if best is not None and best.t_go_s <= LATER * expected + LATER_S:
+        if best is not None and best.t_go_s <= RENEWED_LATER * expected + RENEWED_LATER_S:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -558,7 +558,7 @@ def _converged(
     search = _Search(Withdrawn(rows=rows), np.zeros((2 * n, len(CONSTRAINTS))))
     change = largest_change(case, reference, trust)
     last: StepPath | None = None
-    for iteration in range(ITERATIONS):
+    for iteration in range(MOST_ITERATIONS):
         problem = convex_subproblem(case, reference, search.off, change, search.away.rows)
         if (found := solve(problem)) is None:
             break

@@ -31,8 +31,8 @@ from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.withdrawal import (
-    COMPARED,
-    DENSER,
+    DENSITY_POWER,
+    EVALUATED_INSTANTS,
     STARTS,
     Certificate,
     Space,
@@ -44,7 +44,7 @@ from avsreplay.plan.withdrawal import (
 
 COARSE_NODES = 16  # least number of thrust intervals while initial paths are compared
 COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
-TURN_RAD = 0.5  # the target may turn by this much between two iterations
+MOST_TURN_RAD = 0.5  # the target may turn by this much between two iterations
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 RESERVE = (
     3.0  # margin at the checked instants in units of the buffer, for the instants between them
@@ -281,7 +281,7 @@ def largest_change(case: Case, reference: ReferencePath, most: float) -> float:
     turn by TURN_RAD.
     """
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
-    return float(min(most, TURN_RAD / max(turn, 1e-9)))
+    return float(min(most, MOST_TURN_RAD / max(turn, 1e-9)))
 
 
 def dense_margins(case: Case, path: RobotPath) -> tuple[Array, Margins]:
@@ -455,9 +455,9 @@ def _withdrawal_rows(
     near = np.flatnonzero(found.margins_m < required + far)
     part = np.floor((found.worst.t[near] - case.wait_s) * (2.0 * STARTS / length))
     after = np.maximum(found.at[near] / found.worst.span[near], 0.0)
-    late = np.round(after ** (1.0 / DENSER) * COMPARED)
+    late = np.round(after ** (1.0 / DENSITY_POWER) * EVALUATED_INSTANTS)
     order = np.lexsort((found.margins_m[near], late, part))
-    key = ((COMPARED + 1.0) * part + late)[order]
+    key = ((EVALUATED_INSTANTS + 1.0) * part + late)[order]
     k = near[order][np.r_[True, np.diff(key) > 0.0]] if len(order) else near
     m, lead = found.worst.of(k), found.at[k]
     t, r, v = m.t + lead, m.r, m.v

@@ -33,7 +33,7 @@ from avsreplay.records import Forecast
 SEARCH_AGAIN = 1.1
 # share of the capture tolerance: without a measurement, a plan whose end moved by less is not
 # renewed
-UNCHANGED = 0.01
+UNCHANGED_OF_TOLERANCE = 0.01
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
@@ -272,7 +272,7 @@ class Guidance:
         return (
             known.gamma == 0
             and (seen_s or 0.0) <= made_s
-            and self._still_valid(flown, known, UNCHANGED)
+            and self._still_valid(flown, known, UNCHANGED_OF_TOLERANCE)
         )
 
     def _still_valid(self, flown: Segment, known: PlannerInput, share: float = 1.0) -> bool:

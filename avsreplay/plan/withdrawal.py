@@ -38,8 +38,8 @@ COAST_S = 30.0  # time after a cut of the thrust over which the coasting robot i
 ENOUGH_OF_EXTENT = 0.025  # margin that counts as enough: no larger one is looked for or stated
 RESOLUTION_OF_EXTENT = 5e-4  # uncertainty of a certified margin, and reserve of plans for it
 RANGES = 48  # ranges of start instants of a path whose thrust is not constant over intervals
-DENSER = 1.3  # power of the share of a manoeuvre: instants are denser at the begin
-COMPARED = 32  # instants at which margins of an escape are evaluated for the planner
+DENSITY_POWER = 1.3  # power of the share of a manoeuvre: instants are denser at the begin
+EVALUATED_INSTANTS = 32  # instants at which margins of an escape are evaluated for the planner
 HALVINGS = 16  # largest number of halvings of a range of start instants
 COAST_HALVINGS = 6  # the same for coasting, whose margin is only stated
 MOST_RANGES = 4000  # of start instants; more are bounded without being halved
@@ -302,7 +302,7 @@ class Space:
         """Return margins (m, n) at n instants of manoeuvres, denser at the begin, and the times
         after it (m, n); a margin above ``below_m`` may be a lower bound [m].
         """
-        share = np.linspace(0.0, 1.0, COMPARED + 1) ** DENSER
+        share = np.linspace(0.0, 1.0, EVALUATED_INSTANTS + 1) ** DENSITY_POWER
         tau = m.span[:, None] * share
         found: Array = self.kernel(_last_s(m)).margins(m.table, tau, below_m)
         return found, tau
