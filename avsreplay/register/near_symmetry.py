@@ -249,8 +249,8 @@ class NearSymmetry:
 
         Of equal ones those are taken at which fewer than ``LEAST_OFF_MODEL`` rays more than at the
         pose pass through a mark. ``better``: only poses that explain more rays, by
-        ``LEAST_OFF_MODEL`` at least; also those turned by a few degrees, because a body of revolution with marks has a
-        minimum wherever a mark of the model meets some of the points.
+        ``LEAST_OFF_MODEL`` at least; also those turned by a few degrees, because a body of
+        revolution with marks has a minimum wherever a mark of the model meets some of the points.
         """
         stride, tested = self._stride, 0
         passed = self._passed(rays, T_ca, stride)[0]

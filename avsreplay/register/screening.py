@@ -2,8 +2,8 @@
 
 A graduated registration takes point-to-plane passes while the rejection distance falls
 geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``SCREEN_STOP_OF_EXTENT`` of the
-extent. The falling distance rejects outliers, which the rms rule of the normal alignment cannot do if they are
-the majority. Poses are compared by truncated squared distances at a common width.
+extent. The falling distance rejects outliers, which the rms rule of the normal alignment cannot do
+if they are the majority. Poses are compared by truncated squared distances at a common width.
 """
 
 from __future__ import annotations
