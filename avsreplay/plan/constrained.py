@@ -11,9 +11,9 @@ constraints hold at sixteen instants of every interval.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import chain
 from operator import attrgetter
 
 import numpy as np
@@ -60,6 +60,8 @@ RENEWED_LATER, RENEWED_LATER_S = (
     1.02,
     0.1,
 )  # a renewed plan that is later than the earlier one by more starts the full search
+# time that is spared where the withdrawals from the earliest path miss margins, over its time to go
+SPARE = (5e-3, 2e-2)
 NEAR_REFERENCE = (
     0.02  # relative change of the end time below which the excess tightens the constraints
 )
@@ -316,7 +318,11 @@ def _best_path(
         again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
         enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
         best = _refined(again, *warm, rough=True, enough_s=enough_s)
-        if best is not None and best.t_go_s <= RENEWED_LATER * expected + RENEWED_LATER_S:
+        renewed_s = RENEWED_LATER * expected + RENEWED_LATER_S
+        if best is not None and best.short_m > 0.0:
+            slower = _unhurried(again, *warm, max(expected, best.t_go_s))
+            best = _safest_of(chain((best,), slower))
+        if best is not None and best.t_go_s <= renewed_s:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -340,12 +346,20 @@ def _best_path(
         return found if best is None else min(best, found, key=_safest)
     away = proven(case, found, withdrawn(case, found))
     found = replace(found, escapes=away.escapes, short_m=away.short_m)
-    known = [path for path in (best, found) if path is not None]
-    for path in _withdrawing(case, found, drafts, near):
+    paths = chain((best, found), _withdrawing(case, found, drafts, near))
+    return _safest_of(paths, case.reserve_m)
+
+
+def _safest_of(paths: Iterable[StepPath | None], enough_m: float = 0.0) -> StepPath | None:
+    """Return the first path whose withdrawals miss at most ``enough_m``; without one, the path that
+    is the best by what it misses and its time.
+    """
+    known = list[StepPath]()
+    for path in paths:
         known += [] if path is None else [path]
-        if min(known, key=_safest).short_m <= case.reserve_m:
+        if known and min(known, key=_safest).short_m <= enough_m:
             break
-    return min(known, key=_safest)
+    return min(known, key=_safest, default=None)
 
 
 def _near(case: Case, free: Plan, drafts: list[StepPath]) -> list[ReferencePath]:
@@ -363,10 +377,25 @@ def _withdrawing(
     """Search paths that keep the withdrawals: from the path that was found without them, then from
     the drafts, then from initial paths.
     """
-    for start, trust in product((found, *drafts[:IMPROVED]), (TRUST, CAREFUL)):
-        yield _refined(case, start, trust=trust)
+    yield _refined(case, found)
+    yield from _unhurried(case, found, 0.0, found.t_go_s)
+    for start in drafts[:IMPROVED]:
+        yield _refined(case, start)
+    for start in (found, *drafts[:IMPROVED]):
+        yield _refined(case, start, trust=CAREFUL)
     for reference in near:
         yield _converged(case, reference)
+
+
+def _unhurried(
+    case: Case, path: RobotPath, since_s: float, earliest_s: float
+) -> Iterator[StepPath | None]:
+    """Refine a path with time to spare, with which margins can be kept that the earliest path
+    misses.
+    """
+    for spare in SPARE:
+        later = replace(case, earliest_s=max(case.earliest_s, (1.0 + spare) * earliest_s))
+        yield _refined(later, path, since_s, rough=True, enough_s=math.inf)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
