@@ -105,7 +105,7 @@ class Parts:
 def installed(group: str) -> dict[str, metadata.EntryPoint]:
     """Return the entry points of a group by name; of two with one name the first by value.
 
-    They are read once; ``installed.cache_clear()`` forgets them.
+    They are read once, and again after ``installed.cache_clear()``.
 
     Args:
         group: the group, such as ``avsreplay.backends``.
