@@ -366,8 +366,9 @@ def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_fol
 
 @pytest.mark.slow
 def test_a_prediction_that_leaves_no_room_to_approach_is_named(cli, fixtures_folder):
-    """With the same limits and an allowance of 1 sigma a capture is planned (next test)."""
+    """With the same limits and an allowance of 3 sigma a capture is planned."""
     limits = "limits.final_deg=30", "limits.clearance_m=0.1", "task.position_m=0.05"
+    limits += ("limits.clearance_sigmas=4",)
     words = [word for each in limits for word in ("--set", each)]
     said = " ".join(cli("run", fixtures_folder / "tumble.mcap", *words).out.split())
     assert "the predicted error of" in said
