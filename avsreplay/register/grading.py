@@ -15,11 +15,11 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Pose
-from avsreplay.records import Alignment, AlignStatus
+from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register import quality
 from avsreplay.register.backend import Backend, HornBackend, Target, aligned
 from avsreplay.register.hypotheses import Case
-from avsreplay.register.params import RegisterParams
+from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.screening import Screen
 from avsreplay.register.work import LEAST_RATIO, TEST_WORK, alignment_work, grade_work
 
@@ -74,42 +74,57 @@ class Grader:
         name = self._params.backend if by_backend else used.name
         closest, spent, left = used is self.own, 0, case.work.left
         for last in (False, True):
-            most = max(1, left - spent - grade_work(len(scan), noisy=True) - TEST_WORK)
             align = used.align_roughly if rough and not last else used.align
             if width_m is not None:
+                most = max(1, left - spent - grade_work(len(scan), noisy=True) - TEST_WORK)
                 align = partial(self.own.align_within, gate_m=width_m, near=True, most_work=most)
             fit = aligned(name, partial(align, scan, T_ca))
             if isinstance(fit, str):
                 none = quality.not_measured(len(scan), AlignStatus.FAILED, guess)
                 return replace(none, message=fit), spent
-            of, full = self._screen.part(scan) if fit.rough else scan, not fit.rough
-            options = (
-                self._params,
-                case.halves and full,
-                used.accuracy,
-                full and not case.carried,
-                start,
-            )
-            found = quality.grade(
-                index, self._target.visibility, of, fit, limits, *options, full and closest
-            )
-            if fit.rough:
-                found = replace(
-                    found, points=len(scan), inliers=found.inliers * len(scan) // len(of)
-                )
-            noisy = full and closest and found.rms_m > quality.SMALL_NOISE * index.extent_m
-            spent += alignment_work(fit, found, len(of), noisy) if closest else 0
+            found, of = self._measured(case, fit, limits, used.accuracy, start, closest)
+            noisy = not fit.rough and found.rms_m > quality.SMALL_NOISE * index.extent_m
+            spent += alignment_work(fit, found, of, noisy) if closest else 0
             ended = last or fit.iterations >= limits.n_max or left - spent < case.work.healthy
-            if (
-                ended
-                or found.status is not AlignStatus.NOT_CONVERGED
-                or not self._worth_more(guess, found)
-            ):
+            open_end = found.status is AlignStatus.NOT_CONVERGED and self._worth_more(guess, found)
+            if ended or not open_end:
                 break
             T_ca = fit.T_ca
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{name}' {found.message}")
         return found, spent
+
+    def _measured(
+        self,
+        case: Case,
+        fit: Fit,
+        limits: RegistrationLimits,
+        accuracy: tuple[float, float],
+        start: Pose,
+        closest: bool,
+    ) -> tuple[Alignment, int]:
+        """Measure the quality of a fit, of a rough one by a part of the scan; also return the
+        number of points.
+        """
+        scan, full = case.points, not fit.rough
+        of = scan if full else self._screen.part(scan)
+        found = quality.grade(
+            self._target.index,
+            self._target.visibility,
+            of,
+            fit,
+            limits,
+            self._params,
+            halves=case.halves and full,
+            accuracy=accuracy,
+            systematic=full and not case.carried,
+            guess=start,
+            simulated=full and closest,
+        )
+        if full:
+            return found, len(of)
+        inliers = found.inliers * len(scan) // len(of)
+        return replace(found, points=len(scan), inliers=inliers), len(of)
 
     def close(self, found: Alignment) -> bool:
         """Return whether an alignment is a close fit of nearly all points."""
