@@ -248,11 +248,11 @@ def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessm
         "tolerance": CaptureError(*setup.limits.tolist()),
         "task": task.text,
         "basis": "flight over the log",
-        "asked": "grasp point" not in task.assumed,
+        "asked": setup.guidance.params.enabled and "grasp point" not in task.assumed,
     }
     if not setup.guidance.params.enabled:
-        known |= {"asked": False, "limit": "no plans are made (plan.enabled = false)"}
-        return Assessment(chance=Chance.NOT_ASSESSED, **known)
+        limit = "no plans are made (plan.enabled = false)"
+        return Assessment(chance=Chance.NOT_ASSESSED, limit=limit, **known)
     if task.problem:
         return Assessment(
             chance=Chance.NOT_ASSESSED, limit=task.problem, change=setup.advice, **known

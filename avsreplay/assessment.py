@@ -64,7 +64,7 @@ class Assessment:
         change: what would change the answer, in words.
         task: the task in one line.
         in_fact: what happened; None where the true motion is not known.
-        asked: whether a grasp point was given, and is not the one that is assumed.
+        asked: whether a grasp point was given, in place of the assumed one, and plans are made.
     """
 
     chance: Chance
@@ -86,8 +86,7 @@ class Assessment:
     def lowers_grade(self) -> bool:
         """Whether the assessment is a reason for concern beside the tracking.
 
-        A capture that is not assessed, because the assumed grasp point cannot be used or plans are
-        switched off, is none.
+        A capture for which nobody asked, and that is not assessed, is none.
         """
         return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 
