@@ -11,7 +11,11 @@ from avsreplay.benchmark.results import Record
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_text
 
-LABELS_PX, PANEL_PX, GAP_PX, ROW_PX, HEAD_PX = 130, 170, 34, 22, 60
+LABELS_PX = 130
+PANEL_PX = 170
+GAP_PX = 34
+ROW_PX = 22
+HEAD_PX = 60
 PANELS = (  # key, heading, colour (Okabe and Ito), whether the axis is logarithmic
     ("wrong", "runs with a wrong pose", "#D55E00", False),
     ("captured", "captured", "#009E73", False),

@@ -31,10 +31,16 @@ GRAVITY = (  # settings of docs/real.md: gravity of the tracks, and a cube about
     "estimator.force_noise_mps15=0.02",
     "estimator.torque_noise_radps15=0.1",
 )
-REPLAYED, MODELLED = range(80, 95), range(96, 113)  # frames of the van
-FIRST_FRAME, FRAME_S = 5, 0.1  # of its label file
+# frames of the van
+REPLAYED = range(80, 95)
+MODELLED = range(96, 113)
+# of its label file
+FIRST_FRAME = 5
+FRAME_S = 0.1
 BOX_M = (5.530, 1.895, 2.195)  # of its label
-BESIDE_M, GROUND_M = 0.15, 0.25  # kept outside of the box, cut off above the ground
+# kept outside of the box, cut off above the ground
+BESIDE_M = 0.15
+GROUND_M = 0.25
 VOXEL_M = 0.04  # of the points of its model
 THIN_M = {"stanford-dragon": 0.002, "primesense-bunny": 0.002, "kitti-van-parked": 0.05}
 

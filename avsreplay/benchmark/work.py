@@ -32,15 +32,13 @@ from avsreplay.run import Job, ReplayedScan, Run
 from avsreplay.sweep.campaign import RunResult
 
 FORMAT = 1  # of a run's result; one with another format is made again
-WRONG_POSE_DEG, WRONG_POSE_OF_EXTENT = (
-    2.0,
-    0.02,
-)  # error of a wrong pose, as in docs/registration-results.md
+# error of a wrong pose, as in docs/registration-results.md
+WRONG_POSE_DEG = 2.0
+WRONG_POSE_OF_EXTENT = 0.02
 SETTLED_SHARE = 0.5  # share of a log after which the errors of the estimate count
-PUSH_NEAR_S, PUSH_SIGMAS = (
-    1.0,
-    4.0,
-)  # a reported change is that of a push if it is this near, or nearer
+# a reported change is that of a push if it is this near, or nearer
+PUSH_NEAR_S = 1.0
+PUSH_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)

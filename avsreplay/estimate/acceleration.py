@@ -32,9 +32,8 @@ from avsreplay.settings import given
 
 _FEWEST_POSES = 8  # poses of the first fit; the noise is estimated from its residuals
 _CONFIRM = 3  # successive poses that contradict the fit end it
-_GATE_WIDENING = (
-    12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
-)
+# the gate is wider with few degrees of freedom of the noise, as the F distribution is
+_GATE_WIDENING = 12.0
 # 1 sigma of the prior of all but the arm, in lengths of the arm over the duration of the poses
 _UNKNOWN = 1e3
 _FIT_PASSES = 4

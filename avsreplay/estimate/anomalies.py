@@ -66,14 +66,14 @@ from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Admission, Belief, Finding, Manoeuvre
 
-_FEWEST_DOUBTFUL, _MOST_DOUBTFUL = 3, 5  # least and most doubtful scans at a decision
-_RMS_STEP, _LEAST_SPREAD = (
-    4.0,
-    0.02,
-)  # step of the log rms residual, over its spread, that shows which poses are biased
-_LEAST_RISE_OF_NOISE = (
-    2.0  # of the variance of the poses, over the level that the NIS of the accepted ones show
-)
+# least and most doubtful scans at a decision
+_FEWEST_DOUBTFUL = 3
+_MOST_DOUBTFUL = 5
+# step of the log rms residual, over its spread, that shows which poses are biased
+_RMS_STEP = 4.0
+_LEAST_SPREAD = 0.02
+# of the variance of the poses, over the level that the NIS of the accepted ones show
+_LEAST_RISE_OF_NOISE = 2.0
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _STEPS = (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS)
 _DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)

@@ -38,9 +38,8 @@ from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
-_MOST_WORK = (
-    2 * BUDGET
-)  # linearised poses of a descent, or pieces of their rotation, from which it is continued later
+# linearised poses of a descent, or pieces of their rotation, from which it is continued later
+_MOST_WORK = 2 * BUDGET
 
 
 @dataclass(frozen=True, slots=True)

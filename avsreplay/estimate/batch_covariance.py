@@ -44,28 +44,25 @@ from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 _LEAST_NODE2 = 3.0  # square of the distance of the profile fits of at most three directions [sigma]
-_TRIAL = (
-    2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
-)
-_TRIES, _LOST = 6, 3.0
-_PINNED_FIT_STEPS, _FEWEST_STEPS = (
-    15,
-    40,
-)  # budget of a fit with one direction fixed, and least budget of all of them
+# distance along a direction at which the cost is compared with the Gaussian one [sigma]
+_TRIAL = 2.0
+_TRIES = 6
+_LOST = 3.0
+# budget of a fit with one direction fixed, and least budget of all of them
+_PINNED_FIT_STEPS = 15
+_FEWEST_STEPS = 40
 _PIN_WORK = 12_000  # budget of all of them in steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _LINEAR_RAD = 0.05
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
-LATEST, _SHARES = (
-    12,
-    (1.0, 0.5, 0.25, 0.0),
-)  # poses that a larger correction must fit better, and its parts tried
+# poses that a larger correction must fit better, and its parts tried
+LATEST = 12
+_SHARES = (1.0, 0.5, 0.25, 0.0)
 SPHERE = 3.0  # tr I / I of a sphere
-_TORQUE, _TORQUES = (
-    0.1,
-    (3e-4, 1e-4, 3e-5, 1e-5),
-)  # probability of a constant torque; 1 sigma, equally likely [rad/s2]
+# probability of a constant torque; 1 sigma, equally likely [rad/s2]
+_TORQUE = 0.1
+_TORQUES = (3e-4, 1e-4, 3e-5, 1e-5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

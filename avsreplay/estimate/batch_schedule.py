@@ -51,7 +51,9 @@ from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
-FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
+FEWEST_TO_CHECK = 50
+CHECK_GROWTH = 0.25
+FEWEST_WITH_OUTLIERS = 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 # largest age of a given start over the fit's memory; until then disturbances change it little

@@ -40,16 +40,16 @@ from avsreplay.outcome import BodyParameters
 from avsreplay.records import BLOCKS, Belief, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
-INERTIA, ARM = slice(12, 17), slice(17, 20)
+INERTIA = slice(12, 17)
+ARM = slice(17, 20)
 ANY_HALF_RAD = 0.5 * float(
     np.sqrt(np.pi**2 / 3.0 + 2.0)
 )  # rms half angle of a uniformly distributed attitude
 # largest 1 sigma of the logarithm of the mass moments; above it the inertia is undetermined
 _LARGEST_1S = 3.0
-_LEAST_GAP, _MOST_MOVED = (
-    0.02,
-    0.1,
-)  # least difference of two values of M, and largest move for its sake [sigma]
+# least difference of two values of M, and largest move for its sake [sigma]
+_LEAST_GAP = 0.02
+_MOST_MOVED = 0.1
 
 
 @value_class

@@ -30,24 +30,20 @@ from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment
 
-_LINE_OF_SIGHT = (
-    0.5  # variance of an error that all views have in common over that of the common errors
-)
+# variance of an error that all views have in common over that of the common errors
+_LINE_OF_SIGHT = 0.5
 _ALL_VIEWS = 0.5  # the same for the systematic part of the covariance of a pose
-_FROM_NOISE, _ALL_SYSTEMATIC = (
-    0.3,
-    0.5,
-)  # mean share up to which it does not count, and from which it counts in full
+# mean share up to which it does not count, and from which it counts in full
+_FROM_NOISE = 0.3
+_ALL_SYSTEMATIC = 0.5
 _RANGES = 0.5  # probability that the ranges of the sensor, and not the model, have the wrong size
-_SIZE_OF_NOISE = (
-    500.0  # error of size that noise causes, over (rms / extent)^2: 30 to 500 on five meshes
-)
+# error of size that noise causes, over (rms / extent)^2: 30 to 500 on five meshes
+_SIZE_OF_NOISE = 500.0
 _SIZE_1S = 1e-3  # standard error of the size from one scan that is added to the stated one
-_LEAST_SCANS, _ALIKE_NEIGHBOURS, _SIGMAS = (
-    12,
-    4.0,
-    4.0,
-)  # scans that show errors; neighbours that count as one; significance
+# scans that show errors; neighbours that count as one; significance
+_LEAST_SCANS = 12
+_ALIKE_NEIGHBOURS = 4.0
+_SIGMAS = 4.0
 _NO_MATRIX = frozen(np.zeros((6, 6)))
 
 

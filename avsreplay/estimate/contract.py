@@ -26,12 +26,18 @@ from avsreplay.parts import LawResult
 from avsreplay.records import Admission, Alignment, AlignStatus, Belief, State
 
 EXTENT_M = 2.0
-POSES, PERIOD_S, BODIES = 80, 0.5, 6
-POSITION_1S_M, ATTITUDE_1S_RAD = 0.002, np.radians(0.1)  # errors of the simulated poses
+POSES = 80
+PERIOD_S = 0.5
+BODIES = 6
+# errors of the simulated poses
+POSITION_1S_M = 0.002
+ATTITUDE_1S_RAD = np.radians(0.1)
 # of the given belief, by block: half angle, rad/s, m, m/s, ratios, m, half angle
 START_1S = np.repeat([0.02, 0.02, 0.02, 0.005, 0.05, 0.02, 0.02], [3, 3, 3, 3, 2, 3, 3])
 SETTLED_POSES = 30  # poses after which the errors are compared with the covariance
-ROUNDING_M, ROUNDING_RAD = 1e-6, 1e-6  # equal but for rounding
+# equal but for rounding
+ROUNDING_M = 1e-6
+ROUNDING_RAD = 1e-6
 MEAN_NEES = (0.3, 2.5)  # allowed mean of the squared error over its variance, per direction
 FORECAST_S = 10.0  # a forecast is compared with the motion this long after the last pose
 SEED = 20

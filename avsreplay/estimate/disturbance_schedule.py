@@ -51,21 +51,18 @@ from avsreplay.geometry import Array
 from avsreplay.records import UNLIKELY, Drift
 from avsreplay.settings import given
 
-FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = (
-    40,
-    10,
-    0.1,
-)  # poses for a test of drift, and between two tests
+# poses for a test of drift, and between two tests
+FEWEST_WITH_DRIFT = 40
+FEWEST_TO_TEST = 10
+DRIFT_GROWTH = 0.1
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
-_DRIFT_OF_SPEED = (
-    5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
-)
+# prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
+_DRIFT_OF_SPEED = 5e-3
 # age of the poses over that at the report of a drift, until which it is tested for as often as
 # before
 _EARLY = 2.0
-_LEAST_EXCESS = (
-    1e-6  # least variance of a belief over that of a pose, less 1, for which the pose is used
-)
+# least variance of a belief over that of a pose, less 1, for which the pose is used
+_LEAST_EXCESS = 1e-6
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5

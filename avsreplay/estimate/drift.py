@@ -43,25 +43,22 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 
-_ONSETS, _FINER = (
-    12,
-    9,
-)  # number of onsets tried, the first at the epoch, and around the most likely one
+# number of onsets tried, the first at the epoch, and around the most likely one
+_ONSETS = 12
+_FINER = 9
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
 # log odds over one step of the velocity and random disturbances: 3 less 0.5, the gain of the
 # likeliest by Wilks' theorem
 _CONSTANT = 2.5
 _MOST_JOINT_FITS = 3  # largest number of joint fits with another onset or kind
-_RELINEARISED_GAIN = (
-    0.5  # decrease of the cost (half chi-square) above which another linearisation follows
-)
+# decrease of the cost (half chi-square) above which another linearisation follows
+_RELINEARISED_GAIN = 0.5
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
-_SMALL_CHANGE = (
-    0.1  # prior 1 sigma of a change that is compared with a drift, over that of a manoeuvre
-)
+# prior 1 sigma of a change that is compared with a drift, over that of a manoeuvre
+_SMALL_CHANGE = 0.1
 _NEGLIGIBLE_ONSET = 1e-3  # probability of an onset hypothesis that is left out
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 

@@ -31,35 +31,32 @@ from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
-_LINEARISATIONS, _SMALL_STEP_SIGMAS = (
-    10,
-    0.1,
-)  # most linearisations; size of a step, in 1 sigma, after which none follows
+# most linearisations; size of a step, in 1 sigma, after which none follows
+_LINEARISATIONS = 10
+_SMALL_STEP_SIGMAS = 0.1
 # size of the first step, in 1 sigma, below which the joint fit is the mean: the likelihood is bent
 # there
 _NEAR = 0.5
-_LAST_STEPS, _LAST_GAIN = (
-    20,
-    0.004,
-)  # most steps of a descent from a motion that is near; least decrease: 0.1 sigma
-_JOINT_STEPS, _LEAST_JOINT_GAIN = (
-    60,
-    0.05,
-)  # most steps of a joint fit; decrease of its cost below which it ends
+# most steps of a descent from a motion that is near; least decrease: 0.1 sigma
+_LAST_STEPS = 20
+_LAST_GAIN = 0.004
+# most steps of a joint fit; decrease of its cost below which it ends
+_JOINT_STEPS = 60
+_LEAST_JOINT_GAIN = 0.05
 # the same as a share of the cost, while the normal points are those of a motion that is still far
 # away
 _COARSE = 0.1
-_DAMPING, _MOST_DAMPING = 1e-3, 1e8  # damping of Levenberg-Marquardt: first value, largest value
-_PIN, _PROFILE_STEPS, _LEAST_PROFILE_RISE = (
-    0.1,
-    20,
-    1.0,
-)  # profile: 1 sigma of the pin, most steps, least increase (2 if Gaussian)
+# damping of Levenberg-Marquardt: first value, largest value
+_DAMPING = 1e-3
+_MOST_DAMPING = 1e8
+# profile: 1 sigma of the pin, most steps, least increase (2 if Gaussian)
+_PIN = 0.1
+_PROFILE_STEPS = 20
+_LEAST_PROFILE_RISE = 1.0
 _JOINT_WORK = 4  # work of a step for each pose, in linearised poses
-_U, _ONSET = (
-    slice(DIM, DIM + 6),
-    DIM + 6,
-)  # the acceleration and its onset after the 20 initial values
+# the acceleration and its onset after the 20 initial values
+_U = slice(DIM, DIM + 6)
+_ONSET = DIM + 6
 
 
 def fit_jointly(

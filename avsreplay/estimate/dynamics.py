@@ -25,7 +25,8 @@ Triple = tuple[float, float, float]
 
 SUBSTEP_RAD = 0.2  # largest rotation of one Taylor series (SUBSTEP in motion.hpp)
 MOST_RAD = 2e4  # largest rotation of a single step [rad]; it takes a few seconds of processor time
-_I3, _I20 = np.eye(3), np.eye(DIM)
+_I3 = np.eye(3)
+_I20 = np.eye(DIM)
 NO_DRIVE = (0.0, 0.0, 0.0)  # no angular acceleration
 
 
@@ -35,7 +36,9 @@ def _diagonal(rows: slice, columns: slice) -> slice:
     return slice(first, first + 2 * DIM + 3, DIM + 1)
 
 
-_POSITION, _MIXED, _VELOCITY = _diagonal(RHO, RHO), _diagonal(RHO, VEL), _diagonal(VEL, VEL)
+_POSITION = _diagonal(RHO, RHO)
+_MIXED = _diagonal(RHO, VEL)
+_VELOCITY = _diagonal(VEL, VEL)
 _MIXED_MIRROR = _diagonal(VEL, RHO)
 _TRANSLATION = slice(RHO.start, VEL.stop)
 

@@ -22,9 +22,8 @@ DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
 # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
 ROUNDING = 1e-9
-_LEAST_ROOT_EIGENVALUE = (
-    1e-9  # least eigenvalue of a product of a root with itself, in the same units
-)
+# least eigenvalue of a product of a root with itself, in the same units
+_LEAST_ROOT_EIGENVALUE = 1e-9
 _SMALLEST = 1e-300 * np.eye(DIM)
 # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 LARGEST_MOVE = 1e3

@@ -37,26 +37,22 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array
 from avsreplay.records import Belief
 
-OVER_FREE, OVER_NEXT = (
-    3.0,
-    2.0,
-)  # log odds over free motion and over the next hypothesis of an early decision
+# log odds over free motion and over the next hypothesis of an early decision
+OVER_FREE = 3.0
+OVER_NEXT = 2.0
 # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _NONLINEAR = 2.0
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
-_MANOEUVRE_INSTANTS, _FEWER, _LONG = (
-    8,
-    4,
-    9,
-)  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
-_LONGEST_SPREAD = (
-    6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
-)
-_FINE, _REFINEMENTS, _NEGLIGIBLE_EVIDENCE = (
-    16,
-    5,
-    1e-4,
-)  # instants of a refined grid, refinements, share of evidence neglected
+# instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
+_MANOEUVRE_INSTANTS = 8
+_FEWER = 4
+_LONG = 9
+# latest scans over whose intervals a manoeuvre that is not instantaneous may extend
+_LONGEST_SPREAD = 6
+# instants of a refined grid, refinements, share of evidence neglected
+_FINE = 16
+_REFINEMENTS = 5
+_NEGLIGIBLE_EVIDENCE = 1e-4
 # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
 _TAIL = 0.05
 _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
@@ -70,9 +66,8 @@ _SPREAD = (
 # log of the prior odds of a manoeuvre over random disturbances that begin within the scans: 1 to
 # 0.01
 _BEGINS = 4.6
-_PER_S = (
-    0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
-)
+# prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
+_PER_S = 0.02
 
 Ranked = tuple[tuple[Epoch, ...], list[Explanation]]
 """Scans and the hypotheses about them, most likely first."""

@@ -44,8 +44,10 @@ from avsreplay.records import Belief, State
 from avsreplay.settings import given
 
 _PAIR_RAD = 0.7
-_DRAWS, _EDGE = 500, 0.99
-_LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
+_DRAWS = 500
+_EDGE = 0.99
+_LEVEL_STEPS = 20
+_LEVEL_TOL = 0.1
 # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 _DETERMINED = 0.5
 

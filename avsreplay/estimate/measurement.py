@@ -150,9 +150,8 @@ def _difference(position: Triple, other: Triple, q: Quad) -> Array:
     return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
 
 
-_LEAST_REPAIRED_EIGENVALUE = (
-    1e-12  # least eigenvalue of a repaired covariance, in units of its variances
-)
+# least eigenvalue of a repaired covariance, in units of its variances
+_LEAST_REPAIRED_EIGENVALUE = 1e-12
 
 
 def innovation_of(

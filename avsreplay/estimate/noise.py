@@ -32,20 +32,17 @@ from avsreplay.records import Alignment, Belief, Innovation, State
 BOUND = 52.4  # 99.99 % point of chi-square with 20 degrees of freedom, for a state
 NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
-_FREE_RAD = (
-    1.0  # standard deviation of an attitude direction that a degenerate view does not determine
-)
+# standard deviation of an attitude direction that a degenerate view does not determine
+_FREE_RAD = 1.0
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
 _LEVEL_DOF = 10.0  # degrees of freedom with which the level of the last fit counts in the window
 _MOST_COMMON_SHARE = 0.8  # largest share from errors of the model: the views of two scans differ
 _LAGS = (5, 10, 20, 40)
-_CALM = (
-    7.0  # log likelihood ratio of the usual noise over the risen one from which the rise has ended
-)
+# log likelihood ratio of the usual noise over the risen one from which the rise has ended
+_CALM = 7.0
 _EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
-_MOST_ALIKE = (
-    50.0  # largest number of scans with correlated errors, reached where the view does not turn
-)
+# largest number of scans with correlated errors, reached where the view does not turn
+_MOST_ALIKE = 50.0
 
 
 def integrated_autocorrelation(e: Array) -> float:

@@ -50,13 +50,14 @@ from avsreplay.geometry import Array
 
 MOST_NORMAL_POINTS = 24  # normal points of an estimate
 FEWEST = 12  # poses from which the levels are estimated
-_CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
+# weight of the prior of the independent and of the common errors
+_CLAIMED_DOF = 6.0
+_LAW_DOF = 1.0
 _STEP = 3.0  # largest factor on a variance in one step
 _VANISHING_PART = 0.3  # part of its standard deviation below which a disturbance may become zero
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
-_WORK = (
-    2 * MOST_NORMAL_POINTS**3
-)  # sum of cubes of the numbers of points over the steps of an estimate
+# sum of cubes of the numbers of points over the steps of an estimate
+_WORK = 2 * MOST_NORMAL_POINTS**3
 _MOST_STEPS = 6
 _ESTABLISHED = 3.0  # log evidence of a random disturbance that the poses show
 # the same from which it is reported: the poses of free bodies reach it in none of 40 logs

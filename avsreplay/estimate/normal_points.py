@@ -23,10 +23,9 @@ from avsreplay.estimate.noise import cholesky_root
 from avsreplay.geometry import Array
 from avsreplay.records import Manoeuvre
 
-_POINTS, _SPAN_RAD = (
-    128,
-    0.25,
-)  # most normal points, and least rotation over which poses are joined [rad]
+# most normal points, and least rotation over which poses are joined [rad]
+_POINTS = 128
+_SPAN_RAD = 0.25
 _MOST_UNJOINED = 48  # poses up to which none are joined
 _NEIGHBOURS = 5  # poses with whose median a pose is compared
 # squared difference of a gross error over the median of all poses, or over its expectation

@@ -14,9 +14,8 @@ from avsreplay.settings import Settings, Tables, are_orthonormal, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-_PER_POSE = (
-    0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
-)
+# largest motion expected between two poses of a tracker: radian, or part of the extent
+_PER_POSE = 0.25
 
 
 class NoiseSource(Enum):

@@ -14,19 +14,16 @@ from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.scan_window import PRIOR_ODDS, log_mean
 from avsreplay.geometry import Array, conjugate, log, multiply
 
-FEWEST_DISTURBED, MOST_DISTURBED = (
-    5,
-    8,
-)  # poses from which disturbances are estimated without a model of the motion
-_DENSITIES, _ERRORS = (
-    np.logspace(-6.0, 2.0, 81),
-    np.logspace(0.0, 4.0, 41),
-)  # compared; errors over the claimed ones
+# poses from which disturbances are estimated without a model of the motion
+FEWEST_DISTURBED = 5
+MOST_DISTURBED = 8
+# compared; errors over the claimed ones
+_DENSITIES = np.logspace(-6.0, 2.0, 81)
+_ERRORS = np.logspace(0.0, 4.0, 41)
 _LONGEST = 3.0  # interval between two of them over the median
-_MOST_TURN, _MOST_MOVE = (
-    0.35,
-    0.1,
-)  # change of the step between poses: angle [rad], and length over the extent
+# change of the step between poses: angle [rad], and length over the extent
+_MOST_TURN = 0.35
+_MOST_MOVE = 0.1
 
 
 def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:

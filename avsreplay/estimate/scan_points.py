@@ -21,10 +21,9 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array
 
 FEWEST_KEPT = 12  # accepted scans that are kept at least, and up to which none are combined
-_KEPT_SCANS_S, _MOST_KEPT = (
-    5.0,
-    64,
-)  # accepted scans that are kept: those within this time, so many at most
+# accepted scans that are kept: those within this time, so many at most
+_KEPT_SCANS_S = 5.0
+_MOST_KEPT = 64
 # latest accepted scans that are not combined; of the older points two each have 2, 4, 8 ... scans
 _SINGLE = 4
 

@@ -48,7 +48,8 @@ SCALES = (
     0.1,
     0.01,
 )  # factors on a prior standard deviation: a large, a small or a very small error or change
-_ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
+_ZERO = frozen(np.zeros(6))
+_NO_COVARIANCE = frozen(np.zeros((6, 6)))
 
 
 class Hypothesis(Enum):

@@ -34,9 +34,8 @@ from avsreplay.geometry import Array
 _MOST_COMPARED = 12  # scans of a bias that are compared
 # 1 sigma of the change of an offset from scan to scan, because the view changes, over its size
 _VARIES = 0.02
-_QUIETER = (
-    1.5  # least rms residual before and during an error over that of a scan which shows its end
-)
+# least rms residual before and during an error over that of a scan which shows its end
+_QUIETER = 1.5
 
 Windowed = Callable[[tuple[Epoch, ...], int], Window]
 """Scans, of which as many as stated are accepted, about the motion predicted from before

@@ -22,16 +22,15 @@ from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
-_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = (
-    5,
-    61,
-    5.348,
-)  # NIS values for the scale; median of chi-square with 6 degrees
-_READY, _READY_AFTER_MANOEUVRE = (
-    8,
-    3,
-)  # least number of poses of an estimate whose prediction can be tested
-_NO_NOISE, _NO_MOTION = frozen(np.zeros((6, 6))), frozen(np.zeros((6, 0)))
+# NIS values for the scale; median of chi-square with 6 degrees
+_FEWEST_NIS = 5
+_MOST_NIS = 61
+_MEDIAN_CHI2 = 5.348
+# least number of poses of an estimate whose prediction can be tested
+_READY = 8
+_READY_AFTER_MANOEUVRE = 3
+_NO_NOISE = frozen(np.zeros((6, 6)))
+_NO_MOTION = frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
 # largest change of the other rotations if a rotation that is first determined turns the track
 _TURN_WITHIN_RAD = 0.2

@@ -150,7 +150,11 @@ def solve(p: Subproblem) -> Solution | None:
     return Solution(h, found[2] * (scale / h**2), scale * max(found[1], 0.0))
 
 
-_Q, _H, _SLACK, _W = 3, 6, 7, 8  # first columns
+# first columns
+_Q = 3
+_H = 6
+_SLACK = 7
+_W = 8
 
 
 def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:

@@ -52,19 +52,16 @@ from avsreplay.plan.withdrawal import COAST_S, Space, Tried, certified, safety
 MOST_ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
-ROUGH_TOLERANCE = (
-    2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
-)
+# the same while initial paths are compared, and where an earlier plan is renewed
+ROUGH_TOLERANCE = 2e-3
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
-RENEWED_LATER, RENEWED_LATER_S = (
-    1.02,
-    0.1,
-)  # a renewed plan that is later than the earlier one by more starts the full search
+# a renewed plan that is later than the earlier one by more starts the full search
+RENEWED_LATER = 1.02
+RENEWED_LATER_S = 0.1
 # time that is spared where the withdrawals from the earliest path miss margins, over its time to go
 SPARE = (5e-3, 2e-2)
-NEAR_REFERENCE = (
-    0.02  # relative change of the end time below which the excess tightens the constraints
-)
+# relative change of the end time below which the excess tightens the constraints
+NEAR_REFERENCE = 0.02
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
@@ -75,9 +72,8 @@ TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
 SHORT_S_PER_M = 20.0  # time that a shortage of withdrawals costs when paths are compared
 IDLE = 3  # the iterations end when the best path has not become better in as many
-STUCK = (
-    4  # from this iteration on an initial path without a plan ends where the slack does not shrink
-)
+# from this iteration on an initial path without a plan ends where the slack does not shrink
+STUCK = 4
 
 
 def constrained(
@@ -354,12 +350,12 @@ def _safest_of(paths: Iterable[StepPath | None], enough_m: float = 0.0) -> StepP
     """Return the first path whose withdrawals miss at most ``enough_m``; without one, the path that
     is the best by what it misses and its time.
     """
-    known = list[StepPath]()
-    for path in paths:
-        known += [] if path is None else [path]
-        if known and min(known, key=_safest).short_m <= enough_m:
+    best: StepPath | None = None
+    for path in filter(None, paths):
+        best = path if best is None else min(best, path, key=_safest)
+        if best.short_m <= enough_m:
             break
-    return min(known, key=_safest, default=None)
+    return best
 
 
 def _near(case: Case, free: Plan, drafts: list[StepPath]) -> list[ReferencePath]:

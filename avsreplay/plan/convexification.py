@@ -46,9 +46,8 @@ COARSE_NODES = 16  # least number of thrust intervals while initial paths are co
 COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
 MOST_TURN_RAD = 0.5  # the target may turn by this much between two iterations
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
-RESERVE = (
-    3.0  # margin at the checked instants in units of the buffer, for the instants between them
-)
+# margin at the checked instants in units of the buffer, for the instants between them
+RESERVE = 3.0
 # a constraint with a larger margin at the reference, in units of the buffer, is left out of the
 # programme
 FAR = 2e4
@@ -57,9 +56,8 @@ SOFT = 1.0
 # margin of withdrawals that the programme requires, in resolutions of their certificate
 RESERVE_RESOLUTIONS = 0.5
 BUFFER_OF_EXTENT = 1e-5  # length below which an excess is rounding
-THRUST_SHARE = (
-    1.0 - 1e-5
-)  # share of a_max used by the cone programme; the rest corrects the terminal errors
+# share of a_max used by the cone programme; the rest corrects the terminal errors
+THRUST_SHARE = 1.0 - 1e-5
 TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the grasp point
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
@@ -278,7 +276,7 @@ def expected_s(case: Case, path: RobotPath, since_s: float) -> float:
 
 def largest_change(case: Case, reference: ReferencePath, most: float) -> float:
     """Return the largest relative change of the end time, at most ``most``: the target may
-    turn by TURN_RAD.
+    turn by MOST_TURN_RAD.
     """
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
     return float(min(most, MOST_TURN_RAD / max(turn, 1e-9)))

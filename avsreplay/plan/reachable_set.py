@@ -36,10 +36,9 @@ _POSITIVE = np.array(
 _OF_POSITIVE = np.array(
     [0.36268378337836166, 0.3137066458778869, 0.22238103445337443, 0.10122853629037706]
 )
-_NODES, _WEIGHTS = (
-    np.r_[-_POSITIVE[::-1], _POSITIVE],
-    np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE],
-)  # Gauss-Legendre
+# Gauss-Legendre
+_NODES = np.r_[-_POSITIVE[::-1], _POSITIVE]
+_WEIGHTS = np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE]
 _GAUSS_S = 0.5 * (_NODES + 1.0)
 _GAUSS_W = 0.5 * _WEIGHTS
 _GAUSS_NODES = np.stack([_GAUSS_S, _GAUSS_W])

@@ -28,12 +28,10 @@ MAX_STEPS = 4000  # of the search, about 0.3 ms each: its work is bounded, not i
 # the goal is sampled over this time span at once, then over ever longer ones; most captures need
 # no more
 STRETCH_S = 30.0
-NEAR_ROOT = (
-    1e-2  # where a* exceeds a_max by less than this fraction, Newton's method finishes the search
-)
-GAP_LIMIT_S = (
-    1e-6  # where t_f exceeds its lower bound by more, the certified steps continue to the root
-)
+# where a* exceeds a_max by less than this fraction, Newton's method finishes the search
+NEAR_ROOT = 1e-2
+# where t_f exceeds its lower bound by more, the certified steps continue to the root
+GAP_LIMIT_S = 1e-6
 RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in metres per second
 
 

@@ -185,10 +185,14 @@ _COMPARE: Mapping[str, Callable[[float, float], bool]] = MappingProxyType(
 )
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
-_MOVING, _AT_REST = Condition("moving", "==", 1), Condition("moving", "==", 0)
-_HEALTHY, _FAULTY = Condition("gamma", "==", 1), Condition("gamma", "==", 0)
-_AT_END, _HOLDING = Condition("t_go_s", "<=", "commit_s"), Condition("holding", "==", 1)
-_ACCURATE, _INACCURATE = Condition("error_ratio", "<=", 1.0), Condition("error_ratio", ">", 1.0)
+_MOVING = Condition("moving", "==", 1)
+_AT_REST = Condition("moving", "==", 0)
+_HEALTHY = Condition("gamma", "==", 1)
+_FAULTY = Condition("gamma", "==", 0)
+_AT_END = Condition("t_go_s", "<=", "commit_s")
+_HOLDING = Condition("holding", "==", 1)
+_ACCURATE = Condition("error_ratio", "<=", 1.0)
+_INACCURATE = Condition("error_ratio", ">", 1.0)
 
 RULES: tuple[Rule, ...] = (
     Rule("aborted", Action.ABORT, (Condition("aborted", "==", 1),), "an abort is final"),

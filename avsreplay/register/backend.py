@@ -47,20 +47,17 @@ TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 NO_LIMIT = 2**62  # of point searches
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
-SETTLED_ERROR_OF_GATE, RADIUS_OF_EXTENT = (
-    0.05,
-    0.25,
-)  # of the rejection distance over the root of the points; usual rms radius
+# of the rejection distance over the root of the points; usual rms radius
+SETTLED_ERROR_OF_GATE = 0.05
+RADIUS_OF_EXTENT = 0.25
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
-ROUGH_OF_GATE = (
-    0.375  # with a larger rms distance of these points, in gates, the fit of the scan is not close
-)
+# with a larger rms distance of these points, in gates, the fit of the scan is not close
+ROUGH_OF_GATE = 0.375
 # a scan of fewer points has the budget of this many, because its target may be mostly hidden
 LEAST_BUDGET_POINTS = 2000
-ALIGN_WORK, WITHIN_WORK = (
-    (20_000, 8),
-    (30_000, 15),
-)  # most work of an alignment (fixed, per point); with a fixed gate
+# most work of an alignment (fixed, per point); with a fixed gate
+ALIGN_WORK = (20_000, 8)
+WITHIN_WORK = (30_000, 15)
 
 
 @value_class

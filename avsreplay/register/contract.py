@@ -32,17 +32,15 @@ from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 SCAN_POINTS = 3000
-STOPPED_RAD, STOPPED_OF_EXTENT = (
-    np.radians(0.01),
-    5e-5,
-)  # equal except for rounding and the stopping rule
+# equal except for rounding and the stopping rule
+STOPPED_RAD = np.radians(0.01)
+STOPPED_OF_EXTENT = 5e-5
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20
 DETAIL = 200  # characters of a detail
-HESSIAN_STEP, HESSIAN_WITHIN = (
-    1e-4,
-    0.03,
-)  # step in shares of the extent; relative error, mostly of points at edges
+# step in shares of the extent; relative error, mostly of points at edges
+HESSIAN_STEP = 1e-4
+HESSIAN_WITHIN = 0.03
 
 # centre [m], edge lengths [m], rotation vector [rad] of each box: disjoint, all different, no
 # symmetry

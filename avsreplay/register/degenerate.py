@@ -20,9 +20,8 @@ from avsreplay.register.covariance import Evidence
 
 # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 FREE_BELOW = 1e-3
-AXIS_WITHIN = (
-    0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
-)
+# cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+AXIS_WITHIN = 0.966
 
 
 @value_class

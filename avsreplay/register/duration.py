@@ -41,12 +41,13 @@ from avsreplay.register.size import (
 )
 from avsreplay.register.surface_index import SurfaceIndex
 
-MEASURED_EVERY, MOST_MEASURED, LEAST_SCANS = (
-    2,
-    24,
-    8,
-)  # aligned scans of which one is measured at first; measured scans
-BIAS_SCANS, JACKKNIFE_BLOCKS = 4, 6  # scans for the bias of the noise, and blocks of the jackknife
+# aligned scans of which one is measured at first; measured scans
+MEASURED_EVERY = 2
+MOST_MEASURED = 24
+LEAST_SCANS = 8
+# scans for the bias of the noise, and blocks of the jackknife
+BIAS_SCANS = 4
+JACKKNIFE_BLOCKS = 6
 MOST_WEIGHT = 4.0  # largest weight of a scan for the size, in units of the median weight
 LEAST_OF_PERIOD = 0.02  # least duration that is reported, over the period
 

@@ -33,13 +33,13 @@ from avsreplay.register.surface_index import kernel_module
 
 RAYS = 2000  # of a scan, with which poses are compared
 OBSERVATION_OF_EXTENT = 0.03  # side of the cubes of the model whose rays are one observation
-MEASURED_OF_EXTENT, BESIDE_OF_EXTENT = (
-    0.05,
-    0.04,
-)  # distances that are measured, and that are beside
+# distances that are measured, and that are beside
+MEASURED_OF_EXTENT = 0.05
+BESIDE_OF_EXTENT = 0.04
 # width over the extent over which the points of a wrong minimum are spread, and the least spread of
 # a right one
-WRONG_SPREAD_OF_EXTENT, RIGHT_SPREAD_OF_EXTENT = 0.006, 0.001
+WRONG_SPREAD_OF_EXTENT = 0.006
+RIGHT_SPREAD_OF_EXTENT = 0.001
 CONTRADICTING_PATCHES = 0.03  # share of the patches of the right pose that contradict it
 SHARES = 0.3  # weight of the shares of patches that are on the model, hidden, and not measured
 CONTINUES = 0.02  # share of the edges of the right pose beyond which the surface continues
@@ -48,14 +48,20 @@ NORMAL_QUANTILES = np.array(
     [0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485]
 )  # for a standard normal
 REFINEMENTS = 2
-LEAST_NOISE, MOST_NOISE = 0.0006, 0.012  # noise over the extent
-THROUGH, THROUGH_OF_EXTENT = 4.0, 0.012  # a ray passed through: so many sigmas, and at least
+# noise over the extent
+LEAST_NOISE = 0.0006
+MOST_NOISE = 0.012
+# a ray passed through: so many sigmas, and at least
+THROUGH = 4.0
+THROUGH_OF_EXTENT = 0.012
 NEIGHBOURS = 8  # returns next to one in the image, of which so many
-ISOLATED, ISOLATED_OF_EXTENT, SPACINGS = 2, 0.03, 2.5  # are near it, and how near
-REGION_OF_EXTENT, SAME_PLACE = (
-    0.75,
-    0.1,
-)  # extents around the middle of the model, and between such places
+# are near it, and how near
+ISOLATED = 2
+ISOLATED_OF_EXTENT = 0.03
+SPACINGS = 2.5
+# extents around the middle of the model, and between such places
+REGION_OF_EXTENT = 0.75
+SAME_PLACE = 0.1
 HOLE = 1.4  # a direction has no return if none is within so many spacings of the rays
 PIXELS = 70  # of the image of the model at most, along its longer side
 EXPECTED_COSINE = 0.2  # of the incidence at which a return is expected
@@ -63,7 +69,9 @@ LEAST_RAYS_NEAR = 20  # near the model; with fewer a pose is not measured
 NEIGHBOUR_OF_EXTENT = 0.1  # neighbouring rays whose points on the model are nearer share an error
 BEFORE_OF_EXTENT = 0.25  # a return that hides the model is this much nearer, as a rule
 IMAGE_POINTS = 800  # of the model, which bound its image
-LEAST_MEAN, LEAST_SURE = 0.8, 1.0  # of the log likelihood ratio per patch: accepted, ends a search
+# of the log likelihood ratio per patch: accepted, ends a search
+LEAST_MEAN = 0.8
+LEAST_SURE = 1.0
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
 LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may be elsewhere
 # Log likelihood ratio of the edges of the model below which another surface was measured. The

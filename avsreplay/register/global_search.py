@@ -37,88 +37,75 @@ from avsreplay.register.sampling import (
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.visibility import VisibleCentroids
 
-COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = (
-    100,
-    300,
-    1500,
-)  # points: first and second selection, final ranking
-COARSE_PASSES, MIDDLE_PASSES = (
-    8,
-    12,
-)  # point-to-plane iterations for each attitude in the two selections
-MIDDLE_STARTS, FINE_STARTS = (
-    50,
-    10,
-)  # attitudes kept for the second selection, and poses registered on the model
-MODEL_POINTS, CELLS = 3000, 40  # sampled from the model; cells of the grid along its diagonal
-COARSE_OF_EXTENT, MIDDLE_OF_EXTENT, MOST_OF_EXTENT = (
-    0.03,
-    0.02,
-    0.05,
-)  # distances of unexplained points; the largest
-FIRST_GATE_OF_EXTENT, GATE_FALL = (
-    0.3,
-    0.7,
-)  # rejection distance of the first pass, and its factor from pass to pass
-FIRST_PASSES, KEPT_AFTER_FIRST = (
-    2,
-    3,
-)  # after two passes with part of the points one start in three is kept
-SECOND_PASSES, KEPT_AFTER_SECOND = (
-    2,
-    8,
-)  # after two more passes with all of them one start in eight is kept
-MIDDLE_FIRST, MIDDLE_STRIDE, KEPT_IN_MIDDLE = (
-    4,
-    2,
-    20,
-)  # passes with every second point, after which so many are left
-FIRST_STRIDES, THINNED = (
-    (2, 3, 3),
-    (1, 2, 2),
-)  # every n-th point, and every n-th attitude, by the round
-SYMMETRIC, SYMMETRIES = (
-    0.3,
-    6,
-)  # largest unexplained share of the surface turned onto itself; most motions tried
+# points: first and second selection, final ranking
+COARSE_POINTS = 100
+MIDDLE_POINTS = 300
+FINE_POINTS = 1500
+# point-to-plane iterations for each attitude in the two selections
+COARSE_PASSES = 8
+MIDDLE_PASSES = 12
+# attitudes kept for the second selection, and poses registered on the model
+MIDDLE_STARTS = 50
+FINE_STARTS = 10
+# sampled from the model; cells of the grid along its diagonal
+MODEL_POINTS = 3000
+CELLS = 40
+# distances of unexplained points; the largest
+COARSE_OF_EXTENT = 0.03
+MIDDLE_OF_EXTENT = 0.02
+MOST_OF_EXTENT = 0.05
+# rejection distance of the first pass, and its factor from pass to pass
+FIRST_GATE_OF_EXTENT = 0.3
+GATE_FALL = 0.7
+# after two passes with part of the points one start in three is kept
+FIRST_PASSES = 2
+KEPT_AFTER_FIRST = 3
+# after two more passes with all of them one start in eight is kept
+SECOND_PASSES = 2
+KEPT_AFTER_SECOND = 8
+# passes with every second point, after which so many are left
+MIDDLE_FIRST = 4
+MIDDLE_STRIDE = 2
+KEPT_IN_MIDDLE = 20
+# every n-th point, and every n-th attitude, by the round
+FIRST_STRIDES = (2, 3, 3)
+THINNED = (1, 2, 2)
+# largest unexplained share of the surface turned onto itself; most motions tried
+SYMMETRIC = 0.3
+SYMMETRIES = 6
 # a point that an exact symmetry carries is this near the surface; share of points that may not be
-CARRIED_OF_EXTENT, MOST_UNCARRIED = 0.002, 0.02
-TURNED_PASSES, TURNED_RIVALS = 6, 2
-RIVALS, RIVAL_WITHIN = (
-    6,
-    0.15,
-)  # poses that are registered to the end: share of unexplained points over the least
+CARRIED_OF_EXTENT = 0.002
+MOST_UNCARRIED = 0.02
+TURNED_PASSES = 6
+TURNED_RIVALS = 2
+# poses that are registered to the end: share of unexplained points over the least
+RIVALS = 6
+RIVAL_WITHIN = 0.15
 # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
 FAVOURED = 5.0
 LAST_FINE_POINTS = 500  # fine points with which the last poses are registered
-ENDED_RAD, ENDED_OF_EXTENT = (
-    1e-4,
-    1e-4,
-)  # a pass that moves the pose by less ends a registration, as poses are compared
-FIRST_FINE, FINE_PASSES = (
-    5,
-    15,
-)  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
-RIVAL_AFTER, MOST_RIVALS = (
-    0.05,
-    4,
-)  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS, ROUND_WORK = (
-    6,
-    28_000,
-)  # look-ups in the grid that cost as much as a search on the model; cost of a round
+# a pass that moves the pose by less ends a registration, as poses are compared
+ENDED_RAD = 1e-4
+ENDED_OF_EXTENT = 1e-4
+# passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
+FIRST_FINE = 5
+FINE_PASSES = 15
+# poses that are registered to the end, as RIVAL_WITHIN, and how many at most
+RIVAL_AFTER = 0.05
+MOST_RIVALS = 4
+# look-ups in the grid that cost as much as a search on the model; cost of a round
+LOOK_UPS = 6
+ROUND_WORK = 28_000
 # with less work left than so many usual rounds, the last poses are registered with half of the
 # points
 SHORT = 1.5
-REGISTERED_SHARE, REGISTERED_WORK = (
-    0.8,
-    10,
-)  # of the work left, for the last poses; usual cost for each fine point
+# of the work left, for the last poses; usual cost for each fine point
+REGISTERED_SHARE = 0.8
+REGISTERED_WORK = 10
 DIFFERENT_STARTS = 0.6  # usual share of different starts
-SHIFTS, SHIFT_OF_EXTENT = (
-    6,
-    0.3,
-)  # number and size of the shifts of the starts across the direction to the camera
+# number and size of the shifts of the starts across the direction to the camera
+SHIFTS = 6
+SHIFT_OF_EXTENT = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

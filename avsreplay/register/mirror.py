@@ -37,62 +37,51 @@ from avsreplay.register.sampling import directions, sample_evenly
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
-MOST_REFLECTED, DIRECTION_COSINE = (
-    6,
-    np.cos(np.radians(30.0)),
-)  # scans that are compared, from directions so far apart
+# scans that are compared, from directions so far apart
+MOST_REFLECTED = 6
+DIRECTION_COSINE = np.cos(np.radians(30.0))
 REFLECTED_POINTS = 600  # of a scan, with which the poses are chosen and refined
-MIRROR_PLANES, PLANE_TEST_POINTS, REFLECTED_SURFACE_POINTS = (
-    200,
-    100,
-    400,
-)  # planes, and points of the surface that are reflected
-NEAR_PLANES, PLANES_APART = (
-    16,
-    np.cos(np.radians(12.0)),
-)  # planes that are registered, with normals so far apart
-REFLECTIONS, SAME_TRACE = (
-    6,
-    1.0 + 2.0 * np.cos(np.radians(5.0)),
-)  # most reflections, and rotation between them
-TRUNCATION_OF_EXTENT, ROUGHLY, UNCARRIED = (
-    0.03,
-    0.5,
-    0.3,
-)  # truncation of distances; largest mean after each stage
+# planes, and points of the surface that are reflected
+MIRROR_PLANES = 200
+PLANE_TEST_POINTS = 100
+REFLECTED_SURFACE_POINTS = 400
+# planes that are registered, with normals so far apart
+NEAR_PLANES = 16
+PLANES_APART = np.cos(np.radians(12.0))
+# most reflections, and rotation between them
+REFLECTIONS = 6
+SAME_TRACE = 1.0 + 2.0 * np.cos(np.radians(5.0))
+# truncation of distances; largest mean after each stage
+TRUNCATION_OF_EXTENT = 0.03
+ROUGHLY = 0.5
+UNCARRIED = 0.3
 TO_MODEL = (
     (0.12, 5),
     (0.05, 5),
     (0.02, 5),
 )  # rejection distances [extent] and passes of a reflected surface
 TO_SCAN = ((0.03, 4), (0.015, 4), (0.008, 6))  # and of a scan
-REFINED_REFLECTIONS, TRIED_OF_EXTENT = (
-    2,
-    0.02,
-)  # reflections of which a scan is refined, and truncation to choose them
-NOISE, LEAST_OF_EXTENT, MOST_OF_EXTENT = (
-    3.0,
-    0.003,
-    0.05,
-)  # truncation: noise, least; largest distance measured
-PATCH_OF_EXTENT, OFF_PLANES, PATCH_POINTS = (
-    0.05,
-    0.381966,
-    4,
-)  # side of a patch, its offset, and fewest points
+# reflections of which a scan is refined, and truncation to choose them
+REFINED_REFLECTIONS = 2
+TRIED_OF_EXTENT = 0.02
+# truncation: noise, least; largest distance measured
+NOISE = 3.0
+LEAST_OF_EXTENT = 0.003
+MOST_OF_EXTENT = 0.05
+# side of a patch, its offset, and fewest points
+PATCH_OF_EXTENT = 0.05
+OFF_PLANES = 0.381966
+PATCH_POINTS = 4
 CONTRADICTING_SHAPE = 0.1  # share of the patches that contradict the true shape
-MIRROR_LOG_RATIO, MOST_AGAINST = (
-    6.0,
-    0.25,
-)  # log likelihood ratio that decides; patches against over those for it
+# log likelihood ratio that decides; patches against over those for it
+MIRROR_LOG_RATIO = 6.0
+MOST_AGAINST = 0.25
 ENOUGH = 3  # scans that decide for the model, after which no more are compared
-MOST_OFF = (
-    0.1  # share of the points off the model, above which the mirror image of one scan is searched
-)
-TESTED_POINTS, LEAST_FACING = (
-    200,
-    0.4,
-)  # points of which so many must be on faces towards the sensor
+# share of the points off the model, above which the mirror image of one scan is searched
+MOST_OFF = 0.1
+# points of which so many must be on faces towards the sensor
+TESTED_POINTS = 200
+LEAST_FACING = 0.4
 
 
 @value_class

@@ -85,28 +85,26 @@ __all__ = [
 ]
 
 CHECKED_POINTS = 1500  # points used of each scan
-_LEAST_RUN_ERROR = (
-    0.001  # least error of size that is reported; a single scan cannot show so small a one
-)
-CHECKED_EVERY, MOST_CHECKED, LEAST_SCANS = 3, 60, 8
+# least error of size that is reported; a single scan cannot show so small a one
+_LEAST_RUN_ERROR = 0.001
+CHECKED_EVERY = 3
+MOST_CHECKED = 60
+LEAST_SCANS = 8
 ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that would be reported
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 _MIRRORED = (
     "so that an axis of the model or of the points is inverted: add --model-mirror (if it is given,"
     " remove it)"
 )
-_SEEN_POINTS, _DURATION_POINTS = (
-    2000,
-    800,
-)  # of a scan: compared with the mirror image, and for its duration
-_PLACE_EVERY, _LEAST_PLACES = (
-    2,
-    12,
-)  # scans of which one gives a place, and places that give the size
+# of a scan: compared with the mirror image, and for its duration
+_SEEN_POINTS = 2000
+_DURATION_POINTS = 800
+# scans of which one gives a place, and places that give the size
+_PLACE_EVERY = 2
+_LEAST_PLACES = 12
 _PLACE_POINTS = 500  # points of each
-_LEAST_EXPLAINED = (
-    0.5  # least share, explained by the size, of what a uniform motion leaves of the places
-)
+# least share, explained by the size, of what a uniform motion leaves of the places
+_LEAST_EXPLAINED = 0.5
 _NOTED = 0.5  # least share of systematic errors that is reported
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged

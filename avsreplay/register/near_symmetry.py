@@ -28,11 +28,10 @@ from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetr
 from avsreplay.register.work import TEST_WORK, healthy_work
 
 MARKS_VERSION = 12  # version of the kept data of a model
-SAMPLES, MARK_DENSITY, MOST_MARKS = (
-    4000,
-    5,
-    500,
-)  # points to find marks, times as many around them, kept
+# points to find marks, times as many around them, kept
+SAMPLES = 4000
+MARK_DENSITY = 5
+MOST_MARKS = 500
 # Most work of a search of all samples [point searches]: of a model with long thin faces, at which
 # a search costs up to a hundred times as much, fewer points are sampled, which misses small marks.
 SAMPLES_WORK = 40_000
@@ -44,14 +43,14 @@ ON_MODEL_OF_EXTENT = 0.004
 MARK_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 # an exact symmetry carries all but this share of the surface to within this of it, over the extent
-EXACT_OF_EXTENT, MOST_INEXACT = 5e-4, 5e-4
+EXACT_OF_EXTENT = 5e-4
+MOST_INEXACT = 5e-4
 LEAST_OFF_MODEL = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
 RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
-MOST_COMPARED_POINTS, SCREENED = (
-    6000,
-    150,
-)  # points of the scan; those on and off the model with which all motions are compared
+# points of the scan; those on and off the model with which all motions are compared
+MOST_COMPARED_POINTS = 6000
+SCREENED = 150
 
 
 class NearSymmetry:

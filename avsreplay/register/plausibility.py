@@ -31,16 +31,14 @@ from avsreplay.register.surface_index import kernel_module
 
 SURFACE_POINTS = 1500
 NOISE_OF_EXTENT = 0.012  # with more noise than this a pose is not registered to the whole scan
-LEAST_SCAN_OF_EXTENT = (
-    0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
-)
+# a smaller scan is about as large as the rejection distance, and any face explains it
+LEAST_SCAN_OF_EXTENT = 0.05
 SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
 # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
 PREDICTED = 1.0
-HIDDEN_NEAR_OF_EXTENT, MOST_HIDDEN = (
-    0.05,
-    0.5,
-)  # where fewer points are nearer, the noise at a predicted pose is theirs
+# where fewer points are nearer, the noise at a predicted pose is theirs
+HIDDEN_NEAR_OF_EXTENT = 0.05
+MOST_HIDDEN = 0.5
 # a scan narrower than so much of the model, in one of four directions of the image, shows a part of
 # it
 PARTIAL_IMAGE = 0.8

@@ -34,27 +34,26 @@ from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, GradeRule, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
-WELL_OFF, PART = (
-    2.0,
-    1000,
-)  # gates from which a point is well off; points per which those are counted
+# gates from which a point is well off; points per which those are counted
+WELL_OFF = 2.0
+PART = 1000
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # keeps the information of an exact scan finite
-AS_MANY, AS_NEAR = 0.99, 1.02  # ratios of inliers and rms for which a pose fits as well
-SUGGESTED, SUGGESTED_SIGMAS = (
-    0.4,
-    2.5,
-)  # error of size from sums of patches: over the least reported one, sigmas
+# ratios of inliers and rms for which a pose fits as well
+AS_MANY = 0.99
+AS_NEAR = 1.02
+# error of size from sums of patches: over the least reported one, sigmas
+SUGGESTED = 0.4
+SUGGESTED_SIGMAS = 2.5
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
 # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
 UNCHANGED = 0.06
 NUMBERS = 1024  # normal numbers of the simulated noise
-SIMULATED, SHARES = (
-    1024,
-    (3, 12, 8),
-)  # points that are simulated; one of so many at most, at least, at most of small noise
+# points that are simulated; one of so many at most, at least, at most of small noise
+SIMULATED = 1024
+SHARES = (3, 12, 8)
 # of the extent: with less noise a part of the simulated points decides whether the others are
 SMALL_NOISE = 0.002
 UNCERTAIN_BIAS = 0.5  # of the bias of the noise: standard error

@@ -19,26 +19,26 @@ from avsreplay.register.surface_index import kernel_module
 
 # factor: the points of a cloud are first thinned evenly to this many times the number needed
 CLOUD_POINTS = 20
-EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
-STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
+EVEN_ROUNDS = 10
+EVEN_WITHIN = (0.85, 1.2)
+STRAY_SHARE = 0.15
+STRAY_VOXELS = 150
+STRAY_POINTS = 10
 R2 = np.array(
     [0.7548776662466927, 0.5698402909980532]
 )  # plastic-number sequence: low discrepancy in the unit square
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
-NEIGHBOUR, TESTED = (
-    8,
-    200,
-)  # neighbour whose distance counts; points that show whether any are scattered
-EMPTY, SPACED = (
-    2.5,
-    125,
-)  # for the density of rays; no ray within so many spacings: nothing was measured
+# neighbour whose distance counts; points that show whether any are scattered
+NEIGHBOUR = 8
+TESTED = 200
+# for the density of rays; no ray within so many spacings: nothing was measured
+EMPTY = 2.5
+SPACED = 125
 # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 SCATTERED = 2.0
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
-BIMODAL = (
-    2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
-)
+# ratio of the upper to the lower quartile of that distance in a scan with scattered points
+BIMODAL = 2.5
 # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
 PARTIAL_OF_EXTENT = 0.85
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
@@ -46,11 +46,14 @@ GROUPED = 3000  # points of a scan in which connected groups are looked for
 MOST_SEGMENTS = 3
 MOST_ATTEMPTS = MOST_SEGMENTS + 3
 VOXEL_OF_EXTENT = 0.04
-LEAST_PART_SHARE, LEAST_PART_POINTS = (
-    0.05,
-    60,
-)  # least size of a part: share of the scan, and points
-PLANES_LEFT_OUT, TRIALS, RANSAC_POINTS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 400, 0.01, 0.2
+# least size of a part: share of the scan, and points
+LEAST_PART_SHARE = 0.05
+LEAST_PART_POINTS = 60
+PLANES_LEFT_OUT = 3
+TRIALS = 200
+RANSAC_POINTS = 400
+PLANE_OF_EXTENT = 0.01
+PLANE_SHARE = 0.2
 
 
 def sample(surface: Surface, count: int) -> tuple[Array, Array]:
@@ -238,7 +241,7 @@ def attempts(
         extent_m: of the model.
         found: whether the first round gave a plausible pose.
     """
-    size = geometry.bounding_diagonal(target)
+    size = bounding_diagonal(target)
     first, next_one = (
         (1, 0) if size < PARTIAL_OF_EXTENT * extent_m else (0, 1)
     )  # a part of the target is not at its centroid
@@ -266,7 +269,7 @@ def segments(points: Array, extent_m: float) -> Iterator[Array]:
     connected = [part for part in parts if len(part) >= STRAY_POINTS]
     if len(connected) > 1:
         together = np.concatenate(connected)
-        if geometry.bounding_diagonal(together) <= LARGER * extent_m:
+        if bounding_diagonal(together) <= LARGER * extent_m:
             parts.insert(0, together)
     for part in parts:
         if least <= len(part) < 0.95 * len(points):

@@ -24,16 +24,18 @@ from avsreplay.register.work import CALL_WORK, LEAST_RATIO, STAGE_WORK
 
 POINTS = PART  # points of the scan by which hypotheses are screened
 HOPEFUL_POINTS = 150  # points that show whether a guess is hopeful
-SCREEN_START_OF_EXTENT, SCREEN_STOP_OF_EXTENT = (
-    0.05,
-    0.004,
-)  # first and last rejection distance over the extent
-SCREEN_FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
+# first and last rejection distance over the extent
+SCREEN_START_OF_EXTENT = 0.05
+SCREEN_STOP_OF_EXTENT = 0.004
+# factor on the rejection distance per stage, and passes per stage
+SCREEN_FALL = 0.6
+PASSES = 4
 # A pose replaces the first of several with a cost below this share of its cost. Nearer to 1, poses
 # are exchanged by the chance of noise.
 BETTER_THAN = 0.9
 # points nearer than so many widths are near; a rest is another object if most of these are on
-NEAR_WIDTHS, MOSTLY = 5.0, 0.9
+NEAR_WIDTHS = 5.0
+MOSTLY = 0.9
 
 
 @value_class

@@ -31,32 +31,28 @@ from avsreplay.register.covariance import noise_along
 from avsreplay.register.surface_index import SurfaceIndex
 
 LEAST_RESIDUALS = 50
-MOST_OF_MODEL = (
-    1.3  # diameter of a scan over that of the model above which more than the target is in view
-)
+# diameter of a scan over that of the model above which more than the target is in view
+MOST_OF_MODEL = 1.3
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
-LEAST_ERROR, SIZE_SIGMAS = (
-    0.005,
-    4.0,
-)  # least |delta| that is reported, by itself and in standard errors
+# least |delta| that is reported, by itself and in standard errors
+LEAST_ERROR = 0.005
+SIZE_SIGMAS = 4.0
 # from so many standard errors on, the covariance of the pose contains the change with the size
 LIKELY_SIGMAS = 2.0
-SIZE_UNSEEN = (
-    "the view does not show an error of the size"  # the message of such a view begins with it
-)
-UNSEEN_ERROR = (
-    0.03  # a view in which a larger error would not be significant does not determine the size
-)
-USED_OF_EXTENT, SIZE_POINTS = 0.02, 600  # larger residuals are not used
-MATCH_ROUNDS, MOST_ROUNDS, SMALL_STEP = (
-    3,
-    20,
-    2e-4,
-)  # times that the points are matched; step of the size that ends them
+# the message of such a view begins with it
+SIZE_UNSEEN = "the view does not show an error of the size"
+# a view in which a larger error would not be significant does not determine the size
+UNSEEN_ERROR = 0.03
+# larger residuals are not used
+USED_OF_EXTENT = 0.02
+SIZE_POINTS = 600
+# times that the points are matched; step of the size that ends them
+MATCH_ROUNDS = 3
+MOST_ROUNDS = 20
+SMALL_STEP = 2e-4
 LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
-LEAST_INFORMATION = (
-    1e-3  # least share of n . p not explained by the pose: three faces of a box give no size
-)
+# least share of n . p not explained by the pose: three faces of a box give no size
+LEAST_INFORMATION = 1e-3
 PATCHES_OF_EXTENT = (
     0.05,
     0.15,
@@ -65,10 +61,9 @@ OFF_PLANES = 0.381966  # share of a patch from its boundary to a coordinate plan
 LEAST_LEFT = 0.2  # leverage is limited to 0.8 where it enlarges the residual of a patch
 # an amplitude that the pose and the size explain to all but this share of its norm is not fitted
 OBSERVABLE = 0.05
-CAUCHY, CAUCHY_VARIANCE = (
-    2.0,
-    1.56,
-)  # width of the weights in standard deviations; variance over the weighted one
+# width of the weights in standard deviations; variance over the weighted one
+CAUCHY = 2.0
+CAUCHY_VARIANCE = 1.56
 
 
 @value_class

@@ -29,10 +29,9 @@ from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.settings import Settings, setting
 
-LARGEST_M, LARGEST_REACH = (
-    1e9,
-    1e5,
-)  # largest coordinate [m], and largest reach in units of the model's extent
+# largest coordinate [m], and largest reach in units of the model's extent
+LARGEST_M = 1e9
+LARGEST_REACH = 1e5
 MOST_PRIMITIVES = 50_000_000
 
 

@@ -21,34 +21,30 @@ from avsreplay.register.global_search import SYMMETRIC, SYMMETRIES, GlobalSearch
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import SurfaceIndex
 
-TURNS, GENERIC_TURNS = (
-    72,
-    (5, 11, 23, 31, 43, 59),
-)  # about an axis of revolution; to recognise the axis
-REVOLVED, FITS, LEAST_FITTED = (
-    0.02,
-    2,
-    60,
-)  # distance of turned surface on the model [extent]; fits of the axis, points
-AXIS_STRIDE, GROUP_STRIDE, CIRCLE_STRIDE = (
-    3,
-    40,
-    20,
-)  # every n-th point for the axis, a product, the circle of turns
+# about an axis of revolution; to recognise the axis
+TURNS = 72
+GENERIC_TURNS = (5, 11, 23, 31, 43, 59)
+# distance of turned surface on the model [extent]; fits of the axis, points
+REVOLVED = 0.02
+FITS = 2
+LEAST_FITTED = 60
+# every n-th point for the axis, a product, the circle of turns
+AXIS_STRIDE = 3
+GROUP_STRIDE = 40
+CIRCLE_STRIDE = 20
 FINALISTS = 2  # poses of each kind of motion that are refined; kinds of single motions
-CIRCLE, LOW = (
-    360,
-    0.75,
-)  # turns along the circle; largest cost at the teeth of a gear over the median cost
-LEAST_COST, LEAST_TEETH = (
-    0.02,
-    5,
-)  # median cost, below which a body is one of revolution; fewest teeth
-PRODUCTS, PRODUCT_ROUNDS = 96, 4  # most motions of a finite group, and rounds of products
-CARRIED_WIDTH_OF_EXTENT, DIFFERENT_RAD = (
-    0.03,
-    np.radians(3.0),
-)  # distance beyond which a point is not carried onto the surface
+# turns along the circle; largest cost at the teeth of a gear over the median cost
+CIRCLE = 360
+LOW = 0.75
+# median cost, below which a body is one of revolution; fewest teeth
+LEAST_COST = 0.02
+LEAST_TEETH = 5
+# most motions of a finite group, and rounds of products
+PRODUCTS = 96
+PRODUCT_ROUNDS = 4
+# distance beyond which a point is not carried onto the surface
+CARRIED_WIDTH_OF_EXTENT = 0.03
+DIFFERENT_RAD = np.radians(3.0)
 
 
 @value_class

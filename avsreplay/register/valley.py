@@ -17,10 +17,9 @@ from avsreplay.register.backend import Target
 from avsreplay.register.generators.weak_directions import weak_motions
 from avsreplay.register.screening import Screen
 
-VALLEY_STEPS, VALLEY_POINTS = (
-    8,
-    250,
-)  # steps of half a gate each way along the two directions; points
+# steps of half a gate each way along the two directions; points
+VALLEY_STEPS = 8
+VALLEY_POINTS = 250
 VALLEY_WORK = 16_000  # cost of the search along the valley [point searches]
 
 

@@ -21,25 +21,25 @@ from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
-LEAST_SEEN, NEAR_FACE_OF_EXTENT = (
-    0.85,
-    0.01,
-)  # share of points so near to a face towards a camera close to the model
-FAR_OF_EXTENT = (
-    0.6  # if the median of a scan is this far from the origin, the camera was at the origin
-)
+# share of points so near to a face towards a camera close to the model
+LEAST_SEEN = 0.85
+NEAR_FACE_OF_EXTENT = 0.01
+# if the median of a scan is this far from the origin, the camera was at the origin
+FAR_OF_EXTENT = 0.6
 TESTED_POINTS = 200
-VIEWS, SIDE_POINTS, VIEWED_FROM = (
-    24,
-    2000,
-    2.0,
-)  # cameras that look at points of open parts, so many extents away
-PATCH_OF_EXTENT, LEAST_INCIDENCE = 0.05, 0.05  # side of a patch; least cosine of a ray
-FROM_BEHIND, LEAST_ONE_SIDED = (
-    0.05,
-    0.2,
-)  # share of the views of a patch; share of the area with one side
-FRONT, BACK, BOTH = 1, 2, 3
+# cameras that look at points of open parts, so many extents away
+VIEWS = 24
+SIDE_POINTS = 2000
+VIEWED_FROM = 2.0
+# side of a patch; least cosine of a ray
+PATCH_OF_EXTENT = 0.05
+LEAST_INCIDENCE = 0.05
+# share of the views of a patch; share of the area with one side
+FROM_BEHIND = 0.05
+LEAST_ONE_SIDED = 0.2
+FRONT = 1
+BACK = 2
+BOTH = 3
 CENTROID_CELL = 0.02  # of the image in which the nearest points are seen, over the extent
 SIDES_VERSION = 1  # of the rule for the sides of open parts, for the cache
 

@@ -12,44 +12,37 @@ from avsreplay.register.backend import LEAST_BUDGET_POINTS
 from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 
-HEALTHY_FIXED, HEALTHY_SEARCHED = (
-    (4200, 0.8),
-    (7000, 1.3),
-)  # an ordinary registration: work, and searches (per point)
-GRADE_WORK, POINTS_GRADED = (
-    8000,
-    2,
-)  # the quality of a pose: point searches in all, and points of which each takes one
-NEAR_POINTS, ORDINARY_NOISE_OF_EXTENT = (
-    500,
-    0.002,
-)  # points with the noise of an ordinary scan that show the cost of a search
+# an ordinary registration: work, and searches (per point)
+HEALTHY_FIXED = (4200, 0.8)
+HEALTHY_SEARCHED = (7000, 1.3)
+# the quality of a pose: point searches in all, and points of which each takes one
+GRADE_WORK = 8000
+POINTS_GRADED = 2
+# points with the noise of an ordinary scan that show the cost of a search
+NEAR_POINTS = 500
+ORDINARY_NOISE_OF_EXTENT = 0.002
 SIMULATED_WORK = (
     1000,
     2,
 )  # cost of the simulation of the noise: point searches in all, and of each point
 MOST_SIMULATED = 3000  # points that are simulated, at most
 LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
-FAR_WORK, LEAST_NEAR = (
-    2,
-    0.5,
-)  # searches per point of a pass while less than this share of the points is on the model
+# searches per point of a pass while less than this share of the points is on the model
+FAR_WORK = 2
+LEAST_NEAR = 0.5
 SCATTER_WORK = (
     3,
     7,
 )  # cost per point of finding whether points are scattered, and of leaving them out
-TEST_WORK, SIZE_WORK = (
-    15_000,
-    15_000,
-)  # cost of a test of a pose, and of fitting the size [point searches]
+# cost of a test of a pose, and of fitting the size [point searches]
+TEST_WORK = 15_000
+SIZE_WORK = 15_000
 FREE_WORK = 8000  # cost of free directions
-STAGE_WORK, CALL_WORK = (
-    1200,
-    600,
-)  # cost in the interpreter of a stage of a restart, and of measuring a pose
-LAST_WORK = (
-    30_000  # cost of registering a scan once more from its pose, and of the test of the result
-)
+# cost in the interpreter of a stage of a restart, and of measuring a pose
+STAGE_WORK = 1200
+CALL_WORK = 600
+# cost of registering a scan once more from its pose, and of the test of the result
+LAST_WORK = 30_000
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 NOT_COMPARED = "no work is left to compare the poses near this one"
 LAST_STEP = 0.5  # of it, kept because a last step can take more than its usual work

@@ -40,31 +40,31 @@ from avsreplay.register.poses import SAME_RAD
 from avsreplay.register.sampling import sample_evenly, thin_to
 from avsreplay.register.work import LEAST_RATIO, NOT_COMPARED
 
-START_POINTS, STEP_OF_EXTENT, STEPS_EACH_WAY = (
-    50,
-    0.06,
-    12,
-)  # of displaced starts: points, their distance, and steps each way
-FIRST_GATE, SECOND_GATE = 0.15, 0.075  # rejection distances over the extent
+# of displaced starts: points, their distance, and steps each way
+START_POINTS = 50
+STEP_OF_EXTENT = 0.06
+STEPS_EACH_WAY = 12
+# rejection distances over the extent
+FIRST_GATE = 0.15
+SECOND_GATE = 0.075
 MOST = (
     150,
     80,
 )  # starts that are kept after the first passes: those turned by near-symmetries, and the others
 MOST_STARTS = 1200  # with more of them their distance is larger
-SECOND, LAST = 4, 6  # passes with the distance SECOND_GATE, and of the best with more points
-COMPARED_FIRST, REGISTERED_STARTS = (
-    16,
-    4,
-)  # poses that are compared with more points, and that are registered to the model
-FIXED_WORK, POINT_WORK = (
-    10_000,
-    (540, 900),
-)  # cost of these poses; usual one for each point, of a part of the target
-SQUARE, ALONG, LEAST_FACES = (
-    0.1,
-    0.98,
-    0.05,
-)  # cosines of normals at right angles and parallel; share of the surface
+# passes with the distance SECOND_GATE, and of the best with more points
+SECOND = 4
+LAST = 6
+# poses that are compared with more points, and that are registered to the model
+COMPARED_FIRST = 16
+REGISTERED_STARTS = 4
+# cost of these poses; usual one for each point, of a part of the target
+FIXED_WORK = 10_000
+POINT_WORK = (540, 900)
+# cosines of normals at right angles and parallel; share of the surface
+SQUARE = 0.1
+ALONG = 0.98
+LEAST_FACES = 0.05
 ALIKE = 0.5  # starts turned by less than this share of SAME_RAD are one
 
 
