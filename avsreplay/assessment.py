@@ -86,7 +86,7 @@ class Assessment:
     def lowers_grade(self) -> bool:
         """Whether the assessment is a reason for concern beside the tracking.
 
-        A capture for which nobody asked, and that is not assessed, is none.
+        A capture that is neither requested nor assessed is none.
         """
         return not self.succeeds and (self.asked or self.chance is not Chance.NOT_ASSESSED)
 
