@@ -47,6 +47,7 @@ from avsreplay.plan.rendezvous import rendezvous
 from avsreplay.records import (
     Admission,
     Alignment,
+    AlignStatus,
     Belief,
     Finding,
     Forecast,
@@ -292,6 +293,8 @@ class PipelineState:
         track: the estimate.  Both are None before the first scan.
         last_pose: last healthy measured pose, None before one.
         failed: what the scans showed before that pose whose searches found none.
+        ambiguous: T_ac of the last scan, if it is one of several that a nearly symmetric model
+            leaves, and no pose was healthy yet.
         origin: where the first pose came from.
         followed: the target, where a region follows it.
         start_ns: instant of the first scan.
@@ -306,6 +309,7 @@ class PipelineState:
     origin: str = ""
     start_ns: int = 0
     failed: tuple[Array, ...] = ()
+    ambiguous: Pose | None = None
     followed: Followed | None = None
     following: Following = Following()
     content: str = ""
@@ -402,7 +406,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         plan=guidance.plan,
     )
     pose = measurement.alignment.T_ac if gamma else state.last_pose
-    failed = _failed(state, scan) if pose is None else ()
+    failed = _failed(state, scan, measurement.alignment) if pose is None else ()
+    ambiguous = _ambiguous(state, measurement.alignment) if pose is None else None
     return (
         PipelineState(
             monitors,
@@ -412,6 +417,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
             state.origin,
             state.start_ns,
             failed,
+            ambiguous,
             followed,
             following,
             content or state.content,
@@ -615,7 +621,7 @@ def _acquire(
     one: that which is nearest to a pose T_ac, or the registered one.
     """
     frame, effort = SensorFrame(stages.registrar, scan.sensor), _effort(state, scan)
-    found = frame.acquire(points, effort)
+    found = frame.acquire(points, effort, state.ambiguous)
     if found.equal:
         best = found.T_ac
         if near is not None:
@@ -658,8 +664,20 @@ def _content(scan: Scan) -> str:
     return hashlib.blake2b(np.ascontiguousarray(scan.points).data, digest_size=16).hexdigest()
 
 
-def _failed(state: PipelineState, scan: Scan) -> tuple[Array, ...]:
-    """What the scans without an accepted pose showed whose searches found none, with this scan."""
+def _ambiguous(state: PipelineState, found: Alignment) -> Pose | None:
+    """The pose of a scan that is one of several; that of the scan before if this one has none."""
+    if found.status is AlignStatus.AMBIGUOUS:
+        return found.T_ac
+    return None if found.measured else state.ambiguous
+
+
+def _failed(state: PipelineState, scan: Scan, found: Alignment) -> tuple[Array, ...]:
+    """What the scans without an accepted pose showed whose searches found none, with this scan.
+
+    A pose that is one of several, as that of the scan before, took no search.
+    """
+    if state.ambiguous is not None and found.status is AlignStatus.AMBIGUOUS:
+        return state.failed
     seen = shown(scan.points)
     searched = seen is not None and effort_for(seen, state.failed) is Effort.FULL
     return (*state.failed, seen) if searched and seen is not None else state.failed

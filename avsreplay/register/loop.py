@@ -385,6 +385,18 @@ class Loop:
 
     # Without a guess
 
+    def turned(self, case: Case) -> Alignment | None:
+        """Return the decision on a scan from its guess, after comparison with the poses turned by
+        near-symmetries; None if the model has no marks that could decide between them.
+        """
+        if not self._turns.needed(case):
+            return None
+        self._draw(case, self._guess)
+        self._examine(case)
+        if case.at.accepted and not case.at.reason:
+            self._draw(case, self._turns)
+        return self.decision.decide(case)
+
     def without_guess(self, case: Case) -> Alignment:
         """Return the decision on a scan without a guess."""
         self._search(case, MOST_ATTEMPTS, None)

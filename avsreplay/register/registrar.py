@@ -13,6 +13,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality
 from avsreplay.register.backend import Target, create_backend, load_backend
+from avsreplay.register.decision import ACCEPTED
 from avsreplay.register.evidence import Observed
 from avsreplay.register.hypotheses import Case
 from avsreplay.register.loop import Loop
@@ -108,13 +109,21 @@ class Registrar:
         """The work that a scan may cost."""
         return Work(healthy_work(len(scan), self._target.near_work))
 
-    def acquire(self, points: NDArray[Any], effort: Effort = Effort.FULL) -> Alignment:
+    def acquire(
+        self,
+        points: NDArray[Any],
+        effort: Effort = Effort.FULL,
+        ambiguous: Pose | None = None,
+    ) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all
         attitudes.
 
         Args:
             points: as for :meth:`register`.
             effort: what is done for the scan; only with the full effort it is searched.
+            ambiguous: T_ac of a scan shortly before that was AMBIGUOUS; None for none. As long as
+                the same turned poses explain the scan there as well, they are the result. If they
+                do no longer, the scan is searched with any effort.
 
         Returns:
             The pose T_ac with its quality. The status is NO_OVERLAP if no pose explains enough of
@@ -125,12 +134,17 @@ class Registrar:
         scan = usable_points(points, self.params.subsample_m)
         if refused := self._loop.test.refused(scan, len(points)):
             return refused
-        if effort is not Effort.FULL:
+        few, seen = self._loop.screen.part(scan), Observed(scan)
+        found = None
+        if ambiguous is not None:
+            found = self._loop.turned(Case(seen, scan, few, self._work(scan), ambiguous))
+        if found is not None and found.status is AlignStatus.AMBIGUOUS:
+            return found
+        if effort is not Effort.FULL and (found is None or found.status not in ACCEPTED):
             return replace(
                 quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED
             )
-        few = self._loop.screen.part(scan)
-        return self._loop.without_guess(Case(Observed(scan), scan, few, self._work(scan)))
+        return self._loop.without_guess(Case(seen, scan, few, self._work(scan)))
 
     def images(self, T_ac: Pose) -> list[Pose]:
         """Return the poses that no scan can tell from a pose, because an exact symmetry of the
