@@ -16,6 +16,7 @@ from avsreplay.register.generators.turns import Turns
 from avsreplay.register.hypotheses import Candidate, Case, Hypothesis
 from avsreplay.register.quality import left_undetermined
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.shown import Effort
 from avsreplay.register.work import Work, healthy_work
 
 
@@ -104,6 +105,39 @@ def test_a_mark_out_of_sight_leaves_the_turn_open(sides, nozzle):
     if found.status is AlignStatus.DEGENERATE:
         assert "turns about z" in found.free_directions
         assert np.linalg.norm(found.info @ axis) < 1e-2 * np.linalg.norm(found.info)
+
+
+@pytest.mark.slow
+def test_an_ambiguous_scan_is_followed_until_the_mark_decides():
+    """Without another search: the turned poses of each scan are named, and one that shows the mark
+    gives its pose; of another object the search is postponed.
+    """
+    mesh = stage(0.15, 96, False, 0.3)
+    registrar, away = Registrar(surface_of(mesh)), seen_from(0.0, 0.5)
+    towards = away.inverse().t
+    hidden = np.arctan2(towards[1], towards[0]) + np.pi - 0.3
+
+    def turned(by_rad: float) -> Pose:
+        return away @ Pose(exp([0.0, 0.0, hidden + by_rad]), np.zeros(3))
+
+    first = registrar.acquire(scan_of(mesh, turned(0.0), 3))
+    assert first.status is AlignStatus.AMBIGUOUS
+    for angle in (0.05, -0.05):
+        scan = scan_of(mesh, turned(angle), 4)
+        found = registrar.acquire(scan, Effort.GUESS, first.T_ac)
+        assert found.status is AlignStatus.AMBIGUOUS
+        assert len(found.members) > 1
+        upright = found.T_ac.R[:, 2] @ turned(angle).R[:, 2]
+        assert abs(upright) > np.cos(np.radians(1.0))
+        assert np.linalg.norm(found.T_ac.t - turned(angle).t) < 0.02
+    T_ac = turned(2.3)
+    found = registrar.acquire(scan_of(mesh, T_ac, 5), Effort.GUESS, first.T_ac)
+    assert found.status is AlignStatus.ALIGNED
+    assert gap_deg(found, T_ac) < 1.0
+    ball = trimesh.creation.icosphere(4, 0.8)
+    other = registrar.acquire(scan_of(ball, first.T_ac, 6), Effort.GUESS, first.T_ac)
+    assert other.status is AlignStatus.BUDGET_EXHAUSTED
+    assert "postponed" in other.message
 
 
 def test_the_information_left_without_motions_is_that_of_free_motions():
