@@ -59,7 +59,7 @@ def test_thinning_does_not_depend_on_the_order() -> None:
 def test_the_threshold_follows_the_error_of_the_guess() -> None:
     surface, T_ca = boxes(), example_pose().inverse()
     registrar = Registrar(surface, RegisterParams(backend="kiss"))
-    backend = KissBackend(registrar._target)
+    backend = KissBackend(registrar.target)
     errors = [
         Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([k * registrar.limits.gate_m, 0.0, 0.0]))
         for k in (0, 3, 9)
