@@ -69,6 +69,19 @@ def test_the_threshold_follows_the_error_of_the_guess() -> None:
     assert sigma[1:] == pytest.approx([np.sqrt((4 + k * k) / 2) for k in (3, 9)])
 
 
+def test_points_that_can_match_nothing_change_no_pose() -> None:
+    """A wall behind the target, farther away than correspondences reach."""
+    pytest.importorskip("small_gicp")
+    surface, T_ac = boxes(), example_pose()
+    scan = T_ac.apply(view(surface, 500, T_ac.inverse().t))
+    wall = scan.mean(axis=0) + 4.0 * surface.extent + np.random.default_rng(5).normal(size=(400, 3))
+    align = Registrar(surface, RegisterParams(backend="small_gicp")).backend.align
+    alone, behind = (align(p, T_ac.inverse()) for p in (scan, np.vstack([wall, scan])))
+    assert alone.converged
+    assert behind.T_ca.t.tobytes() == alone.T_ca.t.tobytes()
+    assert behind.T_ca.q.tobytes() == alone.T_ca.q.tobytes()
+
+
 def test_the_command_writes_poses_that_a_run_reads(cli, tmp_path, fixtures_folder) -> None:
     out = tmp_path / "poses.tum"
     done = cli("odometry", fixtures_folder / "spin-raster.mcap", "-o", out)
