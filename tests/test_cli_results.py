@@ -223,6 +223,14 @@ def test_an_unusable_golden_file_is_refused_before_the_replay(
     assert golden.read_text() == "[1]\n"
 
 
+def test_a_folder_as_golden_file_is_not_called_missing(
+    fixtures_folder: Path, tmp_path: Path
+) -> None:
+    done = run("run", fixtures_folder / "tumble.mcap", "--golden", tmp_path)
+    assert isinstance(done.exception, UnreadableInput), done.exception
+    assert "not a rows.jsonl file" in str(done.exception)
+
+
 def test_a_result_that_is_replaced_keeps_the_files_of_others(
     fixtures_folder: Path, result: Path
 ) -> None:

@@ -130,7 +130,7 @@ def test_the_axis_of_a_body_with_large_marks_is_found(name: str) -> None:
     """
     surface = scenes.meshes([name])[name]
     registrar = Registrar(surface)
-    search = registrar._loop.symmetry.search
+    search = registrar.loop.symmetry.search
     found = near_symmetries(search, registrar.index, *sample(surface, 4000))
     assert len(found.kinds[0]) == 71
     assert min(abs(T[2, 2]) for T in found.kinds[0]) > 0.999
@@ -200,6 +200,6 @@ def test_comparing_poses_stays_within_the_budget(
         else registrar.register(case.points, case.guess)
     )
     assert (
-        0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(case.points), registrar._target.near_work)
+        0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(case.points), registrar.target.near_work)
     )
     assert found.status is not AlignStatus.FAILED

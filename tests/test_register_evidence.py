@@ -73,7 +73,7 @@ def test_only_the_right_pose_is_accepted(
     )
     wrong = rng.random(len(p)) < outliers
     p[wrong] = p.mean(axis=0) + 0.4 * surface.extent * rng.uniform(-1.0, 1.0, (wrong.sum(), 3))
-    model, scan = EvidenceModel(registrar._target), Observed(p)
+    model, scan = EvidenceModel(registrar.target), Observed(p)
     right = model.at(scan, T_ac.inverse())
     assert right is not None
     assert right.reason() == ""
@@ -87,9 +87,9 @@ def test_evidence_says_what_speaks_against_a_pose(registrar: Registrar) -> None:
     surface, T_ac = boxes(), example_pose()
     scan = Observed(points_of(*scan_of(surface, T_ac, np.random.default_rng(SEED))))
     nearer = Pose(T_ac.q, T_ac.t - 0.06 * surface.extent * T_ac.t / np.linalg.norm(T_ac.t))
-    found = EvidenceModel(registrar._target).at(scan, nearer.inverse())
+    found = EvidenceModel(registrar.target).at(scan, nearer.inverse())
     assert found is not None
-    right = EvidenceModel(registrar._target).at(scan, T_ac.inverse())
+    right = EvidenceModel(registrar.target).at(scan, T_ac.inverse())
     assert right is not None
     assert found.through > 0.2 * found.patches
     assert right.through < 0.05 * right.patches
@@ -99,7 +99,7 @@ def test_evidence_says_what_speaks_against_a_pose(registrar: Registrar) -> None:
 def test_a_visible_side_with_gaps_is_not_covered(registrar: Registrar) -> None:
     surface, T_ac = boxes(), example_pose()
     p = points_of(*scan_of(surface, T_ac, np.random.default_rng(SEED)))
-    model = EvidenceModel(registrar._target)
+    model = EvidenceModel(registrar.target)
     whole = model.at(Observed(p), T_ac.inverse())
     part = model.at(Observed(p[p[:, 0] < np.quantile(p[:, 0], 0.7)]), T_ac.inverse())
     assert whole is not None

@@ -163,7 +163,7 @@ def test_a_search_that_fails_stops_at_the_budget(
     found = registrar.acquire(scan)
     assert not found.measured
     assert found.status is AlignStatus.BUDGET_EXHAUSTED
-    assert sum(spent) <= HEALTHY_SCANS * healthy_work(len(scan), registrar._target.near_work)
+    assert sum(spent) <= HEALTHY_SCANS * healthy_work(len(scan), registrar.target.near_work)
 
 
 # --- the parts
@@ -187,7 +187,7 @@ def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registra
 
 
 def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
-    search = Registrar(_box((2.0, 1.0, 0.6)))._loop.symmetry.search
+    search = Registrar(_box((2.0, 1.0, 0.6))).loop.symmetry.search
     turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search.symmetries]
     assert turns
     assert all(angle > 175.0 for angle in turns)
@@ -208,7 +208,7 @@ def test_the_symmetries_of_a_body_are_exact_so_that_a_turned_part_of_it_still_fi
     registrar = Registrar(_mesh(body))
     points, _ = sample(_mesh(body), 500)
     motions = [
-        T for T in registrar._loop.symmetry.search.symmetries if T[2, 2] > 0.5
+        T for T in registrar.loop.symmetry.search.symmetries if T[2, 2] > 0.5
     ]  # about z: the body has a top
     assert motions
     for T in motions:
@@ -224,7 +224,7 @@ def test_attitudes_near_the_identity_that_return_to_it_are_no_symmetries(
     """A box turned by 12 deg still covers most of itself, and is registered back to where it
     was.
     """
-    search = Registrar(_box((2.0, 1.6, 1.8)))._loop.symmetry.search
+    search = Registrar(_box((2.0, 1.6, 1.8))).loop.symmetry.search
     half_turn = Pose.from_matrix(search.symmetries[0])
     near = [Pose(exp(np.radians(12.0) * np.eye(3)[k]), np.zeros(3)) for k in range(3)]
     monkeypatch.setattr(search, "_selected", lambda *_: [*near, half_turn, half_turn @ near[0]])
@@ -346,12 +346,12 @@ def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     """Noise favours a wrong pose with more surface nearby: 3 % more points on the model say
     nothing at large noise.
     """
-    extent, rng = registrar._target.surface.extent, np.random.default_rng(6)
+    extent, rng = registrar.target.surface.extent, np.random.default_rng(6)
     distance = noise * extent * np.abs(rng.standard_normal(1500))
     off = distance.copy()
     off[:45] = 0.1 * extent
     turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
-    found = registrar._loop.symmetry.search._verdict(
+    found = registrar.loop.symmetry.search._verdict(
         [Measured(turned, off), Measured(Pose.identity(), distance)]
     )
     assert np.array_equal(found.best.matrix, np.eye(4))
@@ -363,7 +363,7 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
     model, T_ac = boxes(), example_pose()
     scan = T_ac.apply(view(model, 2000, T_ac.inverse().t))
     apart = Pose(exp([0.0, 0.0, 1.0]), np.zeros(3)) @ T_ac.inverse()
-    found = registrar._loop.symmetry.search.search(scan, known=apart)
+    found = registrar.loop.symmetry.search.search(scan, known=apart)
     assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
     assert not found.rivals
 
@@ -375,7 +375,7 @@ def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
     surface, T_ac = _box((1.0, 0.8, 0.4)), example_pose()
     points, missing = T_ac.apply(view(surface, 500, T_ac.inverse().t)), np.zeros((5, 3))
     registrar, T_ca = Registrar(surface), T_ac.inverse()
-    symmetry = registrar._loop.symmetry
+    symmetry = registrar.loop.symmetry
     rays, padded = (symmetry.rays(p) for p in (points, np.concatenate([points, missing])))
     assert len(padded.points) == len(rays.points)
     expected, found = (symmetry.turned_poses(each, T_ca, False)[0] for each in (rays, padded))

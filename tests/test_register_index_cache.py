@@ -160,7 +160,7 @@ def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
 
 
 def _searched(registrar: Registrar) -> list[bytes]:
-    symmetry = registrar._loop.symmetry
+    symmetry = registrar.loop.symmetry
     arrays = [symmetry.search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
     return [a.tobytes() for a in arrays] + [repr((symmetry._share, symmetry._area)).encode()]
 

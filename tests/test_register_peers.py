@@ -59,7 +59,7 @@ def test_thinning_does_not_depend_on_the_order() -> None:
 def test_the_threshold_follows_the_error_of_the_guess() -> None:
     surface, T_ca = boxes(), example_pose().inverse()
     registrar = Registrar(surface, RegisterParams(backend="kiss"))
-    backend = KissBackend(registrar._target)
+    backend = KissBackend(registrar.target)
     errors = [
         Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([k * registrar.limits.gate_m, 0.0, 0.0]))
         for k in (0, 3, 9)
@@ -67,6 +67,19 @@ def test_the_threshold_follows_the_error_of_the_guess() -> None:
     sigma = [backend.threshold(T_ca, error @ T_ca) / registrar.limits.gate_m for error in errors]
     assert sigma[0] == pytest.approx(2.0)
     assert sigma[1:] == pytest.approx([np.sqrt((4 + k * k) / 2) for k in (3, 9)])
+
+
+def test_points_that_can_match_nothing_change_no_pose() -> None:
+    """A wall behind the target, farther away than correspondences reach."""
+    pytest.importorskip("small_gicp")
+    surface, T_ac = boxes(), example_pose()
+    scan = T_ac.apply(view(surface, 500, T_ac.inverse().t))
+    wall = scan.mean(axis=0) + 4.0 * surface.extent + np.random.default_rng(5).normal(size=(400, 3))
+    align = Registrar(surface, RegisterParams(backend="small_gicp")).backend.align
+    alone, behind = (align(p, T_ac.inverse()) for p in (scan, np.vstack([wall, scan])))
+    assert alone.converged
+    assert behind.T_ca.t.tobytes() == alone.T_ca.t.tobytes()
+    assert behind.T_ca.q.tobytes() == alone.T_ca.q.tobytes()
 
 
 def test_the_command_writes_poses_that_a_run_reads(cli, tmp_path, fixtures_folder) -> None:

@@ -57,12 +57,12 @@ def test_points_well_off_the_model_are_counted_as_their_distances_say(
 ) -> None:
     """Among 1,000 points of the scan: two gates off or more, but within the reach of the index."""
     T_ac, rng = example_pose(), np.random.default_rng(SEED)
-    scan = hidden_view(registrar._target.surface, T_ac, count, rng)
+    scan = hidden_view(registrar.target.surface, T_ac, count, rng)
     stray = rng.random(len(scan)) < 0.07
     scan[stray] += rng.uniform(-1.0, 1.0, (stray.sum(), 3)) * registrar.limits.reach_m
     found = registrar.register(scan, T_ac)
     few = scan[np.linspace(0, len(scan) - 1, 1000).astype(int)] if len(scan) > 1000 else scan
-    distance = registrar._loop.test.measure(few, found.T_ac.inverse())
+    distance = registrar.loop.test.measure(few, found.T_ac.inverse())
     off = (distance > 2.0 * registrar.limits.gate_m) & (distance < registrar.index.reach_m)
     assert found.inlier_ratio > 0.9
     assert found.well_off == np.count_nonzero(off) > 10
@@ -134,7 +134,7 @@ def test_no_scan_costs_more_than_twenty_ordinary_registrations(
         scan = np.vstack([scan, middle + rng.uniform(-2.0, 2.0, (2500, 3)) * [1.0, 0.05, 1.0]])
     turned = T_ac @ Pose(exp([0.5, 0.3, -0.4]), np.array([0.1, 0.0, 0.05]))
     registrar.register(scan, turned) if guessed else registrar.acquire(scan)
-    assert 0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(scan), registrar._target.near_work)
+    assert 0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(scan), registrar.target.near_work)
 
 
 def test_an_ordinary_registration_costs_about_what_is_assumed(
@@ -152,7 +152,7 @@ def test_an_ordinary_registration_costs_about_what_is_assumed(
         scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0]))
     )
     assert found.status is AlignStatus.ALIGNED
-    assert 0.8 < spent[0] / healthy_work(len(scan), registrar._target.near_work) < 2.0
+    assert 0.8 < spent[0] / healthy_work(len(scan), registrar.target.near_work) < 2.0
 
 
 def _searched(scans: list[Array]) -> list[int]:

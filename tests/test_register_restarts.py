@@ -65,9 +65,9 @@ def test_no_far_guess_ends_beside_the_truth(scans):
 
 def test_a_close_guess_is_registered_once(scans, monkeypatch):
     registrar, calls = Registrar(builtin_surface()), []
-    graded = registrar._loop.grader.graded
+    graded = registrar.loop.grader.graded
     monkeypatch.setattr(
-        registrar._loop.grader,
+        registrar.loop.grader,
         "graded",
         lambda *args, **named: calls.append(1) or graded(*args, **named),
     )
@@ -81,7 +81,7 @@ def test_a_scan_of_scattered_points_costs_few_restarts():
     not a second start.
     """
     registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
-    screen = registrar._loop.screen
+    screen = registrar.loop.screen
     calls, graduated = [], screen.graduated
     screen.graduated = lambda *args: calls.append(args[1]) or graduated(*args)
     stray = rng.uniform([-3.0, -3.0, 2.0], [3.0, 3.0, 8.0], (120, 3))
@@ -116,14 +116,14 @@ def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
     surface, T_ac = boxes(), example_pose()
     registrar, calls, restarts = Registrar(surface), [], []
     scan = seen(surface, T_ac, noise, np.random.default_rng(3))
-    graded, graduated = registrar._loop.grader.graded, registrar._loop.screen.graduated
+    graded, graduated = registrar.loop.grader.graded, registrar.loop.screen.graduated
     monkeypatch.setattr(
-        registrar._loop.grader,
+        registrar.loop.grader,
         "graded",
         lambda *args, **named: calls.append(1) or graded(*args, **named),
     )
     monkeypatch.setattr(
-        registrar._loop.screen,
+        registrar.loop.screen,
         "graduated",
         lambda *args: restarts.append(1) or graduated(*args),
     )
@@ -146,8 +146,8 @@ def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise
     )
     guess = near(T_ac, 1.0, 0.003 * surface.extent).inverse()
     found, whole = (
-        registrar._backend.align_roughly(scan, guess),
-        registrar._backend.align(scan, guess),
+        registrar.backend.align_roughly(scan, guess),
+        registrar.backend.align(scan, guess),
     )
     assert whole.converged
     assert found.converged is not rough
@@ -225,10 +225,10 @@ def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() 
     error = found.T_ac.inverse() @ guess
     d = np.concatenate([geometry.log(error.q), error.t])
     sure = replace(found, covariance=1e-4 * found.covariance)
-    wider = registrar._loop.decision.consistent(scan, guess, sure)[0].covariance
+    wider = registrar.loop.decision.consistent(scan, guess, sure)[0].covariance
     assert d @ np.linalg.solve(sure.covariance, d) > 100.0 * d @ np.linalg.solve(wider, d)
     assert np.all(np.linalg.eigvalsh(wider - sure.covariance) > -1e-12)
-    assert registrar._loop.decision.consistent(scan, T_ac @ T_ac, sure)[0] is sure
+    assert registrar.loop.decision.consistent(scan, T_ac @ T_ac, sure)[0] is sure
 
 
 def test_a_pose_beside_the_truth_is_left_along_the_valley():
@@ -259,7 +259,7 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
     registrar = Registrar(surface)
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
     turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
-    moved = along_valley(registrar._target, registrar._loop.screen, scan, turned.inverse())[0]
+    moved = along_valley(registrar.target, registrar.loop.screen, scan, turned.inverse())[0]
     assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
 
 
@@ -303,7 +303,7 @@ def test_a_pose_with_one_point_on_the_model_has_no_valley():
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
     scan[1:] += [0.0, 0.0, 50.0]
     registrar = Registrar(surface)
-    kept = along_valley(registrar._target, registrar._loop.screen, scan, T_ac.inverse())[0]
+    kept = along_valley(registrar.target, registrar.loop.screen, scan, T_ac.inverse())[0]
     assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
 
 
@@ -344,7 +344,7 @@ def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
     points = T_ac.apply(view(model, 12000, T_ac.inverse().t))
     ranges = np.linalg.norm(points, axis=1, keepdims=True)
     points = points * (1.0 + 0.008 * model.extent * rng.standard_normal(ranges.shape) / ranges)
-    backend, width = Registrar(model)._backend, 0.02 * model.extent
+    backend, width = Registrar(model).backend, 0.02 * model.extent
     first = backend.align_within(points, T_ac.inverse(), width)
     again = backend.align_within(points, first.T_ca, width, near=True)
     assert again.converged
@@ -474,8 +474,8 @@ def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
         Registrar(surface, RegisterParams(split_every=1)),
         Pose(Pose.identity().q, -eye),
     )
-    fit = registrar._backend.align(T_ac.apply(p), T_ac.inverse())
-    target = registrar._target
+    fit = registrar.backend.align(T_ac.apply(p), T_ac.inverse())
+    target = registrar.target
     options = (registrar.limits, registrar.params, False, quality.ACCURACY, True, T_ac.inverse())
     first, second = (
         quality.grade(registrar.index, target.visibility, T_ac.apply(p), fit, *options, simulated)

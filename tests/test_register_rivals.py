@@ -163,7 +163,7 @@ def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most
     """
     handle = trimesh.creation.box((0.3, 0.1, 0.4)).apply_translation((0.5, 0.0, 0.1))
     mug = trimesh.util.concatenate([trimesh.creation.cylinder(0.4, 0.9, sections=64), handle])
-    symmetry = Registrar(surface_of(mug))._loop.symmetry
+    symmetry = Registrar(surface_of(mug)).loop.symmetry
     assert symmetry.marked
     assert len(symmetry._marks) > 400
     assert sum(len(motions) for motions in symmetry._kinds) > 100
@@ -190,7 +190,7 @@ def pot() -> trimesh.Trimesh:
 @pytest.mark.parametrize("stride", [1, 4])
 def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
     mesh, rng = pot(), np.random.default_rng(5)
-    symmetry = Registrar(surface_of(mesh))._loop.symmetry
+    symmetry = Registrar(surface_of(mesh)).loop.symmetry
     marks, normals = symmetry._marks, symmetry._normals
     assert len(marks) > 100
     for _ in range(6):
@@ -210,7 +210,7 @@ def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
 def test_the_marks_tested_for_all_turns_are_part_of_the_work(monkeypatch):
     """Where the scan contradicts most turns, the marks are tested at many of them."""
     registrar = Registrar(surface_of(pot()))
-    symmetry, tested = registrar._loop.symmetry, list[int]()
+    symmetry, tested = registrar.loop.symmetry, list[int]()
     T_ac = seen_from(0.3, 0.5)
     scan = scan_of(pot(), T_ac, 1)
     visible = symmetry._visible

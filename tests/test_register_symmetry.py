@@ -65,7 +65,7 @@ def turns_deg(motions: Array) -> Array:
 
 def found_in(surface: Surface):
     registrar = Registrar(surface)
-    return near_symmetries(registrar._loop.symmetry.search, registrar.index, *sample(surface, 4000))
+    return near_symmetries(registrar.loop.symmetry.search, registrar.index, *sample(surface, 4000))
 
 
 @pytest.mark.parametrize(("teeth", "depth"), [(11, 0.2), (17, 0.2), (24, 0.15), (38, 0.12)])

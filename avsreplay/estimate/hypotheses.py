@@ -43,10 +43,7 @@ OVER_NEXT = 2.0
 # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _NONLINEAR = 2.0
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
-# instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
-_MANOEUVRE_INSTANTS = 8
-_FEWER = 4
-_LONG = 9
+_MANOEUVRE_INSTANTS = 8  # instants tried for a manoeuvre between two scans
 # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
 _LONGEST_SPREAD = 6
 # instants of a refined grid, refinements, share of evidence neglected
@@ -166,7 +163,7 @@ def _manoeuvre(
     """
     edges, lengths = window.edges_s[:-1], np.diff(window.edges_s)
     n = len(lengths)
-    count = _MANOEUVRE_INSTANTS if n < _LONG else _FEWER
+    count = _MANOEUVRE_INSTANTS
     instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
     columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)

@@ -195,7 +195,8 @@ _METHODS = {GicpCost.GICP: "GICP", GicpCost.PLANE: "PLANE_ICP"}
 
 class SmallGicpBackend(Backend):
     """GICP or point-to-plane ICP, coarse to fine: first with correspondences up to ``reach_m``,
-    then up to ``gate_m``.
+    then up to ``gate_m``. Points farther than ``reach_m`` from the model are left out: they match
+    nothing, and the library's search for the nearest point of the model takes longest for them.
 
     ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second,
     if it had an inlier.
@@ -215,19 +216,21 @@ class SmallGicpBackend(Backend):
 
         self._library: Any = small_gicp
         self._limits, self._own = target.limits, target.parameters(SmallGicpParams)
+        self._index = target.index
         points, _ = sample(target.surface, self._own.surface_points)
         self._cloud, self._tree = self._prepared(points)
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
-        if len(points) < self._own.neighbours:
-            return Fit(guess, 0, False)
-        scan, _ = self._prepared(np.ascontiguousarray(points, dtype=np.float64))
-        T_ca, passes, found = guess, 0, None
+        scan = np.ascontiguousarray(points, dtype=np.float64)
+        T_ca, passes, ended = guess, 0, False
         for reach in (self._limits.reach_m, self._limits.gate_m):
+            near = scan[self._index.closest(T_ca.apply(scan)).d2 < self._limits.reach_m**2]
+            if len(near) < self._own.neighbours:
+                return Fit(T_ca, passes, False)
             found = self._library.align(
                 self._cloud,
-                scan,
+                self._prepared(near)[0],
                 self._tree,
                 T_ca.matrix,
                 registration_type=_METHODS[self._own.cost],
@@ -238,9 +241,8 @@ class SmallGicpBackend(Backend):
                 translation_epsilon=STEP_EPS * self._limits.eps_m,
             )
             T_ca, passes = Pose.from_matrix(found.T_target_source), passes + int(found.iterations)
-        return Fit(
-            T_ca, passes, found is not None and bool(found.converged) and int(found.num_inliers) > 0
-        )
+            ended = bool(found.converged) and int(found.num_inliers) > 0
+        return Fit(T_ca, passes, ended)
 
     def _prepared(self, points: Array) -> tuple[Any, Any]:
         cloud = self._library.PointCloud(points)

@@ -30,6 +30,8 @@ class Registrar:
 
     Attributes:
         params, index: the parameters as given; the index of the model.
+        target, backend: what is registered to; the back end that aligns.
+        loop: what proposes poses, tests them and decides.
         limits: the same with every automatic length resolved for this surface.
         sided: the outer side of the faces is known.
     """
@@ -57,9 +59,9 @@ class Registrar:
             surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir
         )
         near = near_work(surface, self.index)
-        self._target = Target(surface, self.index, self.limits, self._visibility, near)
-        self._backend = create_backend(self.params, factory, self._target)
-        self._loop = Loop(self._target, self.params, self._backend, cache_dir)
+        self.target = Target(surface, self.index, self.limits, self._visibility, near)
+        self.backend = create_backend(self.params, factory, self.target)
+        self.loop = Loop(self.target, self.params, self.backend, cache_dir)
 
     def register(
         self,
@@ -91,23 +93,23 @@ class Registrar:
             then the guess.
         """
         whole = usable_points(points, self.params.subsample_m)
-        if refused := self._loop.test.refused(whole, len(points), guess):
+        if refused := self.loop.test.refused(whole, len(points), guess):
             return refused
-        scan, work = self._loop.test.around(whole, guess), self._work(whole)
+        scan, work = self.loop.test.around(whole, guess), self._work(whole)
         if effort is Effort.GUESS:
-            hopeful, spent = self._loop.screen.confirms(scan, guess)
+            hopeful, spent = self.loop.screen.confirms(scan, guess)
             work.spend(spent)
             if not hopeful:
                 status = AlignStatus.BUDGET_EXHAUSTED
                 return replace(quality.not_measured(len(scan), status, guess), message=POSTPONED)
-        few, halves = self._loop.screen.part(scan), seq % self.params.split_every == 0
+        few, halves = self.loop.screen.part(scan), seq % self.params.split_every == 0
         case = Case(Observed(whole), scan, few, work, guess, carried, halves, unknown)
-        found = self._loop.from_guess(case)
+        found = self.loop.from_guess(case)
         return found if found.points == len(whole) else replace(found, points=len(whole))
 
     def _work(self, scan: NDArray[Any]) -> Work:
         """The work that a scan may cost."""
-        return Work(healthy_work(len(scan), self._target.near_work))
+        return Work(healthy_work(len(scan), self.target.near_work))
 
     def acquire(
         self,
@@ -132,19 +134,19 @@ class Registrar:
             unobservable directions is not a different pose.
         """
         scan = usable_points(points, self.params.subsample_m)
-        if refused := self._loop.test.refused(scan, len(points)):
+        if refused := self.loop.test.refused(scan, len(points)):
             return refused
-        few, seen = self._loop.screen.part(scan), Observed(scan)
+        few, seen = self.loop.screen.part(scan), Observed(scan)
         found = None
         if ambiguous is not None:
-            found = self._loop.turned(Case(seen, scan, few, self._work(scan), ambiguous))
+            found = self.loop.turned(Case(seen, scan, few, self._work(scan), ambiguous))
         if found is not None and found.status is AlignStatus.AMBIGUOUS:
             return found
         if effort is not Effort.FULL and (found is None or found.status not in ACCEPTED):
             return replace(
                 quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED
             )
-        return self._loop.without_guess(Case(seen, scan, few, self._work(scan)))
+        return self.loop.without_guess(Case(seen, scan, few, self._work(scan)))
 
     def images(self, T_ac: Pose) -> list[Pose]:
         """Return the poses that no scan can tell from a pose, because an exact symmetry of the
@@ -153,7 +155,7 @@ class Registrar:
         Args:
             T_ac: the pose.
         """
-        return [T_ac, *(each.inverse() for each in self._loop.symmetry.images(T_ac.inverse()))]
+        return [T_ac, *(each.inverse() for each in self.loop.symmetry.images(T_ac.inverse()))]
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see

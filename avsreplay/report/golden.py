@@ -107,7 +107,7 @@ def read_golden(path: Path) -> dict[int, dict[str, Any]]:
     Raises:
         UnreadableInput: the file does not exist, or does not hold rows.
     """
-    if not path.is_file():
+    if not path.exists():
         raise UnreadableInput(
             "no such golden file", where=str(path), hint="--update-golden writes it"
         )

@@ -50,7 +50,7 @@ def main() -> None:
     means: dict[tuple[str, bool], list[float]] = defaultdict(list)
     for surface in scenes.meshes(args.bodies.split(",")).values():
         registrar = Registrar(surface)
-        model = EvidenceModel(registrar._target)
+        model = EvidenceModel(registrar.target)
         for name in SCENES:
             for k in range(args.views):
                 case = scenes.SCENES[name](surface, args.points, args.seed + 100 * k)
@@ -75,7 +75,7 @@ def _poses(registrar, model, case, seed):
     """Whether each of the registered poses of a scan is right, and its evidence."""
     rng = np.random.Generator(np.random.PCG64(seed))
     scan, extent = Observed(case.points), registrar.index.extent_m
-    vertices = registrar._target.surface.vertices
+    vertices = registrar.target.surface.vertices
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     starts = [case.truth]
     for degrees in np.linspace(30.0, 180.0, TURNS):
@@ -84,8 +84,8 @@ def _poses(registrar, model, case, seed):
         turn = Pose(q, middle - geometry.matrix(q) @ middle)
         starts.append(case.truth @ turn)
     for start in starts:
-        found = registrar._backend.align_within(case.points, start.inverse(), 0.05 * extent)
-        found = registrar._backend.align_within(case.points, found.T_ca, 0.01 * extent, near=True)
+        found = registrar.backend.align_within(case.points, start.inverse(), 0.05 * extent)
+        found = registrar.backend.align_within(case.points, found.T_ca, 0.01 * extent, near=True)
         at = model.at(scan, found.T_ca)
         step = case.truth.inverse() @ found.T_ca.inverse()
         angle = float(np.degrees(geometry.angle(step.q)))

@@ -276,7 +276,7 @@ def fixed_point(cloud: Surface, surface: Surface, args: argparse.Namespace) -> N
     )
     for mesh in real_meshes(surface, args):
         registrar = Registrar(mesh, RegisterParams(index_cache=False))
-        rule = registrar._backend._rules[True]
+        rule = registrar.backend._rules[True]
         exact = replace(rule, n_plane=0, few=0, tighten=0.0, eps_rad=1e-10, eps_m=1e-10)
         for outliers, deg, metres in STARTS:
             passes, far = [], []
@@ -357,7 +357,7 @@ def registered(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], t
 
 def aligned(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
     def run() -> tuple[Array, int]:
-        found = registrar._backend.align(scan, guess)
+        found = registrar.backend.align(scan, guess)
         return found.T_ca.matrix, found.iterations
 
     return run
@@ -416,8 +416,8 @@ def grading(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         one = Registrar(mesh, RegisterParams(index_cache=False))
         scan, truth = look(mesh, args.scan, 0.0, 3, partial(_ranges, one))
         guess = off(truth, 0.5, 0.01, 4)
-        fit = one._backend.align(scan, guess)
-        rest = (one._loop.grader._accuracy, True, guess)
+        fit = one.backend.align(scan, guess)
+        rest = (one.loop.grader._accuracy, True, guess)
         cases = {
             "register": Case(registered(one, scan, guess)),
             "align": Case(aligned(one, scan, guess)),

@@ -77,7 +77,7 @@ def difference(registrar: Registrar, points: Array, T_ac: Pose, half: Array) -> 
     found = [registrar.register(part, T_ac) for part in (points[half], points[~half])]
     steps = [T_ac.inverse() @ each.T_ac for each in found]
     d = np.subtract(*([*geometry.log(step.q), *step.t] for step in steps[::-1]))
-    target = registrar._target
+    target = registrar.target
     whole, first, second = (
         quality.evidence(target.index, target.visibility, part, T_ca, gate)
         for part in (points, points[half], points[~half])
@@ -93,7 +93,7 @@ def cost(registrar: Registrar, points: Array, T_ac: Pose) -> tuple[float, float]
     """Processor time of the systematic errors, and of the test of halves, over that of a
     registration.
     """
-    target, extent = registrar._target, registrar.index.extent_m
+    target, extent = registrar.target, registrar.index.extent_m
     found = quality.evidence(
         target.index, target.visibility, points, T_ac.inverse(), registrar.limits.gate_m
     )

@@ -16,11 +16,27 @@ constexpr double INSIDE = 0.52;   // winding number above which a point is insid
 constexpr double ROUNDING = 1e-9; // of a distance, relative to the coordinates
 constexpr size_t DEPTH = 96;      // of the tree: faces are halved, so that 2^32 of them need 32
 
-double solid_angle(const std::array<Vector3, 3>& face, const Vector3& q) {
-  const Vector3 a = face[0] - q, b = face[1] - q, c = face[2] - q;
-  const double la = norm(a), lb = norm(b), lc = norm(c);
-  return 2 * std::atan2(dot(a, cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb);
-}
+// Sum of the solid angles of faces: each is twice the angle of a complex number, so that one arc tangent of their product
+// serves all. A product of two numbers on one side of the real axis that ends on the other one has passed the angle pi.
+class SolidAngle {
+ public:
+  void add(const std::array<Vector3, 3>& face, const Vector3& q) {
+    const Vector3 a = face[0] - q, b = face[1] - q, c = face[2] - q;
+    const double la = norm(a), lb = norm(b), lc = norm(c);
+    const double re = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb, im = dot(a, cross(b, c));
+    const double x = re_ * re - im_ * im, y = re_ * im + im_ * re, size = std::abs(x) + std::abs(y);
+    if (!(size > 0)) return;  // a corner of the face
+    const bool side = std::signbit(im_);
+    if (side == std::signbit(im) && side != std::signbit(y)) turns_ += side ? -1 : 1;
+    re_ = x / size;
+    im_ = y / size;
+  }
+  double sum() const { return 2 * (std::atan2(im_, re_) + 2 * PI * turns_); }
+
+ private:
+  double re_ = 1, im_ = 0;
+  int turns_ = 0;
+};
 
 Vector3 closest_on_segment(const Vector3& a, const Vector3& b, const Vector3& q) {
   const Vector3 side = b - a;
@@ -121,6 +137,7 @@ void FaceTree::build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order,
 
 double FaceTree::winding(const Vector3& q) const {
   double sum = 0;
+  SolidAngle near;
   for (uint32_t i = 0; i < nodes_.size();) {
     const Node& node = nodes_[i];
     const Vector3 away = node.centre - q;
@@ -130,11 +147,11 @@ double FaceTree::winding(const Vector3& q) const {
       i = node.next;
     } else {
       if (node.next == i + 1)
-        for (uint32_t k = node.begin; k < node.end; ++k) sum += solid_angle(corners_[k], q);
+        for (uint32_t k = node.begin; k < node.end; ++k) near.add(corners_[k], q);
       ++i;
     }
   }
-  return sum / (4 * PI);
+  return (sum + near.sum()) / (4 * PI);
 }
 
 // Distance to the surface, which is known to be below ``most``.
@@ -183,7 +200,7 @@ double FaceTree::signed_distance(const Vector3& q, Near& last, Vector3* foot) co
   const double step = last.known ? norm(q - last.at) : 0, reached = std::abs(last.distance);
   const double most = last.known ? step + reached + ROUNDING * (nodes_[0].radius + norm(q - nodes_[0].centre)) : INFINITE;
   double found = distance(q, most, closest);
-  if (last.known && step < reached) {
+  if (last.known && (step < reached || step < found)) {
     found = std::copysign(found, last.distance);
   } else if (box_distance2(nodes_[0].low, nodes_[0].high, q) == 0 && winding(q) > INSIDE) {
     found = -found;

@@ -29,8 +29,8 @@ class FaceTree {
   FaceTree(const double* vertices, size_t vertex_count, const int32_t* faces, size_t count);
 
   // Signed distance of q, negative inside, and the closest point. ``last`` is a point nearby: the answer does not depend
-  // on it, except inside an open surface, but the search is shorter, and the winding number is not summed again within
-  // the ball around it that does not reach the surface.
+  // on it, except inside an open surface, but the search is shorter, and the winding number is not summed again where
+  // one of the balls around both that do not reach the surface contains the other point.
   double signed_distance(const Vector3& q, Near& last, Vector3* foot = nullptr) const;
 
  private:
