@@ -227,14 +227,18 @@ def small_gicp(
     points: Array, scan: Array, guess: Pose, kind: str, n_max: int, eps: float, threads: int = 1
 ) -> Callable[[], tuple[Array, int]]:
     import small_gicp as sg
+    from scipy.spatial import cKDTree
 
     target = sg.PointCloud(points)
     tree = sg.KdTree(target)
     sg.estimate_normals_covariances(target, tree, 10, 1)
     scan64, T0 = scan.astype(np.float64), guess.matrix
+    model = cKDTree(points)
 
     def run() -> tuple[Array, int]:
-        source = sg.PointCloud(scan64)
+        # the library's own search is slowest for points that match nothing
+        away = model.query(guess.apply(scan64), distance_upper_bound=REACH_M)[0]
+        source = sg.PointCloud(scan64[np.isfinite(away)])
         if kind == "GICP":
             sg.estimate_covariances(source, sg.KdTree(source, num_threads=threads), 10, threads)
         r = sg.align(
