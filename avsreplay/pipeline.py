@@ -293,8 +293,8 @@ class PipelineState:
         track: the estimate.  Both are None before the first scan.
         last_pose: last healthy measured pose, None before one.
         failed: what the scans showed before that pose whose searches found none.
-        ambiguous: T_ac of the last scan, if it is one of several that a nearly symmetric model
-            leaves, and no pose was healthy yet.
+        ambiguous: T_ac of the last measured scan, if it is one of several that a nearly symmetric
+            model leaves, and no pose was healthy yet.
         origin: where the first pose came from.
         followed: the target, where a region follows it.
         start_ns: instant of the first scan.
@@ -674,7 +674,7 @@ def _ambiguous(state: PipelineState, found: Alignment) -> Pose | None:
 def _failed(state: PipelineState, scan: Scan, found: Alignment) -> tuple[Array, ...]:
     """What the scans without an accepted pose showed whose searches found none, with this scan.
 
-    A pose that is one of several, as that of the scan before, took no search.
+    After an ambiguous scan, another one is none whose search failed.
     """
     if state.ambiguous is not None and found.status is AlignStatus.AMBIGUOUS:
         return state.failed

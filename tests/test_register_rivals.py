@@ -16,6 +16,7 @@ from avsreplay.register.generators.turns import Turns
 from avsreplay.register.hypotheses import Candidate, Case, Hypothesis
 from avsreplay.register.quality import left_undetermined
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import Effort
 from avsreplay.register.work import Work, healthy_work
 
@@ -107,6 +108,9 @@ def test_a_mark_out_of_sight_leaves_the_turn_open(sides, nozzle):
         assert np.linalg.norm(found.info @ axis) < 1e-2 * np.linalg.norm(found.info)
 
 
+SENSOR = Pose(exp([0.4, -1.1, 2.0]), np.array([8.0, -4.0, 1.0]))  # in a fixed frame
+
+
 @pytest.mark.slow
 def test_an_ambiguous_scan_is_followed_until_the_mark_decides():
     """Without another search: the turned poses of each scan are named, and one that shows the mark
@@ -127,6 +131,11 @@ def test_an_ambiguous_scan_is_followed_until_the_mark_decides():
         found = registrar.acquire(scan, Effort.GUESS, first.T_ac)
         assert found.status is AlignStatus.AMBIGUOUS
         assert len(found.members) > 1
+        fixed = SensorFrame(registrar, SENSOR).acquire(
+            SENSOR.apply(scan), Effort.GUESS, SENSOR @ first.T_ac
+        )
+        assert fixed.status is AlignStatus.AMBIGUOUS
+        assert np.allclose(fixed.T_ac.matrix, (SENSOR @ found.T_ac).matrix, atol=1e-5)
         upright = found.T_ac.R[:, 2] @ turned(angle).R[:, 2]
         assert abs(upright) > np.cos(np.radians(1.0))
         assert np.linalg.norm(found.T_ac.t - turned(angle).t) < 0.02

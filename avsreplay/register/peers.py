@@ -224,13 +224,16 @@ class SmallGicpBackend(Backend):
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
         T_ca, passes, ended = guess, 0, False
+        used, source = np.zeros(len(scan), dtype=bool), None
         for reach in (self._limits.reach_m, self._limits.gate_m):
-            near = scan[self._index.closest(T_ca.apply(scan)).d2 < self._limits.reach_m**2]
-            if len(near) < self._own.neighbours:
+            near = self._index.closest(T_ca.apply(scan)).d2 < self._limits.reach_m**2
+            if np.count_nonzero(near) < self._own.neighbours:
                 return Fit(T_ca, passes, False)
+            if not np.array_equal(near, used):
+                used, source = near, self._prepared(scan[near])[0]
             found = self._library.align(
                 self._cloud,
-                self._prepared(near)[0],
+                source,
                 self._tree,
                 T_ca.matrix,
                 registration_type=_METHODS[self._own.cost],

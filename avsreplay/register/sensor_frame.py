@@ -17,6 +17,7 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.shown import Effort
 
 
 @value_class
@@ -49,21 +50,27 @@ class SensorFrame:
             self.registrar.register(T_sa.apply(points), T_sa @ guess, *more), self.sensor
         )
 
-    def acquire(self, points: NDArray[Any], *more: Any) -> Alignment:
+    def acquire(
+        self,
+        points: NDArray[Any],
+        effort: Effort = Effort.FULL,
+        ambiguous: Pose | None = None,
+    ) -> Alignment:
         """Find the pose without a guess, as ``Registrar.acquire`` does.
 
         Args:
             points: (n, 3) in {A} [m].
-            more: the other arguments of ``Registrar.acquire``.
+            effort: as for ``Registrar.acquire``.
+            ambiguous: the same, T_ac of a scan shortly before; None for none.
 
         Returns:
             The pose T_ac with its quality.
         """
         if self.sensor is None:
-            return self.registrar.acquire(points, *more)
-        return self._in_a(
-            self.registrar.acquire(self.sensor.inverse().apply(points), *more), self.sensor
-        )
+            return self.registrar.acquire(points, effort, ambiguous)
+        T_sa = self.sensor.inverse()
+        before = None if ambiguous is None else T_sa @ ambiguous
+        return self._in_a(self.registrar.acquire(T_sa.apply(points), effort, before), self.sensor)
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, as ``Registrar.instants`` does.
