@@ -170,15 +170,16 @@ double FaceTree::winding(const Vector3& q) const {
   return (sum + near.sum()) / (4 * PI);
 }
 
-// Distance to the surface, which is known to be below ``most``. A face whose plane is farther away, by more than
-// ``rounding``, is not examined.
-double FaceTree::distance(const Vector3& q, double most, double rounding, Vector3& foot) const {
+// Distance to the surface, which is known to be below ``most``, and the closest face; ``face`` is one nearby. A face
+// whose plane is farther away, by more than ``rounding``, is not examined.
+double FaceTree::distance(const Vector3& q, double most, double rounding, Vector3& foot, uint32_t& face) const {
   struct Open {
     uint32_t node;
     double least2;
   };
   std::array<Open, DEPTH> stack;
   size_t depth = 0;
+  most = std::min(most, norm(closest_on_face(corners_[face], q) - q) + rounding);
   double best2 = most * most, examined = most + rounding;
   foot = corners_[0][0];
   stack[depth++] = {0, box_distance2(nodes_[0].low, nodes_[0].high, q)};
@@ -195,6 +196,7 @@ double FaceTree::distance(const Vector3& q, double most, double rounding, Vector
           best2 = d2;
           examined = std::sqrt(d2) + rounding;
           foot = p;
+          face = k;
         }
       }
       continue;
@@ -218,13 +220,14 @@ double FaceTree::signed_distance(const Vector3& q, Near& last, Vector3* foot) co
   }
   const double step = last.known ? norm(q - last.at) : 0, reached = std::abs(last.distance);
   const double rounding = ROUNDING * (norm(nodes_[0].high - nodes_[0].low) + norm(q - nodes_[0].low));
-  double found = distance(q, last.known ? step + reached + rounding : INFINITE, rounding, closest);
+  uint32_t face = last.face;
+  double found = distance(q, last.known ? step + reached + rounding : INFINITE, rounding, closest, face);
   if (last.known && (step < reached || step < found)) {
     found = std::copysign(found, last.distance);
   } else if (box_distance2(nodes_[0].low, nodes_[0].high, q) == 0 && winding(q) > INSIDE) {
     found = -found;
   }
-  last = {q, found, true};
+  last = {q, found, true, face};
   if (foot) *foot = closest;
   return found;
 }

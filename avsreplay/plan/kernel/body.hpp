@@ -18,6 +18,7 @@ struct Near {
   Vector3 at{};
   double distance = 0;  // signed
   bool known = false;
+  uint32_t face = 0;  // the closest one, in the order of the tree
 
   // Distance from q to the surface at least; negative where the ball around this point does not contain q.
   double least(const Vector3& q) const { return known ? std::abs(distance) - norm(q - at) : -HUGE_VAL; }
@@ -50,7 +51,7 @@ class FaceTree {
   void index() const;
   void build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order, const std::vector<Vector3>& middles) const;
   double winding(const Vector3& q) const;
-  double distance(const Vector3& q, double most, double rounding, Vector3& foot) const;
+  double distance(const Vector3& q, double most, double rounding, Vector3& foot, uint32_t& face) const;
 
   mutable std::once_flag built_;
   mutable std::vector<Face> corners_;
