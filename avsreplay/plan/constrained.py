@@ -59,7 +59,7 @@ SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, hav
 RENEWED_LATER = 1.02
 RENEWED_LATER_S = 0.1
 # time that is spared where the withdrawals from the earliest path miss margins, over its time to go
-SPARE = (5e-3, 2e-2)
+SPARE = (0.0, 5e-3, 2e-2)
 # relative change of the end time below which the excess tightens the constraints
 NEAR_REFERENCE = 0.02
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
@@ -311,14 +311,9 @@ def _best_path(
     """
     best: StepPath | None = None
     if warm is not None:
-        again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
-        enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
-        best = _refined(again, *warm, rough=True, enough_s=enough_s)
-        renewed_s = RENEWED_LATER * expected + RENEWED_LATER_S
-        if best is not None and best.short_m > 0.0:
-            slower = _unhurried(again, *warm, max(expected, best.t_go_s))
-            best = _safest_of(chain((best,), slower))
-        if best is not None and best.t_go_s <= renewed_s:
+        best = _safest_of(_renewed(case, *warm))
+        latest_s = max(expected_s(case, *warm), case.earliest_s) * (1.0 + SPARE[-1])
+        if best is not None and best.t_go_s <= (1.0 + ROUGH_TOLERANCE) * latest_s + TIME_TOLERANCE_S:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -374,7 +369,7 @@ def _withdrawing(
     the drafts, then from initial paths.
     """
     yield _refined(case, found)
-    yield from _unhurried(case, found, 0.0, found.t_go_s)
+    yield from _unhurried(case, found, 0.0, found.t_go_s, SPARE[1:])
     for start in drafts[:IMPROVED]:
         yield _refined(case, start)
     for start in (found, *drafts[:IMPROVED]):
@@ -383,14 +378,20 @@ def _withdrawing(
         yield _converged(case, reference)
 
 
+def _renewed(case: Case, path: RobotPath, since_s: float) -> Iterator[StepPath | None]:
+    """Refine the rest of an earlier path: for its capture time, then with time to spare."""
+    again = shortened(case, path, since_s)
+    yield from _unhurried(again, path, since_s, path.t_go_s - since_s, SPARE)
+
+
 def _unhurried(
-    case: Case, path: RobotPath, since_s: float, earliest_s: float
+    case: Case, path: RobotPath, since_s: float, earliest_s: float, spare: tuple[float, ...]
 ) -> Iterator[StepPath | None]:
     """Refine a path with time to spare, with which margins can be kept that the earliest path
     misses.
     """
-    for spare in SPARE:
-        later = replace(case, earliest_s=max(case.earliest_s, (1.0 + spare) * earliest_s))
+    for share in spare:
+        later = replace(case, earliest_s=max(case.earliest_s, (1.0 + share) * earliest_s))
         yield _refined(later, path, since_s, rough=True, enough_s=math.inf)
 
 
