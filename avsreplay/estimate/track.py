@@ -124,7 +124,7 @@ class Track:
         rejected: the last poses since the last accepted scan that nothing explained.
         bias: an error of the sensor in effect, or None.
         started_ns: instant of the first scan of this estimate.
-        previous: the estimate before the last new start, None where there was none.
+        previous: the estimate before the last manoeuvre or new start, None where there was none.
         manoeuvres: all that were found.
         pending: the last of them is reported, and the motion after it not determined.
         drift: a constant torque or force on the target, None where none is found.
