@@ -66,7 +66,7 @@ class Epoch:
     prediction and innovation.
     """
 
-    track: Track
+    track: Track = field(repr=False)
     prediction: Prediction
     innovation: Innovation
     converged: bool
@@ -161,7 +161,7 @@ class Track:
     nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
     started_ns: int = 0
-    previous: Track | None = None
+    previous: Track | None = field(default=None, repr=False)
     manoeuvres: tuple[Manoeuvre, ...] = ()
     pending: bool = False
     drift: Drift | None = None
