@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
-from avsreplay.estimate import Prediction, Track, in_doubt, with_change
+from avsreplay.estimate import Prediction, Track, after_change, in_doubt
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.kinematic import Motion, kinematic_track
@@ -181,7 +181,7 @@ class Monitors:
         if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
             after_s = np.array([planned.after_s()])
             forecast = estimator.track_forecast(track, after_s, seen.grasp_c)
-        possible = with_change(forecast, belief, track.change_P)
+        possible = after_change(belief, forecast.times_s, track.change_probability, track.change_P)
         turns = state.turns
         if seen.alignment.measured:
             turns = turns.after(belief.t_ns, seen.alignment.T_ac.q)

@@ -510,6 +510,19 @@ class Forecast:
     rot_1s_rad: Array
 
 
+@value_class
+class Possible:
+    """A change of the motion that the last scans make possible.
+
+    Attributes:
+        probability: that it has happened.
+        errors: root mean square of the error of the grasp point that it has then caused.
+    """
+
+    probability: float
+    errors: Forecast
+
+
 Trajectory = Callable[
     [Array], tuple[Array, Array]
 ]  # times (n,) [s] -> r (n, 3) [m], v (n, 3) [m/s] of {C} in {A}

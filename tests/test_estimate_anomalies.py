@@ -26,7 +26,7 @@ from avsreplay.estimate import (
     pose_differences,
     scan_window,
 )
-from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state, with_change
+from avsreplay.estimate.dynamics import after_change, grasp_forecast, propagate, propagate_state
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
@@ -875,6 +875,33 @@ def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.Mon
     assert all(gamma for t, gamma in zip(result.t, result.gamma, strict=True) if t > 53.0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_end_of_a_drift_of_the_ranges_restores_the_estimate_before_it(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Ranges that grow by 10 mm/s from 40 to 46 s are those of a target that is pushed, until they
+    are right again: then it was not pushed.
+    """
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        given = simulated(case, times, states, seed)
+        along = [0.01 * (t - case.at_s) * (case.at_s <= t < case.until_s) for t in times]
+        return [
+            replace(a, T_ac=Pose(a.T_ac.q, a.T_ac.t + d * a.T_ac.t / np.linalg.norm(a.T_ac.t)))
+            for a, d in zip(given, along, strict=True)
+        ]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+    case = surprises.Case("drift", at_s=40.0, until_s=46.0, seconds=52.0)
+    result = surprises.run(case, seed)
+    assert result.track is not None
+    pushes, started_ns = len(result.track.manoeuvres), result.track.started_ns
+    assert (pushes, started_ns) == (0, 0)
+    assert max(e for (e, _), t in zip(result.error, result.t, strict=True) if t > 48.0) < 0.01
+
+
 def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The offset stays, because the prediction has it: the scans from 60 s on have half of
     the residuals.
@@ -971,9 +998,9 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(
     assert 0.8 * density < np.sqrt(np.mean(np.square(found))) < 1.3 * density
 
 
-def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
-    """Mean square over motions of which a fifth has a change of the velocities; a linear
-    motion of the mass centre.
+def test_the_errors_of_a_possible_change_are_those_given_that_it_has_happened() -> None:
+    """Mean square over changes of the velocities; a linear motion of the mass centre. Together with
+    the motion without it, by its probability, they make the variance of the mixture.
     """
     world, rng, share = tumbling.draw(3, seconds=1.0), np.random.Generator(np.random.PCG64(4)), 0.2
     x, times = world.states[0], np.array([5.0, 30.0])
@@ -982,11 +1009,14 @@ def test_a_forecast_with_a_possible_change_is_that_of_the_mixture() -> None:
     plain, changed = (
         grasp_forecast(Belief(0, x, C), times, 1e-6, 1e-6) for C in (belief.P, belief.P + P)
     )
-    found = with_change(plain, belief, share * P)
-    assert with_change(plain, belief, np.zeros((20, 20))) is plain
+    found = after_change(belief, times, share, share * P)
+    assert found is not None
+    assert found.probability == share
+    assert after_change(belief, times, share, np.zeros((20, 20))) is None
+    assert after_change(belief, times, 0.0, np.zeros((20, 20))) is None
     for name in ("pos_1s_m", "vel_1s_mps", "rot_1s_rad"):
-        before, after, mixed = (getattr(f, name) ** 2 for f in (plain, changed, found))
-        assert mixed == pytest.approx((1.0 - share) * before + share * after, rel=1e-9)
+        before, after, error = (getattr(f, name) ** 2 for f in (plain, changed, found.errors))
+        assert error == pytest.approx(after - before, rel=1e-9)
 
 
 @pytest.mark.parametrize("least", [0.0, 1e-3, math.inf])

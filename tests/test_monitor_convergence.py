@@ -8,9 +8,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Criterion, block_1s
-from avsreplay.records import BLOCKS, Belief, Forecast, State
+from avsreplay.records import BLOCKS, Belief, Forecast, Possible, State
 
 X = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
 PAPER = ConvergenceParams(criterion=Criterion.COVARIANCE)
@@ -97,7 +98,9 @@ def test_the_test_of_the_paper_looks_at_the_covariance_only() -> None:
     printed method.
     """
     convergence = Convergence(PAPER, 8.0, TOLERANCE)
-    track = fold(convergence, [(belief(t), ahead(), False, ahead(1e9)) for t in range(9)])
+    track = fold(
+        convergence, [(belief(t), ahead(), False, Possible(1.0, ahead(1e9))) for t in range(9)]
+    )
     assert track.converged
     assert track.t1_ns == 0
 
@@ -126,8 +129,8 @@ def test_params() -> None:
 
 
 def test_a_possible_change_withholds_convergence_and_does_not_interrupt_the_dwell() -> None:
-    convergence, far = Convergence(ConvergenceParams(), 8.0, TOLERANCE), ahead(pos=1.0)
-    steps = [(belief(float(t)), ahead(), True, far if t in (1, 6) else ahead()) for t in range(9)]
+    convergence, far = Convergence(ConvergenceParams(), 8.0, TOLERANCE), Possible(0.4, ahead(1.0))
+    steps = [(belief(float(t)), ahead(), True, far if t in (1, 6) else None) for t in range(9)]
     assert [fold(convergence, steps[: n + 1]).converged for n in range(9)] == [
         t >= 2 and t != 6 for t in range(9)
     ]
@@ -145,3 +148,25 @@ def test_the_tolerance_of_the_task_decides_and_a_flight_goes_on_up_to_twice_the_
             for t in range(5):
                 track = convergence.judge(track, belief(float(t)), seen, flown=flown)
             assert track.converged is expected
+
+
+@pytest.mark.parametrize("sigmas", [1.0, 2.0])
+def test_a_possible_change_counts_by_the_probability_of_an_error_above_the_tolerance(
+    sigmas: float,
+) -> None:
+    """Against the distribution itself: a normal error with a second component of the change."""
+    convergence = Convergence(ConvergenceParams(sigmas=sigmas), 8.0, TOLERANCE)
+    most = 2.0 * norm.sf(sigmas)
+    counted = {False: 0, True: 0}
+    for share in (0.1, 0.5, 0.9, 0.99):
+        for probability in (0.001, 0.02, 0.1, 0.3, 0.4, 0.9):
+            for far in (0.0, 0.5, 2.0, 1e6):
+                free, more = share / sigmas, far * TOLERANCE[0]
+                seen, change = ahead(pos=free * TOLERANCE[0]), Possible(probability, ahead(more))
+                wide = 2.0 * norm.sf(1.0 / math.hypot(free, far))
+                beyond = (1 - probability) * 2.0 * norm.sf(1.0 / free) + probability * wide
+                steps = [(belief(float(t)), seen, True, change) for t in range(5)]
+                converged = fold(convergence, steps).converged
+                assert converged == (beyond <= most)
+                counted[converged] += 1
+    assert min(counted.values()) > 20

@@ -14,9 +14,9 @@ except ImportError:
         " outside of it",
     ) from None
 
-from avsreplay.estimate.dynamics import with_change
+from avsreplay.estimate.dynamics import after_change
 from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.track import Prediction, Track, in_doubt
 
-__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track", "in_doubt", "with_change"]
+__all__ = ["Estimator", "EstimatorParams", "Prediction", "Track", "after_change", "in_doubt"]

@@ -19,7 +19,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import IDENTITY_QUAT, Array, skew
-from avsreplay.records import Belief, Forecast, State, Trajectory
+from avsreplay.records import Belief, Forecast, Possible, State, Trajectory
 
 Triple = tuple[float, float, float]
 
@@ -322,26 +322,19 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     return forecast_of(times, _motion.forecast(x.flat, P, density, force**2, times))
 
 
-def with_change(forecast: Forecast, belief: Belief, P: Array) -> Forecast:
-    """The forecast with a possible change of the motion, by the law of total covariance at each
-    instant.
+def after_change(belief: Belief, times_s: Array, probability: float, P: Array) -> Possible | None:
+    """What a possible change of the motion means for the grasp point; None where none is possible.
 
     Args:
-        forecast: of the motion without a change.
-        belief: at its beginning.
-        P: (20, 20) second moments of the error that the change has caused by then, times its
-            probability.
+        belief: now.
+        times_s: (n,) >= 0, ascending [s after now].
+        probability: of the change.
+        P: (20, 20) second moments of the error that it has caused by now, times its probability.
     """
-    if not P.any():
-        return forecast
-    more = grasp_forecast(Belief(belief.t_ns, belief.x, P), forecast.times_s, 0.0, 0.0)
-    position, velocity = (
-        np.hypot(forecast.pos_1s_m, more.pos_1s_m),
-        np.hypot(forecast.vel_1s_mps, more.vel_1s_mps),
-    )
-    return Forecast(
-        forecast.times_s, position, velocity, np.hypot(forecast.rot_1s_rad, more.rot_1s_rad)
-    )
+    if not (probability > 0.0 and P.any()):
+        return None
+    changed = Belief(belief.t_ns, belief.x, P / probability)
+    return Possible(probability, grasp_forecast(changed, times_s, 0.0, 0.0))
 
 
 def ascending(times_s: Array) -> Array:

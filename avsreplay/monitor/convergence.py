@@ -20,7 +20,7 @@ from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.monitor import _root
 from avsreplay.monitor.chi_square import mean_band
-from avsreplay.records import BLOCKS, UNLIKELY, Belief, Forecast, Innovation
+from avsreplay.records import BLOCKS, UNLIKELY, Belief, Forecast, Innovation, Possible
 from avsreplay.settings import Settings, given, setting
 
 ABORT_ERROR_RATIO = 2.0  # a flight goes on up to this multiple of the error with which it may begin
@@ -322,7 +322,7 @@ class Convergence:
         belief: Belief,
         forecast: Forecast | None = None,
         consistent: bool = True,
-        possible: Forecast | None = None,
+        possible: Possible | None = None,
         flown: bool = False,
     ) -> ConvergenceTrack:
         """Return the state after one more scan. By the predictive criterion an inconsistent
@@ -334,9 +334,9 @@ class Convergence:
             forecast: predicted 1 sigma of the grasp point at the planned capture; needed by the
                 predictive criterion.
             consistent: of the consistency tests.
-            possible: the forecast with a change that the last scans make possible. While it exceeds
-                a limit, convergence is not claimed. The dwell goes on: once later scans exclude the
-                change, the test has held.
+            possible: a change that the last scans make possible. While it makes an error above the
+                tolerance too likely (``_within``), convergence is not claimed. The dwell goes on:
+                once later scans exclude the change, the test has held.
             flown: a plan is flown: further scans will arrive before the capture, so that the
                 flight is given up only where the error is ``ABORT_ERROR_RATIO`` times as large.
         """
@@ -344,9 +344,8 @@ class Convergence:
         unknown = tuple(
             name for name, limit in self._limits.items() if not one_sigma[name] <= limit
         )
-        predictive = forecast is not None and self.ratio(forecast) <= (
-            ABORT_ERROR_RATIO if flown else 1.0
-        )
+        allowed = ABORT_ERROR_RATIO if flown else 1.0
+        predictive = forecast is not None and self.ratio(forecast) <= allowed
         printed = (
             self.params.criterion is Criterion.COVARIANCE
         )  # the paper's test looks at the covariance only
@@ -354,14 +353,29 @@ class Convergence:
         if not holds:
             return ConvergenceTrack(False, track.t1_ns, None, not unknown, predictive, unknown)
         since = belief.t_ns if track.since_ns is None else track.since_ns
-        excluded = (
-            possible is None
-            or printed
-            or self.ratio(possible) <= (ABORT_ERROR_RATIO if flown else 1.0)
-        )
-        converged = excluded and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
+        within = printed or forecast is None or self._within(forecast, possible, allowed)
+        converged = within and (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)
+
+    def _within(self, forecast: Forecast, possible: Possible | None, allowed: float) -> bool:
+        """Return whether an error above ``allowed`` tolerances is no more likely than a 1 sigma at
+        the limit makes it.
+
+        A change contributes at most its probability, however large its effect.
+        """
+        if possible is None:
+            return True
+        p, unit = possible.probability, allowed * np.array(self._tolerance)[:, None]
+        free, changed = (
+            np.array([f.pos_1s_m, f.vel_1s_mps, f.rot_1s_rad]) / unit
+            for f in (forecast, possible.errors)
+        )
+        most = _beyond(1.0 / self.params.sigmas)
+        return all(
+            (1.0 - p) * _beyond(a) + p * _beyond(math.hypot(a, b)) <= most
+            for a, b in zip(free.flat, changed.flat, strict=True)
+        )
 
     def ratio(self, forecast: Forecast) -> float:
         """Return the largest predicted error in units of its tolerance.
@@ -374,3 +388,8 @@ class Convergence:
             float(values.max()) / limit
             for values, limit in zip(predicted, self._tolerance, strict=True)
         )
+
+
+def _beyond(one_sigma: float) -> float:
+    """Probability that a normal variable of this 1 sigma is above 1 in magnitude."""
+    return math.erfc(math.sqrt(0.5) / one_sigma) if one_sigma else 0.0

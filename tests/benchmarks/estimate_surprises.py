@@ -38,7 +38,7 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.chart import ARM, ETA, INERTIA, RATE, to_chart, to_errors
-from avsreplay.estimate.dynamics import with_change
+from avsreplay.estimate.dynamics import after_change
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import in_doubt
@@ -286,7 +286,9 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         result.failed_at += [t] * len(failed)
         honest = honest and not in_doubt(track) and not failed
         forecast = estimator.track_forecast(track, np.array([30.0]))
-        possible = with_change(forecast, track.belief, track.change_P)
+        possible = after_change(
+            track.belief, forecast.times_s, track.change_probability, track.change_P
+        )
         word = test.judge(word, track.belief, forecast, honest, possible)
         published = estimator.published(track)
         score(result, t, x, published, verdict.gamma, verdict.reason.value, word.converged)
