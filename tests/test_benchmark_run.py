@@ -2,6 +2,7 @@
 
 import json
 import xml.etree.ElementTree as ElementTree
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,14 @@ from avsreplay.assessment import Assessment, Chance, InFact
 from avsreplay.benchmark import results
 from avsreplay.benchmark.prepared import Prepared
 from avsreplay.benchmark.scores import MEASURES, difference, scores
-from avsreplay.benchmark.work import capture_of, events_of, pose_nees
+from avsreplay.benchmark.work import RunScorer, capture_of, events_of, pose_nees
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import IDENTITY_QUAT, Pose, exp
 from avsreplay.outcome import CaptureError
-from avsreplay.records import Belief, State
+from avsreplay.plan.uncertainty import Tolerance
+from avsreplay.records import Belief, Label, ScanStatus, State
 from avsreplay.report.summary_parts import VelocityChange
+from avsreplay.rows import Row
 
 SHORT = ("benchmark", "--quick", "--only", "clean-fast,real-tosses", "--n-scans", 6)
 
@@ -225,3 +228,91 @@ def test_the_nees_of_a_pose_is_that_of_its_error_and_covariance():
 
 
 THREE = np.zeros(2), np.zeros(3)
+
+
+def scored(rows, labels=(), **log):
+    """Scores of rows on a target of 2 m whose capture allows 10 mm and 1 deg; the true pose is
+    known at every row.
+    """
+    given = SimpleNamespace(
+        header=SimpleNamespace(labels=labels),
+        surface=SimpleNamespace(extent=2.0),
+        task=SimpleNamespace(tolerance=Tolerance(0.01, 0.005, 1.0)),
+        truth=None,
+    )
+    x = State(IDENTITY_QUAT, np.zeros(3), np.zeros(3), np.zeros(3), *THREE, IDENTITY_QUAT)
+    belief = Belief(0, x, np.eye(20))
+    scorer = RunScorer(given, Prepared("a", "clean", 0, **log))
+    for row in rows:
+        scan = SimpleNamespace(status=ScanStatus.OK, log_ns=row.t_ns)
+        outcome = SimpleNamespace(scan=scan, belief=belief)
+        truth = SimpleNamespace(pose=Pose(IDENTITY_QUAT, np.zeros(3)))
+        scorer.take(SimpleNamespace(row=row, outcome=outcome, truth=truth))
+    return scorer.result(SimpleNamespace(**vars(summary()), assessment=None))
+
+
+@pytest.mark.parametrize(("truth_m", "truth_deg"), [(0.0, 0.0), (0.004, 0.3)])
+def test_limits_of_wrong_poses_and_claims_are_added_to_the_accuracy_of_the_truth(
+    truth_m, truth_deg
+):
+    """A used pose is wrong beyond 2 % of the extent of 2 m or 2 deg, a claim beyond the tolerance
+    of the capture.
+    """
+    limits = (
+        (0.04, 2.0, "reg_pos_err_m", "reg_rot_err_deg", "wrong"),
+        (*(0.01, 1.0, "pos_err_m", "rot_err_deg", "wrong_claims"),),
+    )
+    for limit_m, limit_deg, *names, count in limits:
+        for part, off in product((0, 1), (-1e-6, 1e-6)):
+            errors = [0.0, 0.0]
+            errors[part] = (limit_m + truth_m, limit_deg + truth_deg)[part] + off
+            row = Row(t_ns=0, gamma=1, converged=True, **dict(zip(names, errors, strict=True)))
+            found = scored([row], truth_m=truth_m, truth_deg=truth_deg)
+            assert found[count] == (off > 0.0)
+
+
+def test_scans_are_counted_by_their_use_and_by_the_labels_of_the_log():
+    label = Label("dropout", 10, 20)
+    wrong = {"reg_pos_err_m": 1.0, "reg_rot_err_deg": 0.0}
+    rows = [Row(t_ns=t, gamma=t % 2) for t in range(9, 22)]
+    rows += [Row(t_ns=30, gamma=1, **wrong), Row(t_ns=31, gamma=1, status="degenerate", **wrong)]
+    rows += [Row(t_ns=32, gamma=0, **wrong), Row(t_ns=33, converged=True, pos_err_m=None)]
+    found = scored(rows, [label, Label("drift", 0, 99, harmful=False)])
+    assert found["scans"] == 17
+    assert found["usable"] == 17 - 10  # 10 to 19
+    assert found["used"] == 7 + 2  # odd from 9 to 21
+    assert found["used_usable"] == 9 - 5
+    assert (found["judged"], found["wrong"]) == (1, 1)
+    assert (found["claims"], found["wrong_claims"]) == (0, 0)
+
+
+def test_errors_are_those_of_the_second_half():
+    off_m = (1.0, 0.02)
+    rows = [
+        Row(t_ns=k, converged=False, pos_err_m=off_m[k // 4], rot_err_deg=0.5 * k) for k in range(8)
+    ]
+    found = scored(rows)
+    assert found["position_permille"] == pytest.approx(10.0)
+    assert found["attitude_deg"] == pytest.approx(0.5 * np.sqrt(np.mean(np.arange(4, 8) ** 2)))
+
+
+def test_an_entry_that_is_missing_is_in_the_table_of_all_groups_only():
+    entries = [{"name": "x+own", "missing": ""}, {"name": "y+own", "missing": "not installed"}]
+    found = results.document(SUITE, entries, [run(), run(group="moved")])
+    for group, counts in ({"all": ["2"], "clean": ["1"], "moved": ["1"]}).items():
+        for times in (None, {"x+own": 3.0}):
+            table = results.score_table(found, group, times)
+            lost = [["y+own", "not installed"]] * (group == "all")
+            assert [list(row[:2]) for row in table.rows] == [["x+own", *counts], *lost]
+            assert {len(row) for row in table.rows} == {len(table.heads)}
+
+
+def test_counts_of_a_run_have_no_decimals_and_figures_have():
+    found = results.document(SUITE, [], [run(wrong=3, nees=1.25, attitude_deg=0.5)])
+    table = results.scenario_table(found, "x+own")
+    shown = dict(zip(table.heads, table.rows[0], strict=True))
+    assert shown["scenario"] == "a 0"
+    assert shown["wrong pose"] == "3"
+    assert shown[of("nees").head] == "1.25"
+    assert shown[of("attitude_deg").head] == "0.5"
+    assert shown[of("brier").head] == "-"

@@ -875,6 +875,33 @@ def test_an_offset_that_varies_with_the_view_is_one_bias(monkeypatch: pytest.Mon
     assert all(gamma for t, gamma in zip(result.t, result.gamma, strict=True) if t > 53.0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_end_of_a_drift_of_the_ranges_restores_the_estimate_before_it(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Ranges that grow by 10 mm/s from 40 to 46 s are those of a target that is pushed, until they
+    are right again: then it was not pushed.
+    """
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        given = simulated(case, times, states, seed)
+        along = [0.01 * (t - case.at_s) * (case.at_s <= t < case.until_s) for t in times]
+        return [
+            replace(a, T_ac=Pose(a.T_ac.q, a.T_ac.t + d * a.T_ac.t / np.linalg.norm(a.T_ac.t)))
+            for a, d in zip(given, along, strict=True)
+        ]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+    case = surprises.Case("drift", at_s=40.0, until_s=46.0, seconds=52.0)
+    result = surprises.run(case, seed)
+    assert result.track is not None
+    pushes, started_ns = len(result.track.manoeuvres), result.track.started_ns
+    assert (pushes, started_ns) == (0, 0)
+    assert max(e for (e, _), t in zip(result.error, result.t, strict=True) if t > 48.0) < 0.01
+
+
 def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The offset stays, because the prediction has it: the scans from 60 s on have half of
     the residuals.

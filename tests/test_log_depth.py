@@ -269,6 +269,19 @@ def test_rays_of_any_lens_are_those_that_it_images_at_the_pixels(data):
     assert known.mean() > 0.5
 
 
+@pytest.mark.parametrize("k1", [-0.6, -0.2, -0.05])
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.97])
+def test_directions_are_found_nearly_up_to_the_fold_of_a_lens(k1, share):
+    """Of a radial lens the image of a direction of slope r grows up to r^2 = 1 / (3 |k1|)."""
+    for angle in np.radians([0.0, 30.0, 60.0, 135.0, 250.0]):
+        r = share / np.sqrt(-3.0 * k1)
+        direction = r * np.array([np.cos(angle), np.sin(angle)])
+        seen = direction * (1.0 + k1 * r * r)
+        centre = (-500.0 * seen[0], -400.0 * seen[1])
+        camera = Camera((500.0, 400.0), centre, None, "plumb_bob", (k1, 0.0, 0.0, 0.0, 0.0))
+        np.testing.assert_allclose(rays(camera, 1, 1)[0][0, 0], direction, atol=1e-4)
+
+
 def test_pixels_beyond_the_fold_of_a_lens_give_no_point():
     camera = Camera((10.0, 10.0), (16.0, 12.0), None, "plumb_bob", (-0.6, 0.0, 0.0, 0.0, 0.0))
     raw = depth_cloud(DepthImage(0, "", np.full((H, W), 1000, np.uint16)), camera)

@@ -496,6 +496,19 @@ def test_free_motion_gives_mass_centre_and_smooths_poses():
     assert np.sqrt(np.mean(np.square(off))) < 0.7 * np.sqrt(np.mean(np.square(raw)))
 
 
+@pytest.mark.parametrize("noise", [(0.2, 0.0), (1.2, 0.0), (0.0, 0.012)])
+def test_whether_poses_follow_a_free_motion_does_not_depend_on_the_unit_of_length(noise):
+    found = []
+    for scale in (0.1, 8.0):
+        t_ns, poses, _ = tumble(noise_deg=noise[0], noise_m=noise[1])
+        motion = free_motion(t_ns, [Pose(T.q, scale * T.t) for T in poses], scale)
+        found.append(None if motion is None else np.array([motion.at(t).t for t in t_ns]) / scale)
+    if max(noise) in (1.2, 0.012):  # 1.8 and 2 % of the extent on the surface
+        assert found == [None] * 2
+    else:  # 0.3 %
+        np.testing.assert_allclose(found[0], found[1], atol=1e-3)
+
+
 WEAK = """
 seed = 4
 duration_s = 48.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from oracles.covariance import difference_covariance
 from oracles.residuals import summed
 from scipy.stats import chi2, f
 
+from avsreplay import geometry
 from avsreplay.register.covariance import (
     Evidence,
     registration_covariance,
@@ -20,6 +23,12 @@ from avsreplay.register.covariance import (
     without_dominant_patches,
 )
 from avsreplay.register.degenerate import unbounded_directions
+from avsreplay.register.registrar import Registrar
+from avsreplay.simulate.target import builtin_surface
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+import registration_noise
+import scenes
 
 
 @pytest.mark.parametrize("patches", [5, 8, 9, 30, 122])
@@ -241,6 +250,22 @@ def test_an_error_of_the_ranges_that_varies_over_the_image_is_in_the_covariance(
     known, unknown = np.mean(squared, axis=0)
     assert 0.5 < known < 2.0
     assert unknown > 4.0
+
+
+@pytest.mark.slow
+def test_claims_hold_for_scans_whose_ranges_err_as_much_over_the_image_as_by_noise() -> None:
+    """Faces in few directions: an error of the ranges must not pass for noise in them."""
+    surface = builtin_surface()
+    registrar, squared = Registrar(surface), []
+    for seed in range(273, 1473, 100):
+        v = scenes.view(surface, 4000, seed)
+        points = v.points + scenes.NOISE * surface.extent * registration_noise.waves(v)
+        found = registrar.register(points, scenes.off(v, 0.5, 0.002))
+        error = found.T_ac.inverse() @ v.T_ac
+        d = np.concatenate([geometry.log(error.q), error.t])
+        assert found.covariance is not None
+        squared.append(d @ np.linalg.solve(found.covariance, d) / 6.0)
+    assert 0.6 < np.mean(squared) < 2.0
 
 
 @pytest.mark.parametrize("ranges", [0.0, 0.003])

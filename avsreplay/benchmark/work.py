@@ -114,7 +114,7 @@ def run_benchmark_task(task: BenchmarkTask) -> RunResult:
     begin = time.perf_counter()
     try:
         with Run(job) as run:
-            scorer = _Scorer(run, task.log)
+            scorer = RunScorer(run, task.log)
             for _ in run.rows([scorer.take]):
                 pass
             spent_s = time.perf_counter() - begin
@@ -125,8 +125,13 @@ def run_benchmark_task(task: BenchmarkTask) -> RunResult:
     return RunResult(task.id, "ok", None, found)
 
 
-class _Scorer:
-    """Counts scan by scan."""
+class RunScorer:
+    """Counts scan by scan what a run is scored by.
+
+    Args:
+        run: its header, target, task and truth.
+        log: the scenario.
+    """
 
     def __init__(self, run: Run, log: Prepared) -> None:
         self._log, self._run = log, run

@@ -219,6 +219,8 @@ class AnomalyTest:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Finding.OPEN)
         best, explained = ranked[0], ranked[0].explains
+        if doubtful >= _FEWEST_DOUBTFUL and (resumed := self._resumed(track)) is not None:
+            return resumed, Finding.EXPLAINED
         if doubtful < _MOST_DOUBTFUL and not certain(ranked):
             return in_doubt
         manoeuvre = best.hypothesis is Hypothesis.MANOEUVRE and explained
@@ -265,11 +267,8 @@ class AnomalyTest:
 
         A range error deforms the scan, so the rms residual steps with it where the scan is
         registered. Otherwise the poses that have been consistent for longer than sensor errors
-        usually last are taken as correct. A pose that the estimate before a new start predicted
-        ends the error that caused the new start.
+        usually last are taken as correct.
         """
-        if self._previous_agrees(track):
-            return False
         before, after = (
             np.array([e.innovation.rms_m for e in epochs if e.innovation.rms_m > 0.0])
             for epochs in (track.recent, track.doubtful)
@@ -298,15 +297,13 @@ class AnomalyTest:
         """The track initialised anew from the doubtful poses if they agree with one another;
         else they are bad.
         """
-        old = track.previous
-        if old is not None and self._previous_agrees(track):
-            anew: Track | None = self._used(with_history(old, track), track.doubtful)
-        else:
-            track = self._with_rejected(track)
-            levels = self._disturbances(track)
-            anew = self._initialised_anew(track, levels)
-            if anew is None and levels.count:
-                anew = self._started(track, track.doubtful[-_FEWEST_DOUBTFUL:], levels)
+        if (resumed := self._resumed(track)) is not None:
+            return resumed, Finding.EXPLAINED
+        track = self._with_rejected(track)
+        levels = self._disturbances(track)
+        anew = self._initialised_anew(track, levels)
+        if anew is None and levels.count:
+            anew = self._started(track, track.doubtful[-_FEWEST_DOUBTFUL:], levels)
         if anew is not None:
             return anew.changed(reinitialised=track.reinitialised + 1), Finding.EXPLAINED
         left = with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST_DOUBTFUL :])
@@ -329,16 +326,17 @@ class AnomalyTest:
                 return NoiseLevels(torque=found[0], force=found[1], count=1)
         return NO_LEVELS
 
-    def _previous_agrees(self, track: Track) -> bool:
-        """Return whether the estimate before the last new start predicted the doubtful poses to
-        within its errors.
+    def _resumed(self, track: Track) -> Track | None:
+        """The estimate before the last manoeuvre or new start, continued with the doubtful poses,
+        if it predicted them to within its errors and the present one did not: what caused the
+        change was an error of the sensor. None where it did not predict them.
         """
         old = track.previous
         if (
             old is None
             or (track.doubtful[-1].prediction.belief.t_ns - old.belief.t_ns) * 1e-9 > _KEPT_S
         ):
-            return False
+            return None
         for epoch in track.doubtful:
             prior, seen = epoch.prediction.belief, epoch.innovation
             belief, _ = self.batch.propagated(old, old.belief, prior.t_ns)
@@ -347,8 +345,10 @@ class AnomalyTest:
             alpha = innovation_vector(belief.x, measured_pose(prior.x, seen.alpha))
             limit = gate_of(seen.dof, seen.R, S)
             if squared(alpha, S) > limit or squared(seen.alpha, S) < limit:
-                return False
-        return True
+                return None
+        found = tuple(m for m in track.manoeuvres if m.t_ns <= old.belief.t_ns)
+        used = self._used(with_history(old, track), track.doubtful)
+        return used.changed(manoeuvres=found, previous=None, reinitialised=track.reinitialised + 1)
 
     def _used(self, track: Track, epochs: tuple[Epoch, ...]) -> Track:
         """The track with scans that were in doubt."""
@@ -387,7 +387,13 @@ class AnomalyTest:
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
         anew = track.changed(
-            since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None
+            since=0,
+            recent=(),
+            doubtful=(),
+            pending=False,
+            fitting=None,
+            testing=None,
+            previous=_kept(window[best.onset].track),
         )
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
             return self._used(anew.changed(belief=at, mode="filter", fixes=(), older=()), after)
@@ -450,10 +456,10 @@ class AnomalyTest:
         prior = epochs[0].prediction.belief
         begin = Belief(prior.t_ns, prior.x, prior.P)
         out = self._used(Track(begin, "start", started_ns=prior.t_ns, levels=levels), epochs)
-        old = (
-            track.changed(recent=(), doubtful=(), previous=None, bias=None)
-            if ready(track)
-            else None
-        )
-        out = with_history(out, track).changed(drift=track.drift, previous=old)
+        out = with_history(out, track).changed(drift=track.drift, previous=_kept(track))
         return out.changed(sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _kept(track: Track) -> Track | None:
+    """An estimate as it is kept while another one is tried; None before it is of use."""
+    return track.changed(recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None

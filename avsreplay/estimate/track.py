@@ -66,7 +66,7 @@ class Epoch:
     prediction and innovation.
     """
 
-    track: Track
+    track: Track = field(repr=False)
     prediction: Prediction
     innovation: Innovation
     converged: bool
@@ -124,7 +124,7 @@ class Track:
         rejected: the last poses since the last accepted scan that nothing explained.
         bias: an error of the sensor in effect, or None.
         started_ns: instant of the first scan of this estimate.
-        previous: the estimate before the last new start, None where there was none.
+        previous: the estimate before the last manoeuvre or new start, None where there was none.
         manoeuvres: all that were found.
         pending: the last of them is reported, and the motion after it not determined.
         drift: a constant torque or force on the target, None where none is found.
@@ -161,7 +161,7 @@ class Track:
     nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
     started_ns: int = 0
-    previous: Track | None = None
+    previous: Track | None = field(default=None, repr=False)
     manoeuvres: tuple[Manoeuvre, ...] = ()
     pending: bool = False
     drift: Drift | None = None

@@ -18,9 +18,11 @@ Systematic errors Errors of the model or of the ranges that vary slowly over the
     likelihood estimates (empirical Bayes), 0 if not significant.
 Errors of the ranges They vary slowly over the image (calibration, multipath) and move the surface
     along the rays: a polynomial of third degree over the image, whose terms are draws of a third
-    distribution. Its constant and linear terms look like a motion, so that no residual shows them;
-    their variance is that of the other terms. They are fitted where the position of the camera is
-    known.
+    distribution, that of a random field of one of three lengths, each weighted with its likelihood.
+    Its constant and linear terms look like a motion, so that no residual shows them; their variance
+    follows from that of the other terms and the length. They are fitted where the position of the
+    camera is known. The covariance of the fitted terms is that of the residuals which they leave;
+    that of all residuals contains the error itself and hides it where few faces see a term.
 
 The covariance is an estimate from some hundred patches: the squared error of a pose in its metric
 is Hotelling's T^2, not chi-square. Its degrees of freedom are those of a Wishart matrix with the

@@ -22,7 +22,8 @@ OBSERVABLE = 1e-4
 SIGNIFICANT = 4.0
 LEAST_DETERMINED = 0.05
 ROUNDS = 8
-VARIES = 1.5
+MODES = np.sqrt(2.0)
+LENGTHS = (1.0, MODES, 2.0)
 OBSERVABLE_RANGES = 3e-4
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -78,7 +79,7 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     N, g, basis = _joined(found, none)
     inverse = _pseudo_inverse(N.sum(axis=0))
     fit = inverse @ g.sum(axis=0)
-    variance, amplitudes = _range_errors(found, none, N, g - N @ fit, inverse, basis)
+    variances, amplitudes = _range_errors(found, none, N, g - N @ fit, inverse, basis)
     g = g - _mode_columns(found, none, N, basis) @ amplitudes
     fit = inverse @ g.sum(axis=0)
     g = g - N @ fit
@@ -89,7 +90,8 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     )
     P = inverse @ (S.sum(axis=0) + block * M) @ inverse
     strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
-    smooth = np.repeat([_common_variance(fit[strains], P[strains, strains]), variance], (7, 10))
+    strain = _common_variance(fit[strains], P[strains, strains])
+    smooth = np.concatenate([np.full(7, strain), variances])
     smooth[6] = _common_variance(fit[strains.stop :], P[strains.stop :, strains.stop :])
     every = np.concatenate([basis @ fit[6:], amplitudes])
     return Systematic(extent_m, patch_m, block, smooth, every, fit[:6], found.centre)
@@ -97,20 +99,53 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
 
 def _range_errors(
     found: Evidence, none: Systematic, N: Array, left: Array, inverse: Array, basis: Array
-) -> tuple[float, Array]:
-    """Variance and amplitudes (10,) of the modes of the ranges, by partitioned regression from
+) -> tuple[Array, Array]:
+    """Variances and amplitudes (10,) of the modes of the ranges, by partitioned regression from
     what pose and amplitudes leave of the gradients (m, k).
     """
     D, X = _modes(found), _mode_columns(found, none, N, basis)
     B = X.sum(axis=0).T @ inverse
-    F = np.einsum("pac,pab,pbd->cd", D, found.normals[:, 3:, 3:], D) - B @ X.sum(axis=0)
-    h = np.einsum("pac,pa->pc", D, left[:, 3:6]) - left @ B.T
-    values, vectors = np.linalg.eigh(F)
+    own = np.einsum("pac,pab,pbd->pcd", D, found.normals[:, 3:, 3:], D)
+    F = own.sum(axis=0) - B @ X.sum(axis=0)
+    h = _mode_gradients(D, B, left)
+    back, to = _combinations(F, np.ones(10), found)
+    if not len(to):
+        return np.zeros(10), np.zeros(10)
+    moved = X @ (back @ to @ h.sum(axis=0))
+    moved = moved - N @ (inverse @ moved.sum(axis=0))
+    leverage = np.einsum("pcd,cd->p", own, back @ to) / len(to)
+    r = _mode_gradients(D, B, left - moved)
+    S = (r / np.maximum(1.0 - leverage, 0.5)[:, None]).T @ r
+    degree = np.repeat(np.arange(4), np.arange(1, 5))
+    variances, amplitudes, gains = [], [], []
+    for length in LENGTHS:
+        scale = (MODES / length) ** degree
+        back, to = _combinations(F, scale, found)
+        t, gain = _likely_variance(to @ h.sum(axis=0), to @ S @ to.T)
+        variances.append(t * scale**2)
+        amplitudes.append(back @ to @ h.sum(axis=0))
+        gains.append(gain)
+    likelihood = np.exp(0.5 * np.array(gains))
+    if 2.0 * np.log(likelihood.mean()) <= SIGNIFICANT:
+        return np.zeros(10), np.zeros(10)
+    return likelihood @ variances / likelihood.sum(), amplitudes[int(np.argmax(gains))]
+
+
+def _mode_gradients(D: Array, B: Array, g: Array) -> Array:
+    """(m, 10): of each patch the part of its gradient by the modes that pose and amplitudes do
+    not explain.
+    """
+    return np.asarray(np.einsum("pac,pa->pc", D, g[:, 3:6]) - g @ B.T)
+
+
+def _combinations(F: Array, scale: Array, found: Evidence) -> tuple[Array, Array]:
+    """The observable combinations of the modes times ``scale`` (10,): amplitudes of the modes
+    from those along the combinations (10, n), and these from the summed gradients (n, 10).
+    """
+    values, vectors = np.linalg.eigh(F * np.outer(scale, scale))
     kept = values > OBSERVABLE_RANGES * found.counts.sum()
-    W = (vectors[:, kept] / values[kept]).T
-    along = W @ h.sum(axis=0)
-    variance = _common_variance(along, W @ h.T @ h @ W.T)
-    return variance, vectors[:, kept] @ along if variance > 0.0 else np.zeros(10)
+    back = scale[:, None] * vectors[:, kept]
+    return back, (back / values[kept]).T
 
 
 def _mode_columns(found: Evidence, none: Systematic, N: Array, basis: Array) -> Array:
@@ -142,7 +177,7 @@ def _modes(found: Evidence) -> Array:
     across = np.stack([first, np.cross(along, first)])
     image = found.places @ across.T
     image = image - weight @ image
-    u, v = (image / (VARIES * np.sqrt(0.5 * weight @ np.sum(image**2, axis=1)))).T
+    u, v = (image / (MODES * np.sqrt(0.5 * weight @ np.sum(image**2, axis=1)))).T
     terms = [
         np.sqrt(comb(d, k) / (2**d * factorial(d))) * u ** (d - k) * v**k
         for d in range(4)
@@ -356,11 +391,15 @@ def _block_variance(
 
 
 def _common_variance(values: Array, P: Array) -> float:
-    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments; 0 if
-    not significant.
-    """
+    """Variance t of values ~ N(0, t I + P) of greatest likelihood; 0 if not significant."""
+    t, gain = _likely_variance(values, P)
+    return t if gain > SIGNIFICANT else 0.0
+
+
+def _likely_variance(values: Array, P: Array) -> tuple[float, float]:
+    """The same by weighted moments, and twice its gain in log likelihood."""
     if not len(values):
-        return 0.0
+        return 0.0, 0.0
     variances, axes = np.linalg.eigh(P)
     squares, variances = (axes.T @ values) ** 2, np.maximum(variances, np.finfo(float).tiny)
     t = max(0.0, float(np.mean(squares - variances)))
@@ -368,10 +407,7 @@ def _common_variance(values: Array, P: Array) -> float:
         weights = 1.0 / (variances + t) ** 2
         t = max(0.0, float(weights @ (squares - variances) / weights.sum()))
     ratio = variances / (variances + t)
-    evidence = (
-        squares / variances @ (1.0 - ratio) + np.log(ratio).sum()
-    )  # twice the gain in log likelihood
-    return t if evidence > SIGNIFICANT else 0.0
+    return t, float(squares / variances @ (1.0 - ratio) + np.log(ratio).sum())
 
 
 def _numbers(places: Array, side: float) -> NDArray[np.intp]:

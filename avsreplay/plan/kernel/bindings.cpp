@@ -219,8 +219,9 @@ nb::object gradient(const Space& space, const Points& y, const Values& times, co
   const size_t n = y.shape(0);
   if (times.shape(0) != n || most.shape(0) != n) throw nb::value_error("points of different numbers");
   return filled(n, 3, [&](double* out) {
+    Near last;
     for (size_t i = 0; i < n; ++i)
-      reinterpret_cast<Vector3*>(out)[i] = space.gradient(vectors(y)[i], times.data()[i], most.data()[i]);
+      reinterpret_cast<Vector3*>(out)[i] = space.gradient(vectors(y)[i], times.data()[i], most.data()[i], last);
   });
 }
 
@@ -246,7 +247,8 @@ nb::object margins(const Space& space, const Many& m, const In<double, -1, -1>& 
   const size_t n = m.shape(0), k = tau.shape(1);
   if (tau.shape(0) != n) throw nb::value_error("manoeuvres of different numbers");
   return filled(n, k, [&](double* out) {
-    for (size_t i = 0; i < n; ++i) space.margins(manoeuvres(m)[i], tau.data() + i * k, k, below, out + i * k);
+    Near first;
+    for (size_t i = 0; i < n; ++i) space.margins(manoeuvres(m)[i], tau.data() + i * k, k, below, first, out + i * k);
   });
 }
 
@@ -254,8 +256,9 @@ nb::object margins(const Space& space, const Many& m, const In<double, -1, -1>& 
 nb::object least(const Space& space, const Many& m, double target) {
   const size_t n = m.shape(0);
   return filled(n, 3, [&](double* out) {
+    Near first;
     for (size_t i = 0; i < n; ++i) {
-      const Least found = space.least(manoeuvres(m)[i], target);
+      const Least found = space.least(manoeuvres(m)[i], target, first);
       out[3 * i] = found.lower;
       out[3 * i + 1] = found.upper;
       out[3 * i + 2] = found.at;

@@ -14,6 +14,7 @@ constexpr uint32_t LEAF = 4;      // faces of a group that is not divided furthe
 constexpr double FAR_RADII = 3;   // from this many radii on a group is a dipole: an error below 0.01 of one turn
 constexpr double INSIDE = 0.52;   // winding number above which a point is inside: one half and twice that error
 constexpr double ROUNDING = 1e-9; // of a distance, relative to the coordinates
+constexpr double SLIVER = 1e-5;   // area of a face, in squares of its longest side, below which its normal is not used
 constexpr size_t DEPTH = 96;      // of the tree: faces are halved, so that 2^32 of them need 32
 
 // Sum of the solid angles of faces: each is twice the angle of a complex number, so that one arc tangent of their product
@@ -38,7 +39,7 @@ class SolidAngle {
   int turns_ = 0;
 };
 
-Vector3 closest_on_segment(const Vector3& a, const Vector3& b, const Vector3& q) {
+inline Vector3 closest_on_segment(const Vector3& a, const Vector3& b, const Vector3& q) {
   const Vector3 side = b - a;
   const double length2 = dot(side, side);
   const double share = length2 > 0 ? std::clamp(dot(q - a, side) / length2, 0.0, 1.0) : 0;
@@ -59,10 +60,10 @@ Vector3 closest_on_face(const std::array<Vector3, 3>& face, const Vector3& q) {
   return best;
 }
 
-double box_distance2(const Vector3& low, const Vector3& high, const Vector3& q) {
+inline double box_distance2(const Vector3& low, const Vector3& high, const Vector3& q) {
   double sum = 0;
   for (size_t axis = 0; axis < 3; ++axis) {
-    const double away = std::max({low[axis] - q[axis], q[axis] - high[axis], 0.0});
+    const double away = std::max(std::max(low[axis] - q[axis], q[axis] - high[axis]), 0.0);
     sum += away * away;
   }
   return sum;
@@ -89,15 +90,27 @@ void FaceTree::index() const {
   std::vector<Face> sorted(count);
   for (size_t i = 0; i < count; ++i) sorted[i] = corners_[order[i]];
   corners_ = std::move(sorted);
+  for (const Face& face : corners_) {
+    const Vector3 twice = cross(face[1] - face[0], face[2] - face[0]);
+    const double size = norm(twice);
+    double longest2 = 0;
+    for (size_t k = 0; k < 3; ++k) {
+      const Vector3 side = face[(k + 1) % 3] - face[k];
+      longest2 = std::max(longest2, dot(side, side));
+    }
+    normals_.push_back(size > 2 * SLIVER * longest2 ? (1 / size) * twice : Vector3{});
+  }
 }
 
 void FaceTree::build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order, const std::vector<Vector3>& middles) const {
   const size_t at = nodes_.size();
   nodes_.emplace_back();
+  dipoles_.emplace_back();
   Node node;
+  Dipole dipole;
   node.begin = begin;
   node.end = end;
-  double whole = 0;
+  double whole = 0, radius = 0;
   Vector3 low = middles[order[begin]], high = low, mean{};
   node.low = node.high = corners_[order[begin]][0];
   for (uint32_t i = begin; i < end; ++i) {
@@ -107,8 +120,8 @@ void FaceTree::build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order,
     whole += size;
     for (size_t axis = 0; axis < 3; ++axis) {
       const double middle = middles[order[i]][axis];
-      node.area[axis] += twice[axis] / 2;
-      node.centre[axis] += size * middle;
+      dipole.area[axis] += twice[axis] / 2;
+      dipole.centre[axis] += size * middle;
       mean[axis] += middle / (end - begin);
       low[axis] = std::min(low[axis], middle);
       high[axis] = std::max(high[axis], middle);
@@ -118,9 +131,11 @@ void FaceTree::build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order,
       }
     }
   }
-  for (size_t axis = 0; axis < 3; ++axis) node.centre[axis] = whole > 0 ? node.centre[axis] / whole : mean[axis];
+  for (size_t axis = 0; axis < 3; ++axis) dipole.centre[axis] = whole > 0 ? dipole.centre[axis] / whole : mean[axis];
   for (uint32_t i = begin; i < end; ++i)
-    for (const Vector3& corner : corners_[order[i]]) node.radius = std::max(node.radius, norm(corner - node.centre));
+    for (const Vector3& corner : corners_[order[i]]) radius = std::max(radius, norm(corner - dipole.centre));
+  dipole.far2 = FAR_RADII * radius * FAR_RADII * radius;
+  dipoles_[at] = dipole;
   if (end - begin > LEAF) {
     const Vector3 size = high - low;
     const size_t axis = static_cast<size_t>(std::max_element(size.begin(), size.end()) - size.begin());
@@ -140,10 +155,11 @@ double FaceTree::winding(const Vector3& q) const {
   SolidAngle near;
   for (uint32_t i = 0; i < nodes_.size();) {
     const Node& node = nodes_[i];
-    const Vector3 away = node.centre - q;
-    const double distance = norm(away);
-    if (distance > FAR_RADII * node.radius) {
-      sum += dot(node.area, away) / (distance * distance * distance);
+    const Dipole& dipole = dipoles_[i];
+    const Vector3 away = dipole.centre - q;
+    const double distance2 = dot(away, away);
+    if (distance2 > dipole.far2) {
+      sum += dot(dipole.area, away) / (distance2 * std::sqrt(distance2));
       i = node.next;
     } else {
       if (node.next == i + 1)
@@ -154,15 +170,17 @@ double FaceTree::winding(const Vector3& q) const {
   return (sum + near.sum()) / (4 * PI);
 }
 
-// Distance to the surface, which is known to be below ``most``.
-double FaceTree::distance(const Vector3& q, double most, Vector3& foot) const {
+// Distance to the surface, which is known to be below ``most``, and the closest face; ``face`` is one nearby. A face
+// whose plane is farther away, by more than ``rounding``, is not examined.
+double FaceTree::distance(const Vector3& q, double most, double rounding, Vector3& foot, uint32_t& face) const {
   struct Open {
     uint32_t node;
     double least2;
   };
   std::array<Open, DEPTH> stack;
   size_t depth = 0;
-  double best2 = most * most;
+  most = std::min(most, norm(closest_on_face(corners_[face], q) - q) + rounding);
+  double best2 = most * most, examined = most + rounding;
   foot = corners_[0][0];
   stack[depth++] = {0, box_distance2(nodes_[0].low, nodes_[0].high, q)};
   while (depth) {
@@ -171,11 +189,14 @@ double FaceTree::distance(const Vector3& q, double most, Vector3& foot) const {
     const Node& node = nodes_[open.node];
     if (node.next == open.node + 1) {
       for (uint32_t k = node.begin; k < node.end; ++k) {
+        if (std::abs(dot(normals_[k], q - corners_[k][0])) > examined) continue;
         const Vector3 p = closest_on_face(corners_[k], q), away = p - q;
         const double d2 = dot(away, away);
         if (d2 < best2) {
           best2 = d2;
+          examined = std::sqrt(d2) + rounding;
           foot = p;
+          face = k;
         }
       }
       continue;
@@ -198,14 +219,15 @@ double FaceTree::signed_distance(const Vector3& q, Near& last, Vector3* foot) co
     return INFINITE;
   }
   const double step = last.known ? norm(q - last.at) : 0, reached = std::abs(last.distance);
-  const double most = last.known ? step + reached + ROUNDING * (nodes_[0].radius + norm(q - nodes_[0].centre)) : INFINITE;
-  double found = distance(q, most, closest);
+  const double rounding = ROUNDING * (norm(nodes_[0].high - nodes_[0].low) + norm(q - nodes_[0].low));
+  uint32_t face = last.face;
+  double found = distance(q, last.known ? step + reached + rounding : INFINITE, rounding, closest, face);
   if (last.known && (step < reached || step < found)) {
     found = std::copysign(found, last.distance);
   } else if (box_distance2(nodes_[0].low, nodes_[0].high, q) == 0 && winding(q) > INSIDE) {
     found = -found;
   }
-  last = {q, found, true};
+  last = {q, found, true, face};
   if (foot) *foot = closest;
   return found;
 }

@@ -1,6 +1,7 @@
 // The target's body: closest points and signed distances of a triangle mesh or a point cloud.
 #pragma once
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -17,6 +18,10 @@ struct Near {
   Vector3 at{};
   double distance = 0;  // signed
   bool known = false;
+  uint32_t face = 0;  // the closest one, in the order of the tree
+
+  // Distance from q to the surface at least; negative where the ball around this point does not contain q.
+  double least(const Vector3& q) const { return known ? std::abs(distance) - norm(q - at) : -HUGE_VAL; }
 };
 
 // A tree of faces answers both questions. Distances are exact. A point is inside where the winding number, how often
@@ -36,19 +41,23 @@ class FaceTree {
  private:
   using Face = std::array<Vector3, 3>;
   struct Node {
-    Vector3 low{}, high{};          // box of the corners
-    Vector3 centre{}, area{};       // area: sum of the normals of the faces, each as long as its area
-    double radius = 0;
+    Vector3 low{}, high{};                  // box of the corners
     uint32_t begin = 0, end = 0, next = 0;  // faces, and the node after the whole subtree
+  };
+  struct Dipole {  // of the faces of a node
+    Vector3 centre{}, area{};  // area: sum of the normals of the faces, each as long as its area
+    double far2 = 0;           // squared distance from which on it replaces them
   };
   void index() const;
   void build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order, const std::vector<Vector3>& middles) const;
   double winding(const Vector3& q) const;
-  double distance(const Vector3& q, double most, Vector3& foot) const;
+  double distance(const Vector3& q, double most, double rounding, Vector3& foot, uint32_t& face) const;
 
   mutable std::once_flag built_;
   mutable std::vector<Face> corners_;
+  mutable std::vector<Vector3> normals_;  // of the faces, unit; zero without an area
   mutable std::vector<Node> nodes_;
+  mutable std::vector<Dipole> dipoles_;  // one for each node
 };
 
 // A body in a frame whose origin is a point of the frame of its tree.
@@ -60,6 +69,10 @@ class Body {
     const double found = tree_->signed_distance(q + origin_, last, foot);
     if (foot) *foot = *foot - origin_;
     return found;
+  }
+  // That of two points from which the search for the distance of q is shorter.
+  const Near& nearer(const Vector3& q, const Near& a, const Near& b) const {
+    return a.least(q + origin_) < b.least(q + origin_) ? b : a;
   }
   // Signed distance of q, or a lower bound of it that is at least ``enough``.
   double at_least(const Vector3& q, double enough, Near& last) const {

@@ -170,50 +170,52 @@ double Space::ended(const Manoeuvre& m) const {
   return m.span;
 }
 
-void Space::margins(const Manoeuvre& m, const double* tau, size_t n, double below, double* out) const {
-  Near last;
+void Space::margins(const Manoeuvre& m, const double* tau, size_t n, double below, Near& first, double* out) const {
+  Near last = first;
   for (size_t i = 0; i < n; ++i) {
     const double time = m.t + tau[i];
     out[i] = margin(local(time, position(m, tau[i])), time, m.most, last, below).value;
+    if (i == 0) first = last;
   }
 }
 
-Space::Node Space::node(const Manoeuvre& m, double tau, Near& last) const {
+Space::Node Space::node(const Manoeuvre& m, double tau, const Near& a, const Near& b) const {
   Frame frame;
   motion(m.t + tau, frame, true);
   const Vector3 q = position(m, tau) - frame.rho, w = m.v + tau * m.push - frame.drho;
-  const Margin found = margin(transposed(frame.R, q), m.t + tau, m.most, last);
+  const Vector3 y = transposed(frame.R, q);
+  Near last = body_ ? body_->nearer(y, a, b) : a;
+  const Margin found = margin(y, m.t + tau, m.most, last);
   return {tau, found.value, found.required, norm(transposed(frame.R, w) + transposed(frame.dR, q)),
-          bend(q, w, norm(m.push))};
+          bend(q, w, norm(m.push)), last};
 }
 
 // What is required differs over the range of start instants: the distance in the corridor by the way of the path, and
 // outside it all is required.
-Least Space::least(const Manoeuvre& m, double target) const {
-  if (m.half == 0 || m.most == INFINITE) return bounded(m, target, 0);
+Least Space::least(const Manoeuvre& m, double target, Near& first) const {
+  if (m.half == 0 || m.most == INFINITE) return bounded(m, target, 0, first);
   Frame frame;
   motion(m.t, frame, true);
   const Vector3 q = m.r - frame.rho, w = m.v - frame.drho;
   const double speed = norm(transposed(frame.R, w) + transposed(frame.dR, q));
   const double way = m.half * (speed + 0.5 * MOTION_FACTOR * m.half * bend(q, w, of_.a_max));
-  Least found = bounded(m, target, of_.kept_share * way);
+  Least found = bounded(m, target, of_.kept_share * way, first);
   if (corridor(transposed(frame.R, q)) <= of_.slope * way) {
     Manoeuvre outside = m;
     outside.most = INFINITE;
-    found.lower = std::min(found.lower, bounded(outside, target, 0).lower);
+    found.lower = std::min(found.lower, bounded(outside, target, 0, first).lower);
   }
   return found;
 }
 
 // Bounds for one requirement that is larger by at most ``more``.
-Least Space::bounded(const Manoeuvre& m, double target, double more) const {
+Least Space::bounded(const Manoeuvre& m, double target, double more, Near& first) const {
   struct Interval {
     Node a, b;
     int halvings;
   };
   std::array<Node, INTERVALS + 1> nodes;
   std::array<Interval, INTERVALS + HALVINGS + 1> stack;
-  Near last;
   Least found{INFINITE, INFINITE, 0};
   // before the begin of the manoeuvre are those that begin earlier, of which only a bound is known
   const auto seen = [&](const Node& node) {
@@ -223,9 +225,11 @@ Least Space::bounded(const Manoeuvre& m, double target, double more) const {
     }
   };
   for (size_t i = 0; i <= INTERVALS; ++i) {
-    nodes[i] = node(m, i ? m.span * static_cast<double>(i - 1) / (INTERVALS - 1) : -m.half, last);
+    const Near& last = i ? nodes[i - 1].near : first;
+    nodes[i] = node(m, i ? m.span * static_cast<double>(i - 1) / (INTERVALS - 1) : -m.half, last, last);
     seen(nodes[i]);
   }
+  first = nodes[0].near;
   size_t depth = 0;
   for (size_t i = INTERVALS; i-- > 0;) stack[depth++] = {nodes[i], nodes[i + 1], 0};
   while (depth) {
@@ -242,7 +246,7 @@ Least Space::bounded(const Manoeuvre& m, double target, double more) const {
       found.lower = std::min(found.lower, bound);
       continue;
     }
-    const Node middle = node(m, 0.5 * (a.tau + b.tau), last);
+    const Node middle = node(m, 0.5 * (a.tau + b.tau), a.near, b.near);
     seen(middle);
     stack[depth++] = {middle, b, of.halvings + 1};
     stack[depth++] = {a, middle, of.halvings + 1};
@@ -253,20 +257,20 @@ Least Space::bounded(const Manoeuvre& m, double target, double more) const {
 
 // About the smallest margin of a manoeuvre after its begin, at most ``enough``, and its time; at most ``floor`` where it
 // is not larger.
-Least Space::compared(const Manoeuvre& m, double floor) const {
+Least Space::compared(const Manoeuvre& m, double floor, const Near& first) const {
   static const std::array<double, COMPARED> shares = [] {
     std::array<double, COMPARED> out{};
     for (size_t i = 0; i < COMPARED; ++i) out[i] = std::pow(static_cast<double>(i + 1) / COMPARED, DENSER);
     return out;
   }();
-  Near last;
+  Near last = first;
   Least found{-INFINITE, of_.enough, m.span};
   size_t least = 0;
   const auto see = [&](double tau) {
     const double time = m.t + tau;
     const double value = margin(local(time, position(m, tau)), time, m.most, last, found.upper).value;
     const bool smaller = value < found.upper;
-    if (smaller) found = {-INFINITE, value, tau};
+    if (smaller) found = {-INFINITE, value, tau, last};
     return smaller;
   };
   for (size_t i = 0; i < COMPARED && found.upper > floor; ++i)
@@ -279,19 +283,18 @@ Least Space::compared(const Manoeuvre& m, double floor) const {
 }
 
 // Gradient in {A} of the margin at an instant of a manoeuvre.
-Vector3 Space::gradient(const Manoeuvre& m, double tau) const {
+Vector3 Space::gradient(const Manoeuvre& m, double tau, Near& last) const {
   Frame frame;
   motion(m.t + tau, frame, false);
   const Vector3 y = transposed(frame.R, position(m, tau) - frame.rho);
-  return times(frame.R, gradient(y, m.t + tau, m.most));
+  return times(frame.R, gradient(y, m.t + tau, m.most, last));
 }
 
-Vector3 Space::gradient(const Vector3& y, double time, double most) const {
+Vector3 Space::gradient(const Vector3& y, double time, double most, Near& last) const {
   const double required = std::min(this->required(norm(y), time), most);
   Vector3 away = y - of_.centre;
   double gap = norm(away) - of_.radius;
   if (body_ && (gap - required < of_.enough || of_.radius == 0)) {
-    Near last;
     Vector3 foot;
     gap = body_->signed_distance(y, last, &foot);
     away = gap < 0 ? foot - y : y - foot;
@@ -304,18 +307,18 @@ Vector3 Space::gradient(const Vector3& y, double time, double most) const {
 
 // Turn the direction so that the margin at the worst instant grows to what is wanted, or by a part of that turn; several
 // times, as then another instant is the worst.
-void Space::improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const {
+void Space::improve(Manoeuvre& m, double wanted, Vector3& d, Least& best, const Near& first) const {
   double share = 1;
   for (int turn = 0; turn < TURNS && best.upper < wanted && share > SMALLEST_SHARE; ++turn) {
     m.push = of_.a_max * d;
-    const Vector3 slope = gradient(m, best.at), across = slope - dot(slope, d) * d;
+    const Vector3 slope = gradient(m, best.at, best.near), across = slope - dot(slope, d) * d;
     // the position at the instant changes by a tau^2 / 2 times the change of the direction
     const double rate = 0.5 * of_.a_max * best.at * best.at * dot(across, across);
     if (!(rate > 0)) return;
     const double size = std::min((wanted - best.upper) / rate, LARGEST_TURN / norm(across));
     const Vector3 other = unit(d + (share * size) * across);
     m.push = of_.a_max * other;
-    const Least found = compared(m, best.upper);
+    const Least found = compared(m, best.upper, first);
     if (found.upper > best.upper) {
       best = found;
       d = other;
@@ -327,27 +330,28 @@ void Space::improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const 
 }
 
 double Space::search(double time, const Vector3& r, const Vector3& v, double wanted, Vector3& d) const {
-  Near last;
-  Manoeuvre m{time, 0, r, v, {}, span(time, r, v), 0, most(time, r, last)};
+  Near first;
+  Manoeuvre m{time, 0, r, v, {}, span(time, r, v), 0, most(time, r, first)};
   wanted = std::min(wanted, of_.enough);
   Vector3 q, w;
   relative(time, r, v, q, w);
   Frame frame;
   motion(time, frame, false);
+  if (body_ && !first.known) body_->signed_distance(transposed(frame.R, r - frame.rho), first);
   const Vector3 outward = unit(q), along = std::isnan(of_.tangent) ? outward : times(frame.R, of_.axis);
   Least best{-INFINITE, -INFINITE, 0};
   const auto compare = [&](const std::vector<Vector3>& every) {
     bool better = false;
     for (const Vector3& other : every) {
       m.push = of_.a_max * other;
-      const Least found = compared(m, best.upper);
+      const Least found = compared(m, best.upper, first);
       if (found.upper > best.upper) {
         best = found;
         d = other;
         better = true;
       }
     }
-    if (better) improve(m, wanted, d, best);
+    if (better) improve(m, wanted, d, best, first);
   };
   if (!std::isnan(d[0])) compare({Vector3(d)});
   if (best.upper < std::min(wanted, 0.0)) compare(directions(outward, along));

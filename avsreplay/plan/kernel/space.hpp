@@ -34,6 +34,7 @@ struct Margin {
 };
 struct Least {
   double lower, upper, at;
+  Near near{};  // about the point at that time
 };
 
 class Space {
@@ -49,7 +50,7 @@ class Space {
   // no smaller than that.
   Margin margin(const Vector3& y, double time, double most, Near& last, double below = HUGE_VAL) const;
   // Gradient in {C} of the margin at a point.
-  Vector3 gradient(const Vector3& y, double time, double most) const;
+  Vector3 gradient(const Vector3& y, double time, double most, Near& last) const;
   // Largest distance to the surface that is required of manoeuvres from a point.
   double most(double time, const Vector3& r, Near& last) const;
   // Duration of an escape until the robot recedes outside the sphere; ``m.span`` is the longest one.
@@ -57,9 +58,9 @@ class Space {
   // Longest duration of an escape from a state.
   double span(double time, const Vector3& r, const Vector3& v) const;
   // Margins at instants tau (n,) of a manoeuvre; those above ``below`` may be lower bounds.
-  void margins(const Manoeuvre& m, const double* tau, size_t n, double below, double* out) const;
+  void margins(const Manoeuvre& m, const double* tau, size_t n, double below, Near& first, double* out) const;
   // Bounds of the smallest margin of a manoeuvre; where ``target`` is proven nothing is refined.
-  Least least(const Manoeuvre& m, double target) const;
+  Least least(const Manoeuvre& m, double target, Near& first) const;
   // Improve the direction d of an escape until its margin, which is returned, is ``wanted``. Without a known direction
   // (NaN) and where the margin is negative all directions are compared.
   double search(double time, const Vector3& r, const Vector3& v, double wanted, Vector3& d) const;
@@ -71,6 +72,7 @@ class Space {
   };
   struct Node {
     double tau, margin, required, speed, bend;
+    Near near;
   };
   void motion(double time, Frame& out, bool rates) const;
   Vector3 local(double time, const Vector3& r) const;
@@ -78,12 +80,12 @@ class Space {
   double required(double distance, double time) const;
   double corridor(const Vector3& y) const;
   void relative(double time, const Vector3& r, const Vector3& v, Vector3& q, Vector3& w) const;
-  Node node(const Manoeuvre& m, double tau, Near& last) const;
+  Node node(const Manoeuvre& m, double tau, const Near& last, const Near& other) const;
   bool recedes(const Manoeuvre& m, double tau) const;
-  Least bounded(const Manoeuvre& m, double target, double more) const;
-  Least compared(const Manoeuvre& m, double floor) const;
-  Vector3 gradient(const Manoeuvre& m, double tau) const;
-  void improve(Manoeuvre& m, double wanted, Vector3& d, Least& best) const;
+  Least bounded(const Manoeuvre& m, double target, double more, Near& first) const;
+  Least compared(const Manoeuvre& m, double floor, const Near& first) const;
+  Vector3 gradient(const Manoeuvre& m, double tau, Near& last) const;
+  void improve(Manoeuvre& m, double wanted, Vector3& d, Least& best, const Near& first) const;
 
   const Body* body_;
   SpaceParams of_;

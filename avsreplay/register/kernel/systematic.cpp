@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <iterator>
 #include <limits>
 
 #include "covariance.hpp"
@@ -17,9 +18,9 @@ constexpr double LEAST_DETERMINED = 0.05;  // with less of the displacements of 
 constexpr int ROUNDS = 8;                  // of the maximum likelihood estimate; the last ones change nothing
 constexpr int PAIRS[6][2] = {{0, 0}, {1, 1}, {2, 2}, {0, 1}, {0, 2}, {1, 2}};  // of a strain
 constexpr int JOINED = 6 + SURFACE;        // pose and amplitudes of the surface
-// Over the rms radius of the image: the length over which an error of the ranges varies. A smaller value leaves the errors
-// too small that no residual shows, as those of a constant, a larger one makes the modes unobservable.
-constexpr double VARIES = 1.5;
+// Over the rms radius of the image: the lengths over which an error of the ranges may vary, as likely before the scan, and
+// that of the modes. A length of 0.7 radii makes the error too small whose constant and linear terms no residual shows.
+constexpr double MODES = 1.4142135623730951, LENGTHS[3] = {1, MODES, 2};
 constexpr double OBSERVABLE_RANGES = 3e-4;  // as OBSERVABLE, for the modes of the ranges
 using Joined = Square<JOINED>;
 using Row = std::array<double, JOINED>;
@@ -220,11 +221,15 @@ double block_variance(const PatchTable& t, const Equations& q, const std::vector
   return std::max(0.0, (sums.found - inner(square, all) + 2 * inner(sums.spread, inverse)) / expected);
 }
 
-// Variance t of the `size` values from `first` on, ~ N(0, t I + P), of greatest likelihood, by weighted moments; 0 where it
-// is not significant.
+// A variance of greatest likelihood, and twice the logarithm of its likelihood over that of none.
+struct Likely {
+  double variance = 0, gain = 0;
+};
+
+// The variance t of the `size` values from `first` on, ~ N(0, t I + P), by weighted moments.
 template <int N>
-double common_variance(const double* values, const Square<N>& P, int first, int size) {
-  if (size == 0) return 0;
+Likely likely_variance(const double* values, const Square<N>& P, int first, int size) {
+  if (size == 0) return {};
   Square<N> A, V;
   for (int i = 0; i < size; ++i)
     for (int j = 0; j < size; ++j) A.v[i][j] = P.v[first + i][first + j];
@@ -250,8 +255,16 @@ double common_variance(const double* values, const Square<N>& P, int first, int 
     const double ratio = variance[k] / (variance[k] + t);
     evidence += square[k] / variance[k] * (1 - ratio) + std::log(ratio);
   }
-  return evidence > SIGNIFICANT ? t : 0;
+  return {t, evidence};
 }
+
+// The same, 0 where it is not significant.
+template <int N>
+double common_variance(const double* values, const Square<N>& P, int first, int size) {
+  const Likely found = likely_variance(values, P, first, size);
+  return found.gain > SIGNIFICANT ? found.variance : 0;
+}
+
 
 // Takes the fit from the gradients, and returns how much the leverage of each patch enlarges their covariance.
 std::vector<double> take_fit(Equations& q, const Joined& inverse, const double* fit) {
@@ -279,9 +292,10 @@ std::vector<double> fitted(Equations& q, const Joined& reduced, const Joined& in
   return take_fit(q, inverse, found);
 }
 
-// Amplitudes of the modes of the ranges, and their variance, 0 if it is not significant.
+// Amplitudes of the modes of the ranges, and their variances, 0 if they are not significant.
 struct Ranges {
-  double variance = 0, amplitudes[RANGES] = {};
+  bool significant = false;
+  double variances[RANGES] = {}, amplitudes[RANGES] = {};
 };
 
 // Sums over a patch of the residuals' derivatives by pose and amplitudes times that by each mode, from its normal equations.
@@ -296,67 +310,178 @@ Crossed crossed(const PatchTable& t, const Equations& q, int64_t p) {
   return X;
 }
 
-// The modes in the common fit with pose and amplitudes, from what these leave of the gradients: of each patch the part of its
-// gradient by the modes that they do not explain.
-Ranges range_errors(const PatchTable& t, const Equations& q, const Joined& inverse) {
-  Ranges out;
-  Crossed all{};
-  Square<RANGES> F, S, V;
+// Takes the modes of the ranges from the gradients g.
+void take_ranges(const PatchTable& t, const Equations& q, const double (&amplitudes)[RANGES], std::vector<Row>& g) {
+  for (int64_t p = 0; p < t.m; ++p) {
+    const Crossed X = crossed(t, q, p);
+    for (size_t i = 0; i < JOINED; ++i)
+      for (size_t c = 0; c < RANGES; ++c) g[(size_t)p][i] -= X[i][c] * amplitudes[c];
+  }
+}
+
+// The normal equations of the modes without what pose and amplitudes explain.
+struct ModeEquations {
+  double B[RANGES][JOINED] = {};  // of the gradients of pose and amplitudes, those of the modes
+  Square<RANGES> F;
   double points = 0;
+
+  // Of a patch, the part of its gradient by the modes that pose and amplitudes do not explain.
+  std::array<double, RANGES> gradient(const PatchTable& t, int64_t p, const Row& g) const {
+    std::array<double, RANGES> h{};
+    for (size_t c = 0; c < RANGES; ++c) {
+      for (size_t a = 0; a < 3; ++a) h[c] += t.ranges[(size_t)p][a][c] * g[3 + a];
+      for (size_t i = 0; i < JOINED; ++i) h[c] -= B[c][i] * g[i];
+    }
+    return h;
+  }
+};
+
+ModeEquations mode_equations(const PatchTable& t, const Equations& q, const Joined& inverse) {
+  ModeEquations out;
+  Crossed all{};
   for (int64_t p = 0; p < t.m; ++p) {
     const Crossed X = crossed(t, q, p);
     const auto& D = t.ranges[(size_t)p];
-    points += (double)t.counts[p];
+    out.points += (double)t.counts[p];
     for (size_t i = 0; i < JOINED; ++i)
       for (size_t c = 0; c < RANGES; ++c) all[i][c] += X[i][c];
     for (size_t a = 0; a < 3; ++a)
       for (size_t b = 0; b < RANGES; ++b)
-        for (size_t c = 0; c < RANGES; ++c) F.v[b][c] += D[a][b] * X[3 + a][c];
+        for (size_t c = 0; c < RANGES; ++c) out.F.v[b][c] += D[a][b] * X[3 + a][c];
   }
-  double B[RANGES][JOINED] = {};  // of the gradients of pose and amplitudes, those of the modes
   for (size_t c = 0; c < RANGES; ++c)
     for (size_t i = 0; i < JOINED; ++i)
-      for (size_t j = 0; j < JOINED; ++j) B[c][i] += all[j][c] * inverse.v[j][i];
+      for (size_t j = 0; j < JOINED; ++j) out.B[c][i] += all[j][c] * inverse.v[j][i];
   for (size_t b = 0; b < RANGES; ++b)
     for (size_t c = 0; c < RANGES; ++c)
-      for (size_t i = 0; i < JOINED; ++i) F.v[b][c] -= B[b][i] * all[i][c];
-  double sum[RANGES] = {};
-  for (int64_t p = 0; p < t.m; ++p) {
-    double h[RANGES] = {};
-    const Row& g = q.g[(size_t)p];
-    for (size_t c = 0; c < RANGES; ++c) {
-      for (size_t a = 0; a < 3; ++a) h[c] += t.ranges[(size_t)p][a][c] * g[3 + a];
-      for (size_t i = 0; i < JOINED; ++i) h[c] -= B[c][i] * g[i];
-      sum[c] += h[c];
-    }
-    for (int b = 0; b < RANGES; ++b)
-      for (int c = 0; c < RANGES; ++c) S.v[b][c] += h[b] * h[c];
-  }
-  eigen(F.v, V.v, RANGES, 1e-32);
-  double values[RANGES] = {}, W[RANGES][RANGES] = {};  // W: amplitudes along the observable combinations, from the sums
-  int n = 0;
-  for (int k = 0; k < RANGES; ++k) {
-    if (!(F.v[k][k] > OBSERVABLE_RANGES * points)) continue;
-    for (int c = 0; c < RANGES; ++c) W[n][c] = V.v[c][k] / F.v[k][k], values[n] += W[n][c] * sum[c];
-    for (int c = 0; c < RANGES; ++c) out.amplitudes[c] += V.v[c][k] * values[n];
-    ++n;
-  }
-  Square<RANGES> P;
-  for (int k = 0; k < n; ++k)
-    for (int l = 0; l < n; ++l)
-      for (int b = 0; b < RANGES; ++b)
-        for (int c = 0; c < RANGES; ++c) P.v[k][l] += W[k][b] * S.v[b][c] * W[l][c];
-  out.variance = common_variance(values, P, 0, n);
-  return out.variance > 0 ? out : Ranges();
+      for (size_t i = 0; i < JOINED; ++i) out.F.v[b][c] -= out.B[b][i] * all[i][c];
+  return out;
 }
 
-// Takes the modes of the ranges from the gradients.
-void take_ranges(const PatchTable& t, const Ranges& ranges, Equations& q) {
-  for (int64_t p = 0; p < t.m; ++p) {
-    const Crossed X = crossed(t, q, p);
-    for (size_t i = 0; i < JOINED; ++i)
-      for (size_t c = 0; c < RANGES; ++c) q.g[(size_t)p][i] -= X[i][c] * ranges.amplitudes[c];
+// The observable combinations of the modes, each times `scale`: amplitudes along them from the summed gradients, and the
+// amplitudes of the modes from those.
+struct Combinations {
+  int n = 0;
+  double to[RANGES][RANGES] = {}, back[RANGES][RANGES] = {};
+
+  Combinations(const ModeEquations& modes, const double (&scale)[RANGES]) {
+    Square<RANGES> F, V;
+    for (int b = 0; b < RANGES; ++b)
+      for (int c = 0; c < RANGES; ++c) F.v[b][c] = scale[b] * modes.F.v[b][c] * scale[c];
+    eigen(F.v, V.v, RANGES, 1e-32);
+    for (int k = 0; k < RANGES; ++k) {
+      if (!(F.v[k][k] > OBSERVABLE_RANGES * modes.points)) continue;
+      for (int c = 0; c < RANGES; ++c) back[c][n] = scale[c] * V.v[c][k], to[n][c] = back[c][n] / F.v[k][k];
+      ++n;
+    }
   }
+
+  std::array<double, RANGES> along(const double (&sum)[RANGES]) const {
+    std::array<double, RANGES> values{};
+    for (size_t k = 0; k < (size_t)n; ++k)
+      for (size_t c = 0; c < RANGES; ++c) values[k] += to[k][c] * sum[c];
+    return values;
+  }
+
+  void amplitudes(const std::array<double, RANGES>& values, double (&out)[RANGES]) const {
+    for (size_t c = 0; c < RANGES; ++c) {
+      out[c] = 0;
+      for (size_t k = 0; k < (size_t)n; ++k) out[c] += back[c][k] * values[k];
+    }
+  }
+
+  // Of a matrix of the summed gradients, that of the values.
+  Square<RANGES> about(const Square<RANGES>& S) const {
+    Square<RANGES> P;
+    for (int k = 0; k < n; ++k)
+      for (int l = 0; l < n; ++l)
+        for (int b = 0; b < RANGES; ++b)
+          for (int c = 0; c < RANGES; ++c) P.v[k][l] += to[k][b] * S.v[b][c] * to[l][c];
+    return P;
+  }
+
+  // Mean share of the observable combinations that one patch determines.
+  double leverage(const PatchTable& t, int64_t p) const {
+    double sum = 0;
+    const double* N = t.normals + 36 * p;
+    for (size_t k = 0; k < (size_t)n; ++k) {
+      double u[3] = {}, w[3] = {};
+      for (size_t a = 0; a < 3; ++a)
+        for (size_t c = 0; c < RANGES; ++c) {
+          u[a] += t.ranges[(size_t)p][a][c] * back[c][k], w[a] += t.ranges[(size_t)p][a][c] * to[k][c];
+        }
+      for (size_t a = 0; a < 3; ++a)
+        for (size_t b = 0; b < 3; ++b) sum += u[a] * N[6 * (3 + a) + 3 + b] * w[b];
+    }
+    return sum / n;
+  }
+};
+
+// The covariance of the modes' summed gradients from what a fit of pose, amplitudes and modes leaves of each patch: an error
+// of the ranges must not count as noise, which would hide it.
+Square<RANGES> mode_noise(const PatchTable& t, const Equations& q, const Joined& inverse, const ModeEquations& modes,
+                          const Combinations& whole, const double (&fit)[RANGES]) {
+  std::vector<Row> left = q.g;
+  take_ranges(t, q, fit, left);
+  double moved[JOINED] = {};
+  Row g{};
+  for (const Row& each : left)
+    for (size_t i = 0; i < JOINED; ++i) g[i] += each[i];
+  for (size_t i = 0; i < JOINED; ++i)
+    for (size_t j = 0; j < JOINED; ++j) moved[i] += inverse.v[i][j] * g[j];
+  Square<RANGES> S;
+  for (int64_t p = 0; p < t.m; ++p) {
+    Row& each = left[(size_t)p];
+    for (size_t i = 0; i < JOINED; ++i)
+      for (size_t j = 0; j < JOINED; ++j) each[j] -= q.N[(size_t)p].v[i][j] * moved[i];
+    const std::array<double, RANGES> h = modes.gradient(t, p, each);
+    const double enlarge = 1 / std::max(1 - whole.leverage(t, p), 0.5);
+    for (size_t b = 0; b < RANGES; ++b)
+      for (size_t c = 0; c < RANGES; ++c) S.v[b][c] += enlarge * h[b] * h[c];
+  }
+  return S;
+}
+
+// The modes in the common fit with pose and amplitudes, from what these leave of the gradients. The variances of the modes
+// are those of the lengths, each weighted with its likelihood.
+Ranges range_errors(const PatchTable& t, const Equations& q, const Joined& inverse) {
+  constexpr size_t SCALES = std::size(LENGTHS);
+  const ModeEquations modes = mode_equations(t, q, inverse);
+  double sum[RANGES] = {}, fit[RANGES] = {}, unit[RANGES];
+  for (int64_t p = 0; p < t.m; ++p) {
+    const std::array<double, RANGES> h = modes.gradient(t, p, q.g[(size_t)p]);
+    for (size_t c = 0; c < RANGES; ++c) sum[c] += h[c];
+  }
+  std::fill(unit, unit + RANGES, 1.0);
+  const Combinations whole(modes, unit);
+  Ranges out;
+  if (whole.n == 0) return out;
+  whole.amplitudes(whole.along(sum), fit);
+  const Square<RANGES> S = mode_noise(t, q, inverse, modes, whole, fit);
+  double scales[SCALES][RANGES], amplitudes[SCALES][RANGES];
+  Likely found[SCALES];
+  size_t best = 0;
+  for (size_t s = 0; s < SCALES; ++s) {
+    size_t mode = 0;
+    for (int d = 0; d < 4; ++d)
+      for (int k = 0; k <= d; ++k, ++mode) {
+        scales[s][mode] = 1;
+        for (int i = 0; i < d; ++i) scales[s][mode] *= MODES / LENGTHS[s];
+      }
+    const Combinations scaled(modes, scales[s]);
+    const std::array<double, RANGES> values = scaled.along(sum);
+    scaled.amplitudes(values, amplitudes[s]);
+    found[s] = likely_variance(values.data(), scaled.about(S), 0, scaled.n);
+    if (found[s].gain > found[best].gain) best = s;
+  }
+  double weights[SCALES], total = 0;
+  for (size_t s = 0; s < SCALES; ++s) total += weights[s] = std::exp(0.5 * (found[s].gain - found[best].gain));
+  if (!(found[best].gain + 2 * std::log(total / SCALES) > SIGNIFICANT)) return out;
+  out.significant = true;
+  std::copy(amplitudes[best], amplitudes[best] + RANGES, out.amplitudes);
+  for (size_t s = 0; s < SCALES; ++s)
+    for (size_t c = 0; c < RANGES; ++c) out.variances[c] += weights[s] / total * found[s].variance * scales[s][c] * scales[s][c];
+  return out;
 }
 
 // The modes at each patch: the terms of a polynomial over the image, along the rays. The terms are weighted so that equal
@@ -394,7 +519,7 @@ void image_modes(PatchTable& t) {
   double spread = 0;
   for (int64_t p = 0; p < t.m; ++p)
     for (size_t k = 0; k < 2; ++k) spread += (double)t.counts[p] / points * (image[(size_t)p][k] - centre[k]) * (image[(size_t)p][k] - centre[k]);
-  const double unit = VARIES * std::sqrt(std::max(0.5 * spread, std::numeric_limits<double>::min()));
+  const double unit = MODES * std::sqrt(std::max(0.5 * spread, std::numeric_limits<double>::min()));
   constexpr double WEIGHTS[4] = {1, 0.7071067811865476, 0.3535533905932738, 0.14433756729740643};  // 1 / sqrt(2^d d!)
   constexpr double TERMS[4][4] = {{1}, {1, 1}, {1, 1.4142135623730951, 1}, {1, 1.7320508075688772, 1.7320508075688772, 1}};
   for (int64_t p = 0; p < t.m; ++p) {
@@ -469,7 +594,7 @@ Systematic systematic_errors(const PatchTable& t) {
   double fit[JOINED] = {}, all[JOINED] = {};  // of the observable part, and of pose and amplitudes
   std::vector<double> enlarge = fitted(q, reduced, inverse, fit, all);
   const Ranges ranges = range_errors(t, q, inverse);
-  if (ranges.variance > 0) take_ranges(t, ranges, q), enlarge = fitted(q, reduced, inverse, fit, all);
+  if (ranges.significant) take_ranges(t, q, ranges.amplitudes, q.g), enlarge = fitted(q, reduced, inverse, fit, all);
   for (int64_t p = 0; p < t.m; ++p) add_outer(enlarge[p], q.g[p], q.g[p], spread);
   out.block = block_variance(t, q, enlarge, spread, inverse, M);
   for (int i = 0; i < JOINED; ++i)
@@ -479,7 +604,7 @@ Systematic systematic_errors(const PatchTable& t) {
   for (int k = 0; k < 6; ++k) out.smooth[k] = strain, out.fit[k] = fit[k];
   out.smooth[6] = common_variance(fit, P, 6 + q.strains, n - 6 - q.strains);
   for (int r = 0; r < SURFACE; ++r) out.amplitudes[r] = all[6 + r];
-  for (int k = 0; k < RANGES; ++k) out.smooth[SURFACE + k] = ranges.variance, out.amplitudes[SURFACE + k] = ranges.amplitudes[k];
+  for (int k = 0; k < RANGES; ++k) out.smooth[SURFACE + k] = ranges.variances[k], out.amplitudes[SURFACE + k] = ranges.amplitudes[k];
   return out;
 }
 
