@@ -474,6 +474,10 @@ def simulated(
     """
     rng = setup.rng(3)
     _, drawn = drawn_beliefs(belief, setup.flights, rng)
+    before = np.zeros((0, 3))
+    if setup.contact is not None and state is not None:
+        estimated = np.zeros((1, 6))
+        before = _flown_past(setup, setup.contact, log, belief.t_ns, estimated)[0]
     out: list[Ended] = []
     for each in drawn:
         forecast = partial(setup.estimator.forecast, each)
@@ -489,6 +493,7 @@ def simulated(
                 rng,
                 setup.contact,
                 state,
+                before,
             )
         )
     return out
@@ -560,18 +565,22 @@ def drawn_beliefs(
 def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None:
     """Return for each of ``DRAWN_TARGETS`` targets (n,) whether the flown path touches it; None
     where contact is not checked.
+    """
+    if setup.contact is None:
+        return None
+    z = setup.rng(4).standard_normal((DRAWN_TARGETS, 6))
+    return setup.contact.touched(_flown_past(setup, setup.contact, log, end_ns, z))
+
+
+def _flown_past(setup: Setup, contact: Contact, log: FlightLog, end_ns: int, z: Array) -> Array:
+    """Path (m, n, 3) in {C} that was flown until an instant, past m targets whose poses differ from
+    the estimate by ``z`` (m, 6) standard normal numbers.
 
     A draw has the same share of the pose error at all scans. Parts of the path that are farther
-    from the centre of mass than the target reaches cannot touch it.
+    from the centre of mass than the target reaches cannot touch it and are left out.
     """
-    contact = setup.contact
-    if contact is None:
-        return None
-    if not log.legs:  # the robot has not left its start
-        return np.zeros(DRAWN_TARGETS, dtype=bool)
-    z = setup.rng(4).standard_normal((DRAWN_TARGETS, 6))
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
-    parts: list[Array] = []
+    parts: list[Array] = [np.zeros((len(z), 0, 3))]
     stamps = [leg.belief.t_ns for leg in log.legs]
     for leg, begin_ns, next_ns in zip(log.legs, stamps, [*stamps[1:], end_ns], strict=True):
         stop_ns = min(next_ns, end_ns)
@@ -583,9 +592,7 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
         if not len(r) or float(np.linalg.norm(r - rho, axis=1).min()) > 1.5 * reach:
             continue
         parts.append(_seen_by_draws(setup, leg.belief, times, r - rho, z))
-    if not parts:
-        return np.zeros(DRAWN_TARGETS, dtype=bool)
-    return contact.touched(np.concatenate(parts, axis=1))
+    return np.concatenate(parts, axis=1)
 
 
 def _seen_by_draws(setup: Setup, belief: Belief, times: Array, d: Array, z: Array) -> Array:

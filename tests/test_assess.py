@@ -121,6 +121,10 @@ def test_a_part_that_the_gripper_encloses_is_entered_through_the_mouth_only():
     along = np.column_stack([x, 0.0 * x, 0.0 * x])
     aside = np.column_stack([0.0 * x + 0.03, x, 0.0 * x])
     assert grip.touched(np.array([along, aside])).tolist() == [False, True]
+    back = np.concatenate([along, along[::-1]])  # as a robot that withdraws from the grasp
+    assert not grip.touched(back[None])[0]
+    assert grip.touched(np.concatenate([along, aside[::-1]])[None])[0]
+    assert grip.enclosed(back[None]).sum() == 2 * grip.enclosed(along[None]).sum()
 
 
 def belief(sigma=(0.1, -0.2), spread=1e-3, seed=0):

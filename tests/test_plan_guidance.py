@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import angle, conjugate, exp, multiply
-from avsreplay.plan.flights import closed_loop, pushed, with_thrust_error
+from avsreplay.plan.contact import Contact
+from avsreplay.plan.flights import closed_loop, pushed, relative_path, with_thrust_error
 from avsreplay.plan.guidance import Guidance, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import StepPath
@@ -170,6 +171,47 @@ def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():
     )
     assert all(loop(0.001, seed, 0.3) == "captured" for seed in range(3))
     assert any(loop(0.2, seed, 0.3) != "captured" for seed in range(3))
+
+
+def pin(y):
+    """Closest points and distances of a ball of 6 cm that ends 3 cm beyond the grasp point."""
+    centre = np.array([-0.03, 0.0, 0.0])
+    far = np.linalg.norm(y - centre, axis=1)
+    return centre + 0.06 * (y - centre) / far[:, None], far - 0.06
+
+
+@pytest.mark.slow
+def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flight_touches():
+    target = scene(np.random.default_rng(2))
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = [
+        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
+        for t in np.arange(0.0, 60.0, 0.2)
+    ]
+    guidance = Guidance(ROBOT, Supervisor(PARAMS), Limits(final_deg=12.0).resolved(8.0))
+    grip = Contact(pin, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
+    whole = closed_loop(guidance, known, target, 0, contact=grip)
+    assert (whole.touched, whole.miss is not None) == (False, True)
+    state, path, inside = guidance.initial(0), [np.zeros((0, 3))], 0
+    for last, each, rest in zip(known, known[1:], range(2, len(known)), strict=False):
+        path.append(relative_path(target, state.segment, 0, last.t_ns, each.t_ns))
+        state = guidance.step(state, each)
+        if state.captured_ns is not None:
+            break
+        before = np.concatenate(path)
+        if np.linalg.norm(before[-1]) < 0.1:
+            inside += np.linalg.norm(before[-1]) < 0.075
+            flown = closed_loop(
+                guidance,
+                known[rest:],
+                each.scene,
+                each.t_ns,
+                contact=grip,
+                state=state,
+                before=before,
+            )
+            assert not flown.touched
+    assert inside > 0
 
 
 def test_the_errors_of_the_thrust_over_one_second_do_not_depend_on_the_rate_of_the_scans():

@@ -224,14 +224,8 @@ class AnomalyTest:
         if doubtful < _MOST_DOUBTFUL and not certain(ranked):
             return in_doubt
         manoeuvre = best.hypothesis is Hypothesis.MANOEUVRE and explained
-        if manoeuvre and not best.changes and doubtful < 2 * _MOST_DOUBTFUL:
-            return in_doubt
-        if manoeuvre and best.changes:
-            reported = self._reported(track, window, best)
-            if scans_after(window, best) >= FEWEST_TO_FIT:
-                return self._manoeuvred(reported, window, best), Finding.EXPLAINED
-            if doubtful < 2 * _MOST_DOUBTFUL:
-                return reported, Finding.OPEN
+        if manoeuvre and (decided := self._pushed(track, window, best)) is not None:
+            return decided
         if doubtful < _FEWEST_DOUBTFUL:
             return in_doubt
         free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
@@ -240,6 +234,20 @@ class AnomalyTest:
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
             return self._biased(track, window, best), Finding.OFFSET
         return self._by_agreement(track)
+
+    def _pushed(
+        self, track: Track, window: tuple[Epoch, ...], best: Explanation
+    ) -> tuple[Track, Finding] | None:
+        """The track after a manoeuvre, or in doubt while too few scans follow it; None where these
+        do not come.
+        """
+        waits = len(track.doubtful) < 2 * _MOST_DOUBTFUL
+        if not best.changes:
+            return (track, Finding.OPEN) if waits else None
+        reported = self._reported(track, window, best)
+        if scans_after(window, best) >= FEWEST_TO_FIT:
+            return self._manoeuvred(reported, window, best), Finding.EXPLAINED
+        return (reported, Finding.OPEN) if waits else None
 
     def _allowing(self, track: Track, found: Explanation) -> Track:
         """The track before the doubtful scans with the disturbances or the noise that explain

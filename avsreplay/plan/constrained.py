@@ -55,11 +55,9 @@ RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 # the same while initial paths are compared, and where an earlier plan is renewed
 ROUGH_TOLERANCE = 2e-3
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
-# a renewed plan that is later than the earlier one by more starts the full search
-RENEWED_LATER = 1.02
-RENEWED_LATER_S = 0.1
-# time that is spared where the withdrawals from the earliest path miss margins, over its time to go
-SPARE = (5e-3, 2e-2)
+# time to spare over the time to go of a path from which another one is searched, until its
+# withdrawals keep the margins; where a renewed plan needs more all initial paths are searched
+SPARE = (0.0, 5e-3, 2e-2)
 # relative change of the end time below which the excess tightens the constraints
 NEAR_REFERENCE = 0.02
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
@@ -302,8 +300,8 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
 def _best_path(
     case: Case, free: Plan, unbound: Plan, warm: tuple[RobotPath, float] | None
 ) -> StepPath | None:
-    """Return the earliest capture found: that of a warm start where it converges to about the same
-    end time.
+    """Return the best capture found: from the rest of an earlier path at its end time, or little
+    later where withdrawals need it.
 
     Otherwise all initial paths are searched. Where the earliest capture allowed is before that of
     every draft, the search without this bound, from the unconstrained plan ``unbound``, has the
@@ -311,14 +309,12 @@ def _best_path(
     """
     best: StepPath | None = None
     if warm is not None:
-        again, expected = shortened(case, *warm), max(expected_s(case, *warm), case.earliest_s)
-        enough_s = expected * (1.0 + ROUGH_TOLERANCE) + TIME_TOLERANCE_S
-        best = _refined(again, *warm, rough=True, enough_s=enough_s)
-        renewed_s = RENEWED_LATER * expected + RENEWED_LATER_S
-        if best is not None and best.short_m > 0.0:
-            slower = _unhurried(again, *warm, max(expected, best.t_go_s))
-            best = _safest_of(chain((best,), slower))
-        if best is not None and best.t_go_s <= renewed_s:
+        path, since_s = warm
+        again = shortened(case, path, since_s)
+        best = _safest_of(_unhurried(again, path, since_s, path.t_go_s - since_s))
+        longest = 1.0 + SPARE[-1] + ROUGH_TOLERANCE
+        expected = max(expected_s(case, path, since_s), case.earliest_s)
+        if best is not None and best.t_go_s <= longest * expected + TIME_TOLERANCE_S:
             return best
     coarse = replace(
         case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True
@@ -373,7 +369,6 @@ def _withdrawing(
     """Search paths that keep the withdrawals: from the path that was found without them, then from
     the drafts, then from initial paths.
     """
-    yield _refined(case, found)
     yield from _unhurried(case, found, 0.0, found.t_go_s)
     for start in drafts[:IMPROVED]:
         yield _refined(case, start)
@@ -386,12 +381,12 @@ def _withdrawing(
 def _unhurried(
     case: Case, path: RobotPath, since_s: float, earliest_s: float
 ) -> Iterator[StepPath | None]:
-    """Refine a path with time to spare, with which margins can be kept that the earliest path
-    misses.
+    """Refine the rest of a path for a capture not before ``earliest_s``, then with time to spare,
+    with which margins can be kept that the earliest path misses.
     """
     for spare in SPARE:
         later = replace(case, earliest_s=max(case.earliest_s, (1.0 + spare) * earliest_s))
-        yield _refined(later, path, since_s, rough=True, enough_s=math.inf)
+        yield _refined(later, path, since_s, first=True)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
@@ -476,8 +471,7 @@ def _refined(
     since_s: float = 0.0,
     latest_s: float = math.inf,
     trust: float = TRUST,
-    rough: bool = False,
-    enough_s: float = -math.inf,
+    first: bool = False,
 ) -> StepPath | None:
     """Iterate from the rest of an earlier path, whose withdrawals the first iteration
     requires.
@@ -486,7 +480,7 @@ def _refined(
     tried = Tried.near(known, since_s + case.wait_s, path.t_go_s, case.reserve_m)
     away = withdrawn(case, path, tried, since_s)
     reference = warm_reference(case, path, since_s)
-    return _converged(case, reference, latest_s, trust, rough, away, enough_s)
+    return _converged(case, reference, latest_s, trust, away, first)
 
 
 @dataclass
@@ -520,18 +514,13 @@ class _Search:
                 0 if better or best is None or path.short_m < best.short_m else self.idle,
             )
 
-    def done(self, settled: bool, enough_s: float) -> bool:
-        """Return whether the best path is the latest one and moves no more, or is safe and not
-        later than ``enough_s``, or has not become better in ``IDLE`` iterations, after which only
-        a search that no later one renews goes on to make it safe.
+    def done(self, settled: bool, first: bool) -> bool:
+        """Return whether the best path is safe and the ``first`` one is enough, or it is the latest
+        one and moves no more, or has not become better in ``IDLE`` iterations.
         """
-        if self.best is None:
+        if self.best is None or self.best.short_m > 0.0:
             return False
-        if self.best.short_m <= 0.0 and self.best.t_go_s <= enough_s:
-            return True
-        safe = self.best.short_m <= 0.0
-        idle = self.idle >= IDLE and (safe or math.isfinite(enough_s))
-        return idle or (settled and safe and self.idle == 0)
+        return first or self.idle >= IDLE or (settled and self.idle == 0)
 
     def tighten(self, over: Array, buffer_m: float, near: bool) -> None:
         """Subtract the excess ``over`` from the constraints where the path is near its reference;
@@ -565,19 +554,18 @@ def _converged(
     reference: ReferencePath,
     latest_s: float = math.inf,
     trust: float = TRUST,
-    rough: bool = False,
     away: Withdrawn | None = None,
-    enough_s: float = -math.inf,
+    first: bool = False,
 ) -> StepPath | None:
     """Iterate from a reference until the best feasible path seen no longer becomes better, and
     return it.
 
     The iterations end without a result where the end time remains later than ``latest_s``, and with
-    a safe path that is not later than ``enough_s``. The first iteration requires ``away``, the
+    the first safe path where ``first``. The first iteration requires ``away``, the
     withdrawals of an earlier path.
     """
     n = case.limits.nodes
-    tolerance = ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
+    tolerance = ROUGH_TOLERANCE if case.coarse or first else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     rows = () if away is None else away.rows
     search = _Search(Withdrawn(rows=rows), np.zeros((2 * n, len(CONSTRAINTS))))
@@ -596,7 +584,7 @@ def _converged(
         if found.slack <= case.allowed_slack_m:
             _accepted(case, path, over, search)
         moved = abs(t - reference.t)
-        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t), enough_s):
+        if search.done(moved <= max(TIME_TOLERANCE_S, tolerance * t), first):
             break
         if _hopeless(case, search, path, iteration, latest_s, stuck):
             break

@@ -1,8 +1,9 @@
 """Contact of the end-effector with the body, always by the model of the target.
 
 The end-effector is a ball about its centre. At the grasp point the gripper encloses what is
-narrower than its opening: there, in a cylinder about the axis of the approach, the last part of the
-path is no contact if it was entered through the mouth of the cylinder.
+narrower than its opening: there, in a cylinder about the axis of the approach, a part of the path
+is no contact if it enters the cylinder through its mouth, and leaves it through its mouth if it
+leaves it.
 """
 
 from __future__ import annotations
@@ -56,8 +57,9 @@ class Contact:
         return np.asarray(((self.distances(y) < 0.0) & ~self.enclosed(y)).any(axis=1))
 
     def enclosed(self, y: Array) -> NDArray[np.bool_]:
-        """Return (m, n): whether a position belongs to the last part of a path, inside the
-        cylinder of the grasp.
+        """Return (m, n): whether the gripper encloses the body there: a position inside the
+        cylinder of the grasp, on a part of the path that enters it, and leaves it if it does,
+        through its mouth.
 
         Args:
             y: (m, n, 3) positions from the grasp point in {C} [m], in the order of time.
@@ -66,7 +68,20 @@ class Contact:
         across = np.linalg.norm(y - along[..., None] * self.axis_c, axis=-1)
         most = self.mouth_m + self.radius_m + self.half_m
         inside = (across <= self.half_m + self.radius_m) & (along >= -self.half_m) & (along <= most)
-        last = np.logical_and.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
-        first = np.argmax(last, axis=1)
-        entry = np.take_along_axis(along, first[:, None], axis=1)[:, 0]
-        return np.asarray(last & (entry >= ENTRY * self.mouth_m)[:, None])
+        past_mouth = along >= ENTRY * self.mouth_m
+        entered = _at_first_of_runs(inside, past_mouth)
+        at_end = past_mouth.copy()
+        at_end[:, -1:] = True  # the path ends there
+        left = _at_first_of_runs(inside[:, ::-1], at_end[:, ::-1])[:, ::-1]
+        return np.asarray(inside & entered & left)
+
+
+def _at_first_of_runs(inside: NDArray[np.bool_], flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (m, n): for each position inside, the flag of the first one of its run; the value
+    outside has no meaning.
+    """
+    columns = np.arange(inside.shape[1])
+    begins = inside.copy()
+    begins[:, 1:] &= ~inside[:, :-1]
+    first = np.maximum.accumulate(np.where(begins, columns, 0), axis=1)
+    return np.take_along_axis(flags, first, axis=1)

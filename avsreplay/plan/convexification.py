@@ -425,7 +425,7 @@ def proven(case: Case, path: RobotPath, away: Withdrawn) -> Withdrawn:
     if short <= 0.0:
         return replace(away, margin_m=found.margin_m, short_m=0.0, escapes=found.escapes)
     at = found.worst.t[poor]
-    missing = np.maximum(least - found.margins_m[poor], 0.0)
+    missing = least + case.reserve_m - found.margins_m[poor]
     tried = away.tried.also((at - case.wait_s) / length, escapes_at(escapes, at), missing)
     return replace(
         withdrawn(case, path, tried, improve=False),

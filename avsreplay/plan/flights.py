@@ -360,6 +360,7 @@ def closed_loop(
     rng: np.random.Generator | None = None,
     contact: Contact | None = None,
     state: GuidanceState | None = None,
+    before: Array | None = None,
 ) -> Ended:
     """Fly one approach with replanning, errors of the thrust and the delay of the planner.
 
@@ -373,12 +374,15 @@ def closed_loop(
         rng: Random generator of these errors; needed where they are not zero.
         contact: Contact with the body; None: it is not checked.
         state: State of the robot before the first scan; None: at its configured start.
+        before: Path (n, 3) that the robot has flown to that state, from the grasp point in {C} [m]:
+            how it came to the grasp decides whether it touches the body there.
 
     Raises:
         ValueError: There is no scan.
     """
     aimed: Array | None = None
-    last_ns, flown, known = start_ns, list[Array](), None
+    last_ns, known = start_ns, None
+    flown = [np.zeros((0, 3)) if before is None else before]
     for known in inputs:
         if state is None:
             state, last_ns = guidance.initial(known.t_ns), known.t_ns
@@ -400,7 +404,7 @@ def closed_loop(
             break
     if state is None or known is None:
         raise ValueError("there is no scan")
-    y = np.concatenate([np.zeros((0, 3)), *flown])
+    y = np.concatenate(flown)
     touched = contact is not None and bool(contact.touched(y[None])[0])
     decided = state.decision.action, state.decision.rule
     if state.captured_ns is None:

@@ -694,11 +694,16 @@ def _largest(space: Space, paths: list[BurnPath]) -> Withdrawal:
     every = [_pieces(space, path) for path in paths]
     owner = np.repeat(np.arange(len(every)), [len(m.t) for m in every])
     m = joined(every)
-    rough = np.full(len(paths), space.enough_m)
-    np.minimum.at(rough, owner, space.margins(m, space.enough_m)[0].min(axis=1))
-    goal = float(rough.max()) - space.resolution_m
-    lower = np.full(len(paths), goal)
-    np.minimum.at(lower, owner, space.least(m, goal)[0])
+    upper = np.full(len(paths), space.enough_m)
+    np.minimum.at(upper, owner, space.margins(m, space.enough_m)[0].min(axis=1))
+    for _ in range(HALVINGS):  # a smaller margin is found where the largest one is not proven
+        goal = float(upper.max()) - space.resolution_m
+        lower = np.full(len(paths), goal)
+        bound, found = space.least(m, goal)[:2]
+        np.minimum.at(lower, owner, bound)
+        np.minimum.at(upper, owner, found)
+        if lower.max() >= goal:
+            break
     first = int(lower.argmax())
     return Withdrawal(paths[first], float(lower[first]))
 
