@@ -296,6 +296,13 @@ def test_errors_are_those_of_the_second_half():
     assert found["attitude_deg"] == pytest.approx(0.5 * np.sqrt(np.mean(np.arange(4, 8) ** 2)))
 
 
+def test_the_nees_is_that_of_an_exact_truth_only():
+    row = Row(t_ns=0, converged=False, pos_err_m=0.0, rot_err_deg=0.0)
+    assert scored([row])["nees"] == pytest.approx(0.0, abs=1e-12)
+    assert scored([row], truth_m=0.001)["nees"] is None
+    assert scored([])["nees"] is None
+
+
 def test_an_entry_that_is_missing_is_in_the_table_of_all_groups_only():
     entries = [{"name": "x+own", "missing": ""}, {"name": "y+own", "missing": "not installed"}]
     found = results.document(SUITE, entries, [run(), run(group="moved")])

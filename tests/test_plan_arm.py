@@ -4,6 +4,7 @@ kinematics; needs pinocchio.
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -287,3 +288,21 @@ def test_without_the_library_one_line_says_what_to_install(
         UsageError, match=r"pinocchio, which is not installed; pip install 'avsreplay\[arm\]'"
     ):
         Arm(_urdf(tmp_path / "arm.urdf"))
+
+
+@pytest.mark.parametrize("name", ["range_share", "rate_share", "torque_share"])
+@pytest.mark.parametrize("share", [0.2, 1.0, 1.001, 1.5, math.nan])
+def test_joints_can_move_where_no_limit_is_exceeded_and_slowly_enough_otherwise(name, share):
+    """A rate grows with the root of the acceleration, a torque with it, a range does not."""
+    shares = {"range_share": 0.5, "rate_share": 0.5, "torque_share": 0.5, name: share}
+    path = JointPath(np.zeros(2), np.zeros((2, 6)), 1.0, True, 10.0, **shares)
+    exceeded = share > 1.0
+    assert path.possible == (not exceeded)
+    assert not replace(path, complete=False).possible
+    if exceeded and name != "range_share":
+        slowed_share = share * (path.slower if name == "torque_share" else path.slower**0.5)
+        assert 0.5 < slowed_share < 1.0
+    elif not exceeded:
+        assert path.slower >= 0.9 / max(share, 0.9) - 1e-12 or math.isnan(share)
+    else:
+        assert path.slower == 1.0

@@ -343,6 +343,17 @@ def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
     assert found[40][1] == "the estimate is not converged"
 
 
+@pytest.mark.parametrize("column", ["pos_err_m", "rot_err_deg"])
+def test_an_error_stands_out_above_three_times_the_median(make_rows, column):
+    clean = {"gamma": 1, "reason": "ok", "fault": None, "nis": 6.0}
+    clean |= {"pos_err_m": 0.002, "rot_err_deg": 0.1}
+    rows = [dataclasses.replace(r, **clean) for r in make_rows(n=20)]
+    for factor, found in ((1.0, 0), (2.9, 0), (3.1, 1), (3.9, 1), (30.0, 1)):
+        worse = dataclasses.replace(rows[7], **{column: factor * clean[column]})
+        moments = worst_moments([*rows[:7], worse, *rows[8:]])
+        assert [m.row for m in moments] == [7] * found
+
+
 def test_a_manoeuvre_is_the_cause_of_the_scans_that_were_rejected_before_it_was_decided(make_rows):
     rows = _good(
         make_rows, n=40, gamma=1, reason="ok", fault=None, nis=6.0, converged=True, manoeuvres=0

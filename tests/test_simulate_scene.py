@@ -21,7 +21,7 @@ from avsreplay.simulate.rays import FieldOfView, Pattern, ray_grid
 from avsreplay.simulate.scenario import load_scenario, scenario_of
 from avsreplay.simulate.scene import SceneObject
 from avsreplay.simulate.simulation import SIMULATED_EPOCH_NS, simulate
-from avsreplay.simulate.target import builtin_surface, ply_bytes
+from avsreplay.simulate.target import adapter, builtin_surface, ply_bytes
 
 SURFACE = builtin_surface()
 BASE = """
@@ -175,6 +175,22 @@ def test_a_launcher_adapter_is_a_hollow_cone():
         assert np.all(radius <= outer + 1e-5)
         assert np.all(radius >= (outer - 0.075) * (1.0 - chord) - 1e-5)
         assert radius.min() > 1.3  # open in the middle
+
+
+@pytest.mark.parametrize(("r0", "r1"), [(2.0, 1.5), (0.5, 0.9), (1.0, 1.0)])
+def test_the_surface_of_a_launcher_adapter_is_closed_and_contains_its_wall(r0, r1):
+    made = adapter(r0, r1, 0.4)
+    places = np.unique(made.vertices.round(9), axis=0, return_inverse=True)[1].ravel()
+    corners = places[made.faces]
+    directed = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
+    edges = {tuple(edge) for edge in directed.tolist()}
+    assert len(edges) == len(directed)
+    assert all((b, a) in edges for a, b in edges)
+    a, b, c = made.vertices[made.faces].transpose(1, 0, 2)
+    volume = np.einsum("ni,ni->", a, np.cross(b, c)) / 6.0
+    wall = 0.05 * min(r0, r1)
+    of_circles = np.pi * 0.8 * wall * (r0 + r1 - wall)  # the difference of two truncated cones
+    assert volume == pytest.approx(of_circles, rel=0.01)
 
 
 PLUME = """[[plume]]
