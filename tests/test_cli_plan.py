@@ -10,9 +10,11 @@ import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
+from avsreplay.assessment import Assessment, Chance
 from avsreplay.cli.plan import plan_command
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import IDENTITY_QUAT, matrix
+from avsreplay.outcome import CaptureError
 from avsreplay.records import State
 from avsreplay.report.export import write_tum
 from avsreplay.report.jsonl import write_rows
@@ -122,6 +124,24 @@ def test_plan_spread_hindsight_and_flight(result):
     )  # the estimate is the truth; the truth is a spline through poses
     assert document["execution"]["outcome"] == "captured"
     assert document["execution"]["miss"]["speed_mps"] < 1e-3
+
+
+def test_the_assessment_is_that_of_the_run_unless_an_option_asks_for_another_flight(result):
+    made = Assessment(
+        chance=Chance.POSSIBLE,
+        probability=0.625,
+        probability_95=(0.5, 0.75),
+        at_s=31.5,
+        tolerance=CaptureError(0.013, 0.0066, 2.0),
+        limit="the inertia",
+    )
+    saved = made.record()
+    header = json.loads((result / "run.json").read_text())
+    (result / "run.json").write_text(json.dumps({**header, "capture": saved}))
+    fast = ("--json", "--samples", 8, "--every", 20, "--flights", 16)
+    assert json.loads(run(result, *fast[:-2]).stdout)["capture"] == saved
+    for more in (("--at", 6), ("--a-max", 0.05), ("--set", "plan.horizon_s=50"), fast[-2:]):
+        assert json.loads(run(result, *fast[:-2], *more).stdout)["capture"] != saved
 
 
 def test_the_same_input_gives_the_same_bytes(result):

@@ -63,6 +63,12 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
             2 usage, 3 unreadable input."""
 
 
+# parameters that do not change the approach that is assessed
+_OF_THE_SAME_FLIGHT = frozenset(
+    ("result", "samples", "every_s", "export", "animate", "overwrite", "as_json")
+)
+
+
 @click.command("plan", cls=Command, epilog=EPILOG)
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option(
@@ -182,7 +188,8 @@ def plan_command(
     made = _usable(lambda: planning.stated(index, planning.plan_at(index)))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    assessment = _usable(lambda: planning.assess(index, flights, seed))
+    same = saved.assessment is not None and not _asked()
+    flown = saved.assessment if same else _usable(lambda: planning.assess(index, flights, seed))
     joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
@@ -190,13 +197,26 @@ def plan_command(
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    answer = Answer(planning, at_s, made, assessment, spread, joints, hindsight, execution, changes)
+    answer = Answer(planning, at_s, made, flown, spread, joints, hindsight, execution, changes)
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:
         click.echo(document(answer), nl=False)
     else:
         print_answer(answer)
+
+
+def _asked() -> bool:
+    """Whether an option asks for another flight than that of the run, which has its assessment."""
+    from click.core import ParameterSource
+
+    context = click.get_current_context()
+    given = {
+        name
+        for name in context.params
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT
+    }
+    return bool(given - _OF_THE_SAME_FLIGHT)
 
 
 def _usable(action: Any) -> Any:
