@@ -188,8 +188,9 @@ def plan_command(
     made = _usable(lambda: planning.stated(index, planning.plan_at(index)))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    same = saved.assessment is not None and not _asked()
-    flown = saved.assessment if same else _usable(lambda: planning.assess(index, flights, seed))
+    flown = None if _asked() else saved.assessment
+    if flown is None:
+        flown = _usable(lambda: planning.assess(index, flights, seed))
     joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
