@@ -208,7 +208,7 @@ def plan_command(
 
 
 def _asked() -> bool:
-    """Whether an option asks for another flight than that of the run, which has its assessment."""
+    """Whether an option is given that changes the flight, whose assessment the run has made."""
     from click.core import ParameterSource
 
     context = click.get_current_context()
