@@ -270,6 +270,10 @@ def test_each_problem_is_a_reason(make_rows, changes, grade, text):
     assert any(text in reason.text for reason in found.reasons), found.reasons
 
 
+def test_a_covariance_that_is_somewhat_larger_than_the_errors_is_no_concern(make_rows):
+    assert _judged(_good(make_rows, nees=5.0)).grade is Grade.PASS
+
+
 def test_convergence_that_is_withdrawn_for_the_last_scans_is_a_reason(make_rows):
     """A single doubtful scan at the end is none."""
     rows = _good(make_rows, converged=True)

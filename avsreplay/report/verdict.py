@@ -26,6 +26,8 @@ from avsreplay.tables import chosen, column_of, numbers, used_rows
 # Share of the scans without an injected harmful fault that updated the filter.
 USED_SHARE_FAIL = 0.5
 USED_SHARE_CHECK = 0.9
+# a covariance is called too large if NEES is below its band even with 1 sigma divided by this
+SAFE_SIGMA = 2.0
 LEAST_SHARE_INSIDE = 0.8  # share of NIS or NEES inside the 95 % band
 MAX_FALSE_ALARM_SHARE = 0.05  # share of the scans without a fault
 # Median position error over the model's extent, all scans.
@@ -350,22 +352,20 @@ def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is None or share.count < 10:
             continue
-        # a small NIS shows a noise that was assumed too large, which is safe
-        good = share.inside if name == "NEES" else 1.0 - share.above
-        if good < LEAST_SHARE_INSIDE:
-            low = (
-                "too small (overconfident)"
-                if share.median > share.high
-                else "too large (conservative)"
-            )
+        # values below the band show a covariance that is larger than the errors, which is safe; a
+        # small NIS, a noise that was assumed too large
+        above = 1.0 - share.above < LEAST_SHARE_INSIDE
+        below = name == "NEES" and SAFE_SIGMA**2 * share.median < share.low
+        if above or below:
+            low = "too small (overconfident)" if above else "too large (conservative)"
             where = (
                 f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
             )
-            shares = (
-                f"{100 * share.inside:.0f} % of {name} inside the 95 % band,"
-                f" {100 * share.above:.0f} % above it"
+            yield Concern(
+                Grade.CHECK,
+                f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band,"
+                f" {100 * share.above:.0f} % above it",
             )
-            yield Concern(Grade.CHECK, f"{where}only {shares}")
     if text := error_over_sigma(rows):
         yield Concern(Grade.CHECK, text)
     consistent = zip(column_of(rows, "t_s"), column_of(rows, "consistent"), strict=True)
