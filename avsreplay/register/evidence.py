@@ -77,18 +77,11 @@ LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may 
 # Log likelihood ratio of the edges of the model below which another surface was measured. The
 # right poses of held-out bodies have 18 or more; a box that is 5 % larger has -61 or less.
 LEAST_OF_EDGES = 0.0
-# Share of the patches that rays pass through at wrong minima which their other terms support (a mug
-# with its handle on the wrong side: 0.10 to 0.11); right poses have at most 0.021.
-THROUGH_OF_WRONG = 0.12
-# log likelihood ratio of this share below which the pose is wrong: 100 to 1, so that some patches
-# of a scan with few do not decide
-LEAST_OF_THROUGH = -np.log(100.0)
 GOES_ON = (
     "the surface in the scan continues beyond the edges of the model, as that of another or a"
     " larger object"
 )
 CONTRADICTED = "the scan contradicts the pose: "
-PASSED = "rays that pass through it"
 TURNED_AWAY = "most points are on faces that face away from the camera"
 TOO_FEW = f"fewer than {LEAST_RAYS_NEAR} of its points are near the model"
 PLANES = (1.0, 2.0, 3.0, 5.0)  # standard deviations between the classes of points on the model
@@ -158,15 +151,6 @@ class Evidence:
         )
 
     @property
-    def passed(self) -> float:
-        """Return the log likelihood ratio of the share of patches that rays pass through."""
-        others = max(self.patches - self.through, 0.0)
-        return float(
-            self.through * np.log(CONTRADICTING_PATCHES / THROUGH_OF_WRONG)
-            + others * np.log((1.0 - CONTRADICTING_PATCHES) / (1.0 - THROUGH_OF_WRONG))
-        )
-
-    @property
     def patches(self) -> float:
         """Return the number of patches that the scan shows."""
         return float(max(5.0, self.on.sum() + self.beside + self.through))
@@ -201,8 +185,6 @@ class Evidence:
             return TURNED_AWAY
         if self.silhouettes < LEAST_OF_EDGES:
             return CONTRADICTED + GOES_ON
-        if self.passed < LEAST_OF_THROUGH:
-            return CONTRADICTED + PASSED
         hidden = predicted and self.elsewhere <= MOST_MISSING * self.patches
         allowed = -SHARES * self._shares / self.patches if hidden else 0.0
         if self.mean + allowed >= LEAST_MEAN:
@@ -217,7 +199,7 @@ class Evidence:
             "points beside the model": -self.beside * np.log(CONTRADICTING_PATCHES),
             "surface that is not in the scan, and points off the model": -self.elsewhere
             * np.log(CONTRADICTING_PATCHES),
-            PASSED: -self.through * np.log(CONTRADICTING_PATCHES),
+            "rays that pass through it": -self.through * np.log(CONTRADICTING_PATCHES),
             GOES_ON: -self.continued * np.log(CONTINUES / 0.5),
             f"distances to the model spread by {self.noise_m:.3g} m": 0.5
             * SHARES

@@ -21,7 +21,7 @@ import scenes
 
 from avsreplay import geometry
 from avsreplay.geometry import Pose
-from avsreplay.register.evidence import LEAST_ALONE, LEAST_OF_THROUGH, EvidenceModel, Observed
+from avsreplay.register.evidence import LEAST_ALONE, EvidenceModel, Observed
 from avsreplay.register.registrar import Registrar
 
 LIMITS = (0.4, 0.6, 0.8, 0.9, 1.0, 1.2)
@@ -91,7 +91,6 @@ def _poses(registrar, model, case, seed):
         angle = float(np.degrees(geometry.angle(step.q)))
         moved = float(np.linalg.norm(step.apply(middle) - middle)) / extent
         accepted = at is not None and not (at.away and at.share < LEAST_ALONE)
-        accepted = accepted and at.passed >= LEAST_OF_THROUGH
         if angle < 2.0 and moved < 0.02:
             yield True, at.mean if accepted else -np.inf
         elif angle > 10.0 or moved > 0.1:
