@@ -212,9 +212,14 @@ def _inside(setup, state, x, last_ns, aimed):
     return bool((np.array(errors) <= setup.limits).all())
 
 
+def judged(rows: list[dict[str, object]], key: str) -> list[dict[str, object]]:
+    """Flights with a prediction whose outcome is known: they ended within the log, or touched."""
+    return [r for r in rows if r[key] is not None and (r["ended"] is not None or r["touched"])]
+
+
 def table(rows: list[dict[str, object]], key: str, outcome: str) -> list[tuple[float, ...]]:
     """Bins of a predicted probability: mean prediction, frequency, count."""
-    known = [(float(r[key]), float(r[outcome])) for r in rows if r[key] is not None]
+    known = [(float(r[key]), float(r[outcome])) for r in judged(rows, key)]
     edges, out = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0001), []
     for low, high in pairwise(edges):
         part = [(p, o) for p, o in known if low <= p < high]
@@ -226,9 +231,10 @@ def table(rows: list[dict[str, object]], key: str, outcome: str) -> list[tuple[f
 
 def report(rows: list[dict[str, object]]) -> None:
     """Print bins and Brier scores."""
-    print(f"{len(rows)} flights, {sum(r['predicted'] is not None for r in rows)} reached t_1")
+    reached = sum(r["predicted"] is not None for r in rows)
+    print(f"{len(rows)} flights, {reached} reached t_1, {len(judged(rows, 'predicted'))} judged")
     for key, outcome in (("predicted", "captured"), ("contact", "touched"), ("ended", "captured")):
-        known = [(float(r[key]), float(r[outcome])) for r in rows if r[key] is not None]
+        known = [(float(r[key]), float(r[outcome])) for r in judged(rows, key)]
         brier = np.mean([(p - o) ** 2 for p, o in known]) if known else np.nan
         base = np.var([o for _, o in known]) if known else np.nan
         print(
@@ -238,7 +244,7 @@ def report(rows: list[dict[str, object]]) -> None:
             print(f"  predicted {p:.2f}  happened {o:.2f}  in {n}")
     for name in ("disturbed", "robot", "body"):
         for value in sorted({r[name] for r in rows}):
-            part = [r for r in rows if r[name] == value and r["predicted"] is not None]
+            part = [r for r in judged(rows, "predicted") if r[name] == value]
             if part:
                 p, o = (np.mean([float(r[k]) for r in part]) for k in ("predicted", "captured"))
                 print(f"{name} {value}: predicted {p:.2f}, happened {o:.2f}, {len(part)} flights")
