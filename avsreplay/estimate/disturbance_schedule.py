@@ -63,6 +63,7 @@ _DRIFT_OF_SPEED = 5e-3
 _EARLY = 2.0
 # least variance of a belief over that of a pose, less 1, for which the pose is used
 _LEAST_EXCESS = 1e-6
+_LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
 _LEAST_NIS = 1.6
@@ -155,7 +156,7 @@ class DisturbanceSchedule:
         """
         count, fixes = pose_count(track.fixes), track.fixes
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        if track.drift is not None or late <= 0:
+        if track.drift is not None or late <= (0 if track.since else _LATEST):
             return ()
         if count < FEWEST and _overestimated(track):
             fixes = _all_poses(track).fixes[-FEWEST:]
