@@ -211,6 +211,8 @@ class AnomalyTest:
         """
         if len(track.doubtful) < _FEWEST_DOUBTFUL:
             return track, Finding.OPEN
+        if (resumed := self._resumed(track)) is not None:
+            return resumed, Finding.EXPLAINED
         return self._by_agreement(track)
 
     def _decided(
@@ -305,8 +307,6 @@ class AnomalyTest:
         """The track initialised anew from the doubtful poses if they agree with one another;
         else they are bad.
         """
-        if (resumed := self._resumed(track)) is not None:
-            return resumed, Finding.EXPLAINED
         track = self._with_rejected(track)
         levels = self._disturbances(track)
         anew = self._initialised_anew(track, levels)
