@@ -214,7 +214,7 @@ def test_simulated_flights_keep_what_is_known_of_a_body_whose_principal_axes_are
     T = to_errors(to_chart(x))
     given = Belief(0, x, T @ np.diag(sizes**2) @ T.T)
     assert 2.0 * np.sqrt(np.trace(given.P[:3, :3])) > 1.0  # the attitude of the axes
-    setup, log = setup_of(np.diag([0.02**2] * 6)), FlightLog()
+    setup, log = setup_of(np.diag([0.01**2] * 6)), FlightLog()
     for k in range(5):
         log.take(Belief(k * 400_000_000, x, given.P), None, 1, True)
     ended = simulated(setup, log, None, given)
