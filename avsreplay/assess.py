@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,8 +37,9 @@ from avsreplay.estimate.chart import (
     to_state,
 )
 from avsreplay.estimate.driven import DrivenBelief
+from avsreplay.estimate.grasp_point import noise_about
 from avsreplay.estimate.noise import cholesky_root
-from avsreplay.estimate.params import NoiseSource
+from avsreplay.estimate.params import Adaptation, NoiseSource
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Plan, PlanStatus
 from avsreplay.pipeline import planner_input
@@ -106,7 +108,7 @@ class FlightLog:
         gammas: gamma of every scan.
         stamps: instant of every scan [ns].
         failing_ns: instant since which no capture is planned [ns]; None where one is.
-        noises: (6,) variances of the last measured poses: positions [m2], half angles [rad2].
+        noises: (6, 6) covariances of the last measured poses, as ``noise`` gives them.
     """
 
     def __init__(self) -> None:
@@ -134,12 +136,13 @@ class FlightLog:
             guidance: the state of guidance after the scan; it does not change after the capture.
             gamma: 1 for a healthy scan, else 0.
             converged: whether the belief may be used for planning.
-            noise: (6, 6) noise covariance of the measured pose; None where nothing was measured.
+            noise: (6, 6) covariance of d = [theta; v], the error of the measured pose in {C} [rad,
+                m]; None where nothing was measured.
         """
         self.gammas.append(gamma)
         self.stamps.append(belief.t_ns)
         if noise is not None and gamma:
-            self.noises = [*self.noises[-NOISE_SCANS + 1 :], np.diagonal(noise).copy()]
+            self.noises = [*self.noises[-NOISE_SCANS + 1 :], noise]
         if self.ended or guidance is None:
             return
         self.state, self.belief, self.converged = guidance, belief, converged
@@ -160,14 +163,15 @@ class FlightLog:
         )
 
     @property
-    def noise(self) -> tuple[float, float] | None:
-        """Mean 1 sigma of a measured pose: position [m] and half angle [rad] of one axis; None
-        where no pose was measured.
+    def noise(self) -> Array | None:
+        """The covariance (6, 6) of d = [theta; v], the error of a pose in {C} [rad, m], whose
+        information is the mean of the last poses; None where no pose was measured.
+
+        A view that does not determine a direction tells nothing of it; the next views do.
         """
         if not self.noises:
             return None
-        mean = np.median(self.noises, axis=0)
-        return math.sqrt(float(mean[:3].mean())), math.sqrt(float(mean[3:].mean()))
+        return np.linalg.inv(np.mean(np.linalg.inv(np.array(self.noises)), axis=0))
 
 
 @value_class
@@ -183,8 +187,8 @@ class Setup:
         since_ns: instant of the first scan [ns].
         thrust_noise_mps2: standard deviation of the thrust error of each axis, as its mean over 1 s
             [m/s2].
-        noise: standard deviations of a measured pose [m, rad of half angle]; None takes R0 of the
-            settings.
+        noise: (6, 6) covariance of d = [theta; v], the error of a measured pose in {C} [rad, m];
+            None takes R0 of the settings.
         flights: number of simulated flights where the log ends before the capture.
         seed: seed of all random draws.
         advice: grasp points that could be used instead, in words.
@@ -198,7 +202,7 @@ class Setup:
     extent_m: float
     since_ns: int
     thrust_noise_mps2: float = 0.0
-    noise: tuple[float, float] | None = None
+    noise: Array | None = None
     flights: int = SIMULATED_FLIGHTS
     seed: int = 0
     advice: str = ""
@@ -505,29 +509,32 @@ def _measured(
     """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
     noise of the log, and no pose where the log had a blackout.
     """
-    given: dict[str, Any] = {}
-    if setup.noise is not None:
-        position, half = setup.noise
-        given = {"r0_pos_m": position, "r0_rot_deg": 2.0 * math.degrees(half)}
-    params = replace(setup.estimator.params, noise=NoiseSource.R0, **given)
+    # The noise is known here, and a fit to the poses of the flight would forget those of the log.
+    known = NoiseSource.REGISTRATION, Adaptation.OFF
+    params = replace(setup.estimator.params, noise=known[0], adapt=known[1], audit_poses=0)
     estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)
     motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
-    track = estimator.initial(belief.t_ns, belief.x.T_ac)
+    track, C = estimator.resumed(belief), setup.noise
+    if C is None:
+        position, half = np.split(np.diag(estimator.params.resolved(setup.extent_m).R0), 2)
+        C = np.diag(np.concatenate([4.0 * half, position]))
+    root = cholesky_root(C := noise_about(C, setup.task.grasp_c))
     step_ns = int(np.median(np.diff(log.stamps))) if len(log.stamps) > 1 else 100_000_000
-    R = np.diag(estimator.params.resolved(setup.extent_m).R0)
     offset = int(rng.integers(len(log.gammas)))
     last_ns = round(setup.guidance.params.horizon_s * 2e9)
     for k, since_ns in enumerate(range(step_ns, last_ns, step_ns)):
         t_ns, dt = belief.t_ns + since_ns, np.array([since_ns * 1e-9])
         prior, gamma = estimator.predict(track, t_ns), log.gammas[(offset + k) % len(log.gammas)]
-        error = np.sqrt(R) * rng.standard_normal(6)
+        turn, move = np.split(root @ rng.standard_normal(6), 2)
         if gamma:
+            q = attitude(dt)[0]
             pose = Pose(
-                geometry.multiply(attitude(dt)[0], geometry.exp(2.0 * error[3:])),
-                motion(dt)[0][0] + error[:3],
+                geometry.multiply(q, geometry.exp(turn)),
+                motion(dt)[0][0] + geometry.matrix(q) @ move,
             )
-            seen = Alignment(pose, 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED)
-            track = estimator.update(track, prior, estimator.innovate(prior, seen), 1)
+            quality = 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED
+            innovation = estimator.innovate(prior, Alignment(pose, *quality, covariance=C))
+            track = estimator.update(track, prior, innovation, 1)
         else:
             track = estimator.update(track, prior, None, 0)
         forecast = partial(estimator.forecast, track.belief)
@@ -575,7 +582,7 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
 def _flown(log: FlightLog, end_ns: int) -> Iterator[tuple[Leg, NDArray[np.int64], Array]]:
     """Legs that were flown until an instant, each with instants (n,) [ns] and positions (n, 3)."""
     stamps = [leg.belief.t_ns for leg in log.legs]
-    for leg, begin_ns, next_ns in zip(log.legs, stamps, [*stamps[1:], end_ns], strict=True):
+    for leg, (begin_ns, next_ns) in zip(log.legs, pairwise([*stamps, end_ns]), strict=True):
         if (stop_ns := min(next_ns, end_ns)) > begin_ns:
             yield leg, *flown_positions(leg.segment, begin_ns, stop_ns)
 

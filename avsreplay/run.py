@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.assess import FlightLog, Setup, assess
 from avsreplay.assessment import Assessment
@@ -19,8 +21,9 @@ from avsreplay.config import Against, RunConfig, load_config, pose_text, with_ac
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
-from avsreplay.estimate.grasp_point import at_grasp
-from avsreplay.geometry import Pose
+from avsreplay.estimate.grasp_point import at_grasp, noise_about
+from avsreplay.estimate.measurement import in_fixture
+from avsreplay.geometry import Array, Pose
 from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
 from avsreplay.log.streams import ahead
 from avsreplay.outcome import Outcome
@@ -264,7 +267,7 @@ class Run:
             state.guidance,
             outcome.verdict.gamma,
             outcome.monitors.converged,
-            None if outcome.innovation is None else outcome.innovation.R,
+            self._noise_of(outcome),
         )
         self.taken.append(row)
         self._state, self.done = state, self.done + 1
@@ -399,6 +402,14 @@ class Run:
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
         given = None if motion is None else (lambda times: motion(times + since_s))
         return assess(setup, self.flight, given)
+
+    def _noise_of(self, outcome: Outcome) -> Array | None:
+        """Covariance (6, 6) of the error of a measured pose in {C} [rad, m]."""
+        if outcome.innovation is None or outcome.alignment is None:
+            return None
+        C = in_fixture(outcome.innovation.R, outcome.alignment.T_ac.q, outcome.belief.x.q_bc)
+        own = isinstance(self.estimator, Estimator)
+        return noise_about(C, np.array(self.estimator.frame.origin_c)) if own else C
 
     def _predictor(self) -> Estimator:
         """The estimator that predicts targets from a belief; a plug-in only predicts its own."""

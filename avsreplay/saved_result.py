@@ -54,7 +54,7 @@ class Saved:
         times_s, poses: recorded true poses of {C} in {A} and their times after the first scan [s].
         estimator: estimator with the settings of the run.
         plan, supervisor, limits, robot, task: settings of the run.
-        noise: standard deviations of a measured pose [m, rad of half angle], None where they are
+        noise: (6, 6) covariance of the error of a measured pose in {C} [rad, m]; None where it is
             not known.
         assessment: the assessment of the run; None where the result has none.
         extent_m: diagonal of the target's bounding box [m].
@@ -75,7 +75,7 @@ class Saved:
     task: TaskParams
     extent_m: float
     surface: Surface | None
-    noise: tuple[float, float] | None = None
+    noise: Array | None = None
     assessment: Assessment | None = None
     warnings: Sequence[str] = ()
 
@@ -213,11 +213,13 @@ def task_settings(record: Mapping[str, Any]) -> TaskParams:
     return TaskParams(**values)
 
 
-def _noise(header: Mapping[str, Any]) -> tuple[float, float] | None:
-    found = header.get("measured_1s")
-    if not isinstance(found, list) or len(found) != 2 or not all(v > 0.0 for v in found):
+def _noise(header: Mapping[str, Any]) -> Array | None:
+    try:
+        found = np.array(header.get("measured_covariance"), np.float64)
+    except (TypeError, ValueError):
         return None
-    return float(found[0]), float(found[1])
+    good = found.shape == (6, 6) and bool(np.isfinite(found).all())
+    return found if good and float(np.linalg.eigvalsh(found)[0]) > 0.0 else None
 
 
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:

@@ -5,21 +5,28 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from avsreplay.assess import drawn_beliefs
+from avsreplay.assess import FlightLog, Setup, assess, drawn_beliefs, simulated
 from avsreplay.assessment import Assessment, Chance, InFact, chance_of
 from avsreplay.build import target_geometry
 from avsreplay.estimate.chart import to_chart, to_errors, to_state
-from avsreplay.estimate.grasp_point import at_grasp
+from avsreplay.estimate.estimator import Estimator
+from avsreplay.estimate.grasp_point import at_grasp, noise_about
+from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import exp, matrix
 from avsreplay.log import SourceOptions
 from avsreplay.outcome import CaptureError
+from avsreplay.pipeline import planner_input
 from avsreplay.plan.contact import Contact
+from avsreplay.plan.guidance import Guidance
+from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
-from avsreplay.plan.supervisor import SupervisorParams
+from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.records import Belief, State, Surface
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import print_screen
@@ -170,6 +177,89 @@ def test_a_belief_about_another_point_has_its_position_and_covariance():
     A, B = np.cov(far.T), np.cov(near.T)
     assert np.abs(A - B).max() < 0.15 * np.abs(A).max()
     assert at_grasp(given, np.zeros(3)) is given
+
+
+def setup_of(noise=None, flights=1):
+    """An assessment of flights to a cube of 1 m without limits."""
+    surface = builtin_surface(Shape.CUBE)
+    target, robot, limits = target_geometry(surface, (1.0, 0.0, 0.0)), RobotParams(), Limits()
+    supervisor = SupervisorParams()
+    given = task_of(TaskParams(), supervisor, robot, (1.0, 0.0, 0.0), surface, target.surface)
+    supervision = TaskParams().with_tolerance(supervisor).resolved(surface.extent)
+    return Setup(
+        task=given,
+        estimator=Estimator(EstimatorParams(), None, surface.extent),
+        guidance=Guidance(PlanParams(), Supervisor(supervision), limits, surface.extent),
+        target=target,
+        solid=True,
+        extent_m=surface.extent,
+        since_ns=0,
+        noise=noise,
+        flights=flights,
+    )
+
+
+def test_simulated_flights_keep_what_is_known_of_a_body_whose_principal_axes_are_not():
+    """As a cube that turns about one axis: the pose is known, inertia and mass centre are not."""
+    x = State(
+        exp(np.array([0.3, -0.2, 0.5])),
+        np.array([0.1, 0.0, 0.0]),
+        np.array([0.0, 0.0, 5.0]),
+        np.zeros(3),
+        np.array([1e-3, -1e-3]),
+        np.array([0.0, 0.02, 0.0]),
+        exp(np.array([0.1, 0.2, 0.3])),
+    )
+    sizes = np.repeat([1e-4, 2e-5, 3e-4, 1e-5, 0.5, 0.01], [3, 3, 3, 3, 5, 3])
+    T = to_errors(to_chart(x))
+    given = Belief(0, x, T @ np.diag(sizes**2) @ T.T)
+    assert 2.0 * np.sqrt(np.trace(given.P[:3, :3])) > 1.0  # the attitude of the axes
+    setup, log = setup_of(np.diag([0.01**2] * 6)), FlightLog()
+    for k in range(5):
+        log.take(Belief(k * 400_000_000, x, given.P), None, 1, True)
+    ended = simulated(setup, log, None, given)
+    assert len(ended) == 1
+    assert all(flight.miss.inside(setup.task.tolerance) for flight in ended)
+
+
+def test_the_noise_of_flights_has_the_mean_information_of_the_last_poses():
+    """Two views, of which each leaves one direction free, determine both."""
+    log, (given, _) = FlightLog(), belief()
+    assert log.noise is None
+    for free in (3, 4):
+        C = 1e-6 * np.eye(6)
+        C[free, free] = 1.0
+        log.take(given, None, 1, True, C)
+    log.take(given, None, 0, True, np.eye(6))  # a faulty scan measures nothing
+    assert np.diag(log.noise) == pytest.approx([1e-6, 1e-6, 1e-6, 2e-6, 2e-6, 1e-6], rel=1e-3)
+
+
+def test_the_noise_about_another_point_is_that_of_the_point_that_a_pose_carries():
+    rng, point = np.random.default_rng(5), np.array([0.4, -1.0, 2.0])
+    A = 1e-4 * rng.normal(size=(6, 6))
+    d = rng.normal(size=(20000, 6)) @ A.T
+    moved = d[:, 3:] + np.cross(d[:, :3], point)
+    found = noise_about(A @ A.T, point)
+    assert np.abs(np.cov(moved.T) - found[3:, 3:]).max() < 0.05 * np.abs(found).max()
+    assert noise_about(found, -point) == pytest.approx(A @ A.T)
+
+
+def test_a_log_that_ends_blind_at_its_first_plan_is_assessed():
+    """At the last scan a plan exists, and the approach has not begun."""
+    setup, x = setup_of(), belief()[0].x
+    sizes = np.repeat([1e-4, 1e-5, 1e-4, 1e-6, 1e-3, 1e-4], [3, 3, 3, 3, 5, 3])
+    T = to_errors(to_chart(x))
+    given, log = Belief(0, x, T @ np.diag(sizes**2) @ T.T), FlightLog()
+    guidance, estimator = setup.guidance, setup.estimator
+    known = planner_input(
+        estimator, given, setup.target, 1, True, partial(estimator.forecast, given)
+    )
+    state = guidance.step(guidance.initial(0), replace(known, gamma=0))
+    assert state.plan.found
+    assert not state.supervisor.moving
+    log.take(given, state, 1, True)
+    log.gammas = [1, 0]
+    assert assess(setup, log).probability is not None
 
 
 def test_an_assessment_reads_back_from_its_record_and_says_the_same():

@@ -556,7 +556,7 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
         "facts": facts,
         "versions": versions(),
         "capture": None if summary.assessment is None else summary.assessment.record(),
-        "measured_1s": None if run.flight.noise is None else list(run.flight.noise),
+        "measured_covariance": None if run.flight.noise is None else run.flight.noise.tolist(),
     }
 
 

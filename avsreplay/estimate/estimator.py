@@ -133,6 +133,16 @@ class Estimator:
             errors=ModelErrors(kept=mode != "filter"),
         )
 
+    def resumed(self, belief: Belief) -> Track:
+        """The track of a filter that goes on from a belief.
+
+        Unlike a given start, the belief replaces all poses before it, however uncertain it is.
+
+        Args:
+            belief: in {A}.
+        """
+        return Track(self.frame.belief_into(belief), "filter", started_ns=belief.t_ns)
+
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
 

@@ -40,16 +40,22 @@ def command(*words: str) -> str:
     return done.stdout
 
 
-def made(k: int, seed: int) -> dict[str, object]:
-    """The assessment of one scenario."""
+def written(k: int, seed: int, folder: Path) -> Path:
+    """The log of one scenario, in a folder."""
     rng = np.random.default_rng([seed, k])
     q, w = rng.normal(size=4), rng.normal(size=3)
     q /= np.linalg.norm(q)
     w *= rng.uniform(0.04, 0.1) / np.linalg.norm(w)
+    scenario, log = folder / "scenario.toml", folder / "log.mcap"
+    scenario.write_text(SCENARIO.format(k=k, q=q.tolist(), w=w.tolist()))
+    command("record", str(scenario), "-o", str(log))
+    return log
+
+
+def made(k: int, seed: int) -> dict[str, object]:
+    """The assessment of one scenario."""
     with tempfile.TemporaryDirectory() as folder:
-        scenario, log = Path(folder) / "scenario.toml", Path(folder) / "log.mcap"
-        scenario.write_text(SCENARIO.format(k=k, q=q.tolist(), w=w.tolist()))
-        command("record", str(scenario), "-o", str(log))
+        log = written(k, seed, Path(folder))
         capture = json.loads(command("run", str(log), "--json"))["verdict"]["capture"]
     names = ("chance", "probability", "at_s", "contact", "sentence", "in_fact")
     return {"k": k, "seed": seed, **{name: capture[name] for name in names}}
