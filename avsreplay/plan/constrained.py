@@ -310,10 +310,12 @@ def _best_path(
     best: StepPath | None = None
     if warm is not None:
         path, since_s = warm
-        again = shortened(case, path, since_s)
-        best = _safest_of(_unhurried(again, path, since_s, path.t_go_s - since_s))
-        longest = 1.0 + SPARE[-1] + ROUGH_TOLERANCE
         expected = max(expected_s(case, path, since_s), case.earliest_s)
+        # a robot that has left the path needs at least the time of the plan without constraints
+        since_s = max(min(since_s, path.t_go_s - free.t_go_s), 0.0)
+        again, least_s = shortened(case, path, since_s), max(path.t_go_s - since_s, free.t_go_s)
+        best = _safest_of(_unhurried(again, path, since_s, least_s))
+        longest = 1.0 + SPARE[-1] + ROUGH_TOLERANCE
         if best is not None and best.t_go_s <= longest * expected + TIME_TOLERANCE_S:
             return best
     coarse = replace(
