@@ -224,6 +224,17 @@ def run_tasks(
         yield from _on(client, iter(tasks), work)
 
 
+def check_workers(workers: int, scheduler: str | None = None) -> None:
+    """Raise MissingBackend where the processes of ``run_tasks`` need Dask and it is not installed.
+
+    Args:
+        workers: processes on this machine.
+        scheduler: address of a Dask scheduler.
+    """
+    if workers or scheduler is not None:
+        _distributed()
+
+
 def _distributed() -> Any:
     """Dask's distributed module, which ships no types."""
     try:
@@ -231,7 +242,7 @@ def _distributed() -> Any:
     except ImportError:
         hint = "pip install 'avsreplay[sweep]', or --workers 0 to run in this process"
         raise MissingBackend(
-            "Dask (distributed) is not installed", where="sweep", hint=hint
+            "Dask (distributed) is not installed", where="--workers", hint=hint
         ) from None
 
 

@@ -2,7 +2,7 @@
 
 Each scenario is the built-in target for 90 s with another attitude, rate and seed. Of four, the
 first has the limits of the built-in scenario, the second also an occlusion of 6 s, the third random
-torques, and the fourth no limits: its plans know no body. Finished runs are appended to a file and
+torques, and the fourth is approached from any side: its plans know no body. Finished runs are appended to a file and
 not made again; what was found is printed as a table.
 
 python tests/benchmarks/capture_scenarios.py FILE.jsonl [--count 12] [--seed 1] [--seconds S]
@@ -43,7 +43,11 @@ kind = "occlusion"
 start_s = {start_s}
 duration_s = 6.0
 """
-KINDS = ("limits", "limits, occlusion", "limits, torques", "no limits")
+FREE = """
+[run.task]
+approach = "free"
+"""
+KINDS = ("limits", "limits, occlusion", "limits, torques", "free approach")
 SPAN_S = 90.0
 
 
@@ -55,7 +59,7 @@ def command(*words: str) -> str:
     return done.stdout
 
 
-def written(k: int, seed: int, folder: Path, kind: str = "no limits", span_s: float = 60.0) -> Path:
+def written(k: int, seed: int, folder: Path, kind: str = "", span_s: float = 60.0) -> Path:
     """The log of one scenario, in a folder."""
     rng = np.random.default_rng([seed, k])
     q, w = rng.normal(size=4), rng.normal(size=3)
@@ -66,7 +70,7 @@ def written(k: int, seed: int, folder: Path, kind: str = "no limits", span_s: fl
         more += f"torque_std_radps2 = {10.0 ** rng.uniform(-6.0, -4.0):.3g}\n"
     if "occlusion" in kind:
         more += OCCLUSION.format(start_s=round(rng.uniform(20.0, 40.0), 1))
-    more += LIMITS * (kind != "no limits")
+    more += LIMITS * ("limits" in kind) + FREE * ("free" in kind)
     scenario, log = folder / "scenario.toml", folder / "log.mcap"
     text = SCENARIO.format(k=k, q=q.tolist(), w=w.tolist(), span_s=span_s, more=more)
     scenario.write_text(text)
