@@ -2,8 +2,8 @@
 
 Each scenario is the built-in target for 90 s with another attitude, rate and seed. Of four, the
 first has the limits of the built-in scenario, the second also an occlusion of 6 s, the third random
-torques, and the fourth is approached from any side: its plans know no body. Finished runs are appended to a file and
-not made again; what was found is printed as a table.
+torques, and the fourth is approached from any side: its plans know no body. Finished runs are
+appended to a file and not made again; what was found is printed as a table.
 
 python tests/benchmarks/capture_scenarios.py FILE.jsonl [--count 12] [--seed 1] [--seconds S]
 """
