@@ -118,6 +118,7 @@ MODELS = ("model.ply", "model.obj", "model.stl", "model.ascii.stl", "model.off",
 RUN = ("--init", "truth", "--n-scans", "2", "--json")
 NO_MODEL = ("--model", "model.ply", "--init", "0,0,3,0,0,0,1", "--n-scans", "2", "--json")
 SEEN = ("--n-scans", "4", "--init", "truth")
+ONE_SCAN = ("--n-scans", "1", "--backend", "horn", "--workers", "0")
 MEASURED = ("--backend", "poses", "--extent", "2", "--n-scans", "3", "--json")
 # (command, input) -> (arguments, seeds); IN is the mutated input, OUT an output, the other words
 # name intact seeds or are values. One of several lines of arguments is drawn.
@@ -189,7 +190,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
         MODELS,
     ),
     ("benchmark", "data"): (
-        (("--only", "real-turntable", "--data", "IN", "-o", "OUT", "--n-scans", "1"),),
+        (("--only", "real-turntable", "--data", "IN", "-o", "OUT", *ONE_SCAN),),
         ("scans",),
     ),
     ("config", "log"): ((("IN",),), ("log.mcap", "zstd.mcap")),
