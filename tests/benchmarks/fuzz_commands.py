@@ -264,7 +264,7 @@ class WrittenLog(GrowingLog):
             path.write_bytes(self._rest.pop(0) if rng.random() < 0.9 else b"")
         super().__init__(path, feed)
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         if self._rest:
             piece = self._rest.pop(0)
             with self.path.open("r+b") as file:
@@ -275,7 +275,7 @@ class WrittenLog(GrowingLog):
                 file.write(piece)
         elif not self._fed:
             self.stop()
-        return super()._advance()
+        return super().advance()
 
 
 def call(*args: object) -> None:
