@@ -318,7 +318,7 @@ def _closed(setup: Setup, log: FlightLog, state: GuidanceState) -> dict[str, Any
         limit = "contact with the body"
     change = ""
     if found["chance"] is not Chance.LIKELY:
-        change = "a later deadline" if late else _change(limit)
+        change = "a later deadline" if late else _change(setup, limit)
         found["known_s"] = setup.at_s(belief.t_ns)
     miss = CaptureError(*largest.tolist())
     return {**found, "at_s": at_s, "miss": miss, "contact": contact, "limit": limit} | {
@@ -384,7 +384,7 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
             f" from {cause}"
         ),
         "known_s": setup.at_s(belief.t_ns),
-        "change": _change(cause),
+        "change": _change(setup, cause),
     }
 
 
@@ -443,7 +443,7 @@ def _continued(
         "limit": limit,
     }
     if found["chance"] is not Chance.LIKELY:
-        done |= {"known_s": start_s, "change": _change(limit if any(hits) else cause)}
+        done |= {"known_s": start_s, "change": _change(setup, limit if any(hits) else cause)}
     return done
 
 
@@ -738,12 +738,14 @@ def _cause(steps: Array, errors: Array, worst: int, pushed: Array | None = None)
     return best
 
 
-def _change(cause: str) -> str:
+def _change(setup: Setup, cause: str) -> str:
     """What would change a capture that fails because of a quantity, in words."""
     if cause.startswith(("the attitude", "the rate", "the inertia", "the mass")):
         return "a longer observation would help, or a fixture nearer to the mass centre"
     if "contact" in cause:
-        return "another fixture or approach axis would help, or limits.final_deg with a clearance"
+        clear = setup.guidance.limits.clearance_m is not None
+        more = "a larger limits.clearance_m" if clear else "task.approach=axis with a clearance"
+        return f"another fixture or approach axis would help, or {more}"
     if "thrust" in cause:
         return "a robot with smaller errors of the thrust, or a larger tolerance, would help"
     return "a longer observation or a larger tolerance would help"
