@@ -509,7 +509,7 @@ def _measured(
     """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
     noise of the log, and no pose where the log had a blackout.
     """
-    # The noise is known here, and a fit to the poses of the flight would forget those of the log.
+    # The noise is known here, and a fit to the poses of the flight would have none of the log.
     known = NoiseSource.REGISTRATION, Adaptation.OFF
     params = replace(setup.estimator.params, noise=known[0], adapt=known[1], audit_poses=0)
     estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)

@@ -136,6 +136,7 @@ PAPER = (
     "faults.policy=all",
     "faults.sigmas=1e-9",
     "convergence.criterion=covariance",
+    "task.approach=free",
     "deskew=false",
     "reacquire=false",
 )

@@ -230,13 +230,33 @@ def output_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
     check_output(path, folder=True)
     place = path.resolve()
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with _part(place, folder=True) as part:
+        with kept_if_used(place.parent), _part(place, folder=True) as part:
             yield part
             _keep_others(place, part, own)
             _swap(part, place)
     except OSError as error:
         raise _unwritable(path, error) from None
+
+
+@contextmanager
+def kept_if_used(folder: Path) -> Iterator[None]:
+    """Create a folder and its parents; those created here that are empty at the end are removed.
+
+    Args:
+        folder: the folder.
+
+    Raises:
+        OSError: it cannot be created.
+    """
+    place = folder.resolve()
+    missing = [each for each in (place, *place.parents) if not each.exists()]
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # it is in use
+            for each in missing:
+                each.rmdir()
 
 
 def _swap(part: Path, place: Path) -> None:

@@ -27,7 +27,7 @@ from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
 from avsreplay.tables import column_of
-from avsreplay.task import TaskParams
+from avsreplay.task import Approach, TaskParams
 
 if TYPE_CHECKING:
     from avsreplay.run import Run
@@ -210,7 +210,8 @@ def task_settings(record: Mapping[str, Any]) -> TaskParams:
     names = {f.name for f in dataclasses.fields(TaskParams)}
     known: dict[str, Any] = {k: v for k, v in record.items() if k in names and v is not None}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in known.items()}
-    return TaskParams(**values)
+    approach = Approach(values.pop("approach", Approach.FREE.value))
+    return TaskParams(approach=approach, **values)
 
 
 def _noise(header: Mapping[str, Any]) -> Array | None:

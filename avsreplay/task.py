@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,10 +34,18 @@ _CORRIDOR_RATIO = 1.2  # length of a corridor over the distance at which the cle
 _LEAST_CORRIDOR_OF_EXTENT = 0.06  # shorter ones are not needed, over the target's extent
 # largest half opening that is assumed for a gripper, over the target's extent
 _MAX_OPENING_OF_EXTENT = 0.04
+_APPROACH_DEG = 15.0  # half-angle of the corridor along the axis where the limits set no cone
 _FLAT_COS = math.cos(math.radians(8.0))  # faces of a patch have normals within this angle
 # and lie within this distance of its plane, over the target's extent
 _FLAT_OFFSET_OF_EXTENT = 0.003
 _SEED_FACES = 24  # largest faces from which patches are grown
+
+
+class Approach(Enum):
+    """How the robot comes to the grasp point."""
+
+    AXIS = "axis"
+    FREE = "free"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +66,11 @@ class TaskParams(Settings):
         None,
         "Unit vector in {C} that points out of the surface, along which the robot approaches.",
         unset="fixture_axis_c",
+    )
+    approach: Approach = setting(
+        Approach.AXIS,
+        "How the robot comes to the grasp point of a model where [limits] sets no cone: along the"
+        " axis, through a corridor of 15 deg (axis), or from any side (free).",
     )
     position_m: float | None = setting(
         None,
@@ -145,6 +159,7 @@ class Task:
             part that it encloses.
         deadline_s: latest time of the capture after the first scan; infinite without.
         corridor_m: length of a corridor that ends where the clearance is kept; 0: the usual one.
+        approach: how the robot comes to the grasp point where the limits set no cone.
         assumed: names of the values that were not given.
         problem: why the grasp point cannot be used, "" where it can.
     """
@@ -157,6 +172,7 @@ class Task:
     mouth_m: float
     deadline_s: float
     corridor_m: float = 0.0
+    approach: Approach = Approach.FREE
     assumed: tuple[str, ...] = ()
     problem: str = ""
 
@@ -190,22 +206,32 @@ class Task:
             "angle_deg": self.tolerance.angle_deg,
             "opening_m": self.opening_m,
             "radius_m": self.radius_m,
+            "approach": self.approach.value,
             "deadline_s": self.deadline_s if math.isfinite(self.deadline_s) else None,
             "assumed": list(self.assumed),
             "problem": self.problem,
         }
 
     def corridor(self, limits: Limits) -> Limits:
-        """Return the limits with a corridor that begins where the clearance is kept.
+        """Return the limits with the corridor of the approach, which begins where the clearance is
+        kept.
 
         A corridor shorter than the part at the grasp point would end inside this part.
 
         Args:
-            limits: constraints of a plan; a length of the corridor that is set is kept.
+            limits: constraints of a plan; a cone and a length that are set are kept.
         """
+        if _chosen(self.approach, limits) is Approach.AXIS:
+            limits = replace(limits, final_deg=_APPROACH_DEG)
         if limits.final_deg is None or limits.final_range_m is not None:
             return limits
         return replace(limits, final_range_m=self.corridor_m) if self.corridor_m > 0.0 else limits
+
+
+def _chosen(approach: Approach, limits: Limits | None) -> Approach:
+    """How the robot comes to the grasp point with these limits."""
+    given = limits is not None and (limits.cone_deg is not None or limits.final_deg is not None)
+    return Approach.FREE if given else approach
 
 
 @value_class(eq=True)
@@ -277,6 +303,8 @@ def task_of(
     needed = _Room(params.opening_m, tolerance.position_m, clearance)
     access = _access(point, out, surface, closest, needed, extent)
     corridor = _CORRIDOR_RATIO * access.clear_m
+    usable = len(surface.faces) > 0 and not access.problem
+    approach = params.approach if usable else Approach.FREE
     return Task(
         point,
         out,
@@ -286,7 +314,8 @@ def task_of(
         access.mouth_m,
         math.inf if params.deadline_s is None else params.deadline_s,
         corridor if corridor > _LEAST_CORRIDOR_OF_EXTENT * extent else 0.0,
-        _assumed(params, supervisor, robot),
+        approach,
+        _assumed(params, supervisor, robot, _chosen(approach, limits)),
         access.problem,
     )
 
@@ -300,7 +329,7 @@ def _named_patch(name: str, surface: Surface, closest: Closest) -> Patch:
 
 
 def _assumed(
-    params: TaskParams, supervisor: SupervisorParams, robot: RobotParams
+    params: TaskParams, supervisor: SupervisorParams, robot: RobotParams, approach: Approach
 ) -> tuple[str, ...]:
     """Names of the values that neither the task nor the settings of the robot give."""
     values = {
@@ -310,6 +339,7 @@ def _assumed(
         "speed": params.speed_mps,
         "angle": params.angle_deg,
         "opening": params.opening_m,
+        "approach along the axis": None if approach is Approach.AXIS else approach,
         "radius": robot.radius_m or None if params.radius_m is None else params.radius_m,
     }
     return tuple(name for name, value in values.items() if value is None)

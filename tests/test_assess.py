@@ -33,8 +33,9 @@ from avsreplay.report.summary_tables import print_screen
 from avsreplay.report.table import make_console
 from avsreplay.report.verdict import verdict_of
 from avsreplay.run import Job, Run
+from avsreplay.saved_result import task_settings
 from avsreplay.simulate.target import Shape, builtin_surface
-from avsreplay.task import TaskParams, patches, task_of
+from avsreplay.task import Approach, TaskParams, patches, task_of
 
 TOLERANCE = CaptureError(0.013, 0.0066, 2.0)
 
@@ -102,6 +103,22 @@ def test_a_corridor_does_not_end_inside_the_part_at_the_grasp_point():
     made = task(surface, closest, limits).corridor(limits).resolved(surface.extent)
     end = np.array([[made.final_range_m, 0.0, 0.0]])
     assert closest(end)[1][0] >= 0.1
+
+
+def test_the_approach_is_along_the_axis_unless_the_limits_set_a_cone():
+    free, cone = Limits(), Limits(cone_deg=30.0)
+    along = task(*body(Shape.BRACKET))
+    assert along.corridor(free).final_deg == pytest.approx(15.0)
+    assert "approach along the axis" in along.assumed
+    assert along.corridor(cone) == cone
+    anywhere = task(*body(Shape.BRACKET), approach=Approach.FREE)
+    assert anywhere.corridor(free) == free
+    assert "approach along the axis" not in anywhere.assumed
+    off = task(*body(), grasp_m=(0.4, 0.0, 0.0))  # a grasp point that cannot be used
+    assert off.problem
+    assert off.corridor(free) == free
+    assert task_settings(anywhere.record()).approach is Approach.FREE
+    assert task_settings(along.record()).approach is Approach.AXIS
 
 
 def contact(radius_m=0.0, half_m=0.01, mouth_m=0.0):

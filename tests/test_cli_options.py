@@ -17,9 +17,10 @@ import pytest
 from click.testing import CliRunner
 
 from avsreplay.cli import options as shared
+from avsreplay.cli.main import group
 from avsreplay.cli.options import read_options, source_options
 from avsreplay.cli.run import collect
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import AvsError, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 
 
@@ -203,3 +204,61 @@ def test_a_closed_standard_input_is_one_line(monkeypatch):
         shared.log_file(Path("-")),
     ):
         pass
+
+
+CAMPAIGN = 'name = "c"\nseed = 1\nrepeats = 1\n'
+FIRST_CHECKS = {  # what each command with an output is given, and the package that is not installed
+    "record": [("missing.toml", None), ("damaged", None)],
+    "run": [("missing.mcap", None), ("damaged", None), ("{fixtures}/tumble.mcap --init x", None)],
+    "model": [("missing.mcap", None), ("damaged", None)],
+    "odometry": [("missing.mcap", None), ("damaged", None)],
+    "report": [("missing", None), ("damaged", None)],
+    "export": [("missing", None), ("damaged", None)],
+    "compare": [("missing missing", None), ("damaged damaged", None)],
+    "sweep": [
+        ("missing.toml", None),
+        ("damaged", None),
+        ("campaign.toml", "distributed"),
+        ("campaign.toml --workers 0", "pyarrow"),
+        ("campaign.toml --scheduler tcp://127.0.0.1:9", None),
+        ("campaign.toml --run 7", None),
+    ],
+    "benchmark": [
+        ("--suite none", None),
+        ("--only none", None),
+        ("--backend none", None),
+        ("--quick", "distributed"),
+    ],
+}
+
+
+def test_the_first_checks_are_listed_for_each_command_with_an_output():
+    context = click.Context(group)
+    commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
+    assert set(FIRST_CHECKS) == {
+        name for name, command in commands.items() if any("-o" in p.opts for p in command.params)
+    }
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "absent"),
+    [(name, *each) for name, checks in FIRST_CHECKS.items() for each in checks],
+)
+def test_a_command_that_fails_at_its_first_check_leaves_nothing(
+    command, words, absent, tmp_path, fixtures_folder, monkeypatch
+):
+    (tmp_path / "damaged").write_bytes(b"\x89MCAP0\r\n\x00\x00")
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    if "--scheduler" in words:
+        execute = pytest.importorskip("avsreplay.sweep.execute")
+        pytest.importorskip("distributed", reason="Dask is not installed")
+        monkeypatch.setattr(execute, "CONNECT_TIMEOUT_S", 0.1)
+    if absent:
+        monkeypatch.setitem(sys.modules, absent, None)
+    asked = [command, *words.format(fixtures=fixtures_folder).split(), "-o", "new/deep/out"]
+    done = CliRunner().invoke(group, asked)
+    assert done.exit_code
+    assert isinstance(done.exception, AvsError | click.ClickException | SystemExit)
+    assert sorted(tmp_path.rglob("*")) == before

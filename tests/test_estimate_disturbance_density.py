@@ -17,6 +17,7 @@ from avsreplay.estimate.disturbance_density import (
     density_in_use,
     divided,
     marginal,
+    posterior,
     probability_beside,
 )
 
@@ -64,9 +65,7 @@ def power_mean(found: Marginal) -> float:
     """The power 2/3 of the mean of q^1.5, to which the variance of a velocity that is long tracked
     is proportional.
     """
-    log = np.append(0.0, found.log_odds - np.log(len(DENSITIES)))
-    weights = np.exp(log - log.max())
-    return float(weights[1:] @ DENSITIES**1.5 / weights.sum()) ** (2.0 / 3.0)
+    return float(posterior(found, 0.5)[1:] @ DENSITIES**1.5) ** (2.0 / 3.0)
 
 
 def test_a_velocity_is_claimed_right_in_the_mean_over_the_prior_of_the_density() -> None:
@@ -97,6 +96,22 @@ def test_the_density_in_use_is_zero_or_the_true_one_where_the_poses_determine_it
     assert density_in_use(quiet, PRESENT, 1e-300) < 1e-9
 
 
+def test_what_the_poses_exclude_has_no_part_of_the_prior() -> None:
+    """Poses that exclude all but the weakest disturbances say little about those: their probability
+    is then nearly that before the poses, whatever else was excluded.
+    """
+    rng = np.random.Generator(np.random.PCG64(8))
+    quiet, probability = drawn(0.0, rng)[0], 0.3
+    found = posterior(quiet, probability)
+    assert found.sum() == pytest.approx(1.0)
+    assert (found[1:][quiet.excluded <= DENSITIES] == 0.0).all()
+    weak = quiet.log_odds[0]  # of the least density: the poses cannot tell it from none
+    assert weak == pytest.approx(0.0, abs=0.01)
+    possible = int(np.count_nonzero(quiet.excluded > DENSITIES))
+    odds = found[1] / found[0]
+    assert odds == pytest.approx(probability / (1.0 - probability) / possible, rel=0.01)
+
+
 def test_the_density_in_use_never_exceeds_the_root_mean_square_of_all() -> None:
     """Of few poses the expected NEES of the rate may be 1 for densities that are out of the
     question only.
@@ -104,10 +119,7 @@ def test_the_density_in_use_never_exceeds_the_root_mean_square_of_all() -> None:
     rng = np.random.Generator(np.random.PCG64(5))
     for _ in range(20):
         found = drawn(1e-4, rng)[0]
-        weights = np.exp(
-            np.append(0.0, found.log_odds - np.log(len(DENSITIES)))
-        )  # of a weak disturbance: no overflow
-        largest = float(np.sqrt(weights[1:] @ DENSITIES**2 / weights.sum()))
+        largest = float(np.sqrt(posterior(found, 0.5)[1:] @ DENSITIES**2))
         assert density_in_use(found, PRESENT) <= largest * (1.0 + 1e-12)
         nowhere = Present(PRESENT.by_initial, 1e6 * PRESENT.by_impulses)
         assert density_in_use(found, nowhere) <= largest * (1.0 + 1e-12)

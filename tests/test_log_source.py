@@ -4,6 +4,7 @@ truth in every form.
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 from contextlib import closing
@@ -705,3 +706,34 @@ def test_a_padded_record_is_kept(tmp_path: Path, opcode: int) -> None:
         assert len(source) == 3
         assert source.header.seed == 7
         assert source.header.surface is not None
+
+
+@pytest.mark.parametrize("change", ["shorter", "longer", "other", "gone", ""])
+@pytest.mark.parametrize("kind", ["mcap", "bag", "poses", "folder"])
+def test_a_file_that_changes_while_it_is_read_is_a_loss(
+    tmp_path: Path, kind: str, change: str
+) -> None:
+    """Its scans may be those of either state, and its checksum is that of the second one."""
+    path = tmp_path / f"a.{kind}"
+    if kind == "folder":
+        path.mkdir()
+        for k in range(3):
+            np.save(path / f"{k}.npy", CLOUDS[k].points)
+    elif kind == "poses":
+        path.write_text("".join(f"{k} 0 0 5 0 0 0 1\n" for k in range(1, 4)))
+    elif kind == "bag":
+        bag1(path)
+    else:
+        mcap(path, clouds())
+    file = path / "1.npy" if kind == "folder" else path
+    os.utime(file, (1, 1))
+    data = file.read_bytes()
+    with open_source(path, SourceOptions(poses=kind == "poses")) as source:
+        next(source.scans())
+        if change == "gone":
+            file.unlink()
+        elif change:
+            new = {"shorter": data[:-1], "longer": data + b"\n", "other": bytes(len(data))}
+            file.write_bytes(new[change])
+        found = [loss.file for loss in source.losses]
+    assert found == ([file.name] if change else [])

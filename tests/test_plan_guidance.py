@@ -266,3 +266,82 @@ def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_it
         planned += [state.plan.t_ns * 1e-9] if t > 4.0 else []
     assert state.decision.action is Action.APPROACH_ON_PREDICTION
     assert sorted(set(planned)) == made_s
+
+
+def test_a_robot_that_begins_inside_a_limit_returns_from_it_and_is_not_withdrawn():
+    """What a plan violates at its start shrinks within 0.3 of the flight, and does not end the
+    approach.
+    """
+    target = scene(np.random.default_rng(3))
+    limits = Limits(keepout_m=1.5, keepout_release_m=0.9).resolved(8.0)
+    where = CENTRE + np.array([0.0, 0.0, -1.4])
+    start = replace(ROBOT, robot_position_m=tuple(where.tolist()))
+    guidance = Guidance(start, Supervisor(PARAMS), limits)
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = [PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in (0.0, 0.5)]
+    states = [state for _, state in guidance.fly(known)]
+    assert margin(target, limits, where, np.zeros(3)) < -0.05
+    assert states[0].plan.violation_m == pytest.approx(0.1, abs=1e-6)
+    assert [state.decision.action for state in states] == [Action.APPROACH] * 2
+    end_ns = states[0].segment.end_ns
+    times = np.linspace(0.3, 1.0, 50) * end_ns
+    r = states[0].segment.positions(times.astype(np.int64))
+    centre, goal = target.centre(1e-9 * times), target.goal(1e-9 * times)[0]
+    free = np.linalg.norm(r - centre, axis=1) >= 1.5
+    assert (free | (np.linalg.norm(r - goal, axis=1) <= 0.9)).all()
+
+
+def test_a_capture_that_an_arm_delayed_is_tried_again_at_the_instant_of_the_earlier_plan():
+    class Slow:
+        """An arm that reaches the fixture 30 s after the first plan at the earliest."""
+
+        def __init__(self):
+            self.hints = []
+
+        def fitted(self, make, path, scene, limits, first_s, horizon_s, hint_s):
+            self.hints.append(hint_s)
+            return replace(make(hint_s or 30.0, 1.0), delayed_by="arm"), None
+
+    wait_s, target, arm = 0.3, scene(np.random.default_rng(3)), Slow()
+    guidance = Guidance(replace(ROBOT, latency_s=wait_s), Supervisor(PARAMS), arm=arm)
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = [PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in (0.0, 1.5, 3.0)]
+    ends = [state.segment.end_ns * 1e-9 for _, state in guidance.fly(known)]
+    assert ends == pytest.approx([30.3] * 3, abs=1e-6)
+    assert arm.hints == pytest.approx([0.0, 30.0 - 1.5, 30.0 - 3.0], abs=1e-6)
+
+
+def test_the_path_about_the_target_is_that_of_both_motions():
+    """In seconds after the instant from which the times of the scene count."""
+    w, v = np.array([0.0, 0.0, 0.2]), np.array([0.3, 0.0, -0.1])
+    turning = Scene(
+        lambda t: (np.outer(t, DRIFT), np.tile(DRIFT, (len(t), 1))),
+        lambda t: exp(np.asarray(t)[:, None] * w),
+    )
+    segment = Segment(4 * 10**9, np.array([1.0, 2.0, 3.0]), v)
+    start_ns, begin_ns, end_ns = 10**9, 5 * 10**9, 7 * 10**9
+    y = relative_path(turning, segment, start_ns, begin_ns, end_ns)
+    at = 5.0 + 2.0 * np.arange(10) / 10
+    for t, found in zip(at, y, strict=True):
+        c, s = np.cos(0.2 * (t - 1.0)), np.sin(0.2 * (t - 1.0))
+        away = segment.r0 + (t - 4.0) * v - (t - 1.0) * DRIFT
+        assert np.allclose(found, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ away, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_errors_of_the_thrust_belong_to_the_generator_of_the_flight():
+    target = scene(np.random.default_rng(1))
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = [
+        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
+        for t in np.arange(0.5, 40.0, 1.0)
+    ]
+    guidance = Guidance(ROBOT, Supervisor(PARAMS))
+
+    def missed_m(seed, noise_mps2=0.01):
+        rng = None if seed is None else np.random.default_rng(seed)
+        return closed_loop(guidance, known, target, 0, noise_mps2, rng).miss.distance_m
+
+    assert missed_m(None) == missed_m(5, 0.0) < 1e-9
+    assert missed_m(5) == missed_m(5) > 1e-4
+    assert missed_m(5) != missed_m(6)

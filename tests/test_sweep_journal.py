@@ -209,3 +209,27 @@ def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(UnreadableInput), Journal(tmp_path / "file"):
         pass
+
+
+def interrupted(folder, *finished):
+    """A journal whose command is interrupted after these runs."""
+    with Journal(folder) as journal:
+        for each in finished:
+            journal.add(each)
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_an_error_before_the_first_run_leaves_nothing(there, tmp_path):
+    folder = tmp_path / "a" / "b"
+    if there:
+        folder.mkdir(parents=True)
+        (folder / "note.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(folder)
+    assert sorted(tmp_path.rglob("*")) == before
+    for finished in ([result(1)], []):
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(folder, *finished)
+        assert list(Journal(folder).status) == [result(1).id]

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from avsreplay import __version__, arithmetic
 from avsreplay.cli.sweep import sweep_command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
@@ -294,6 +295,32 @@ def test_a_campaign_whose_scheduler_is_killed_is_resumed(campaign, reference, tm
         assert err.splitlines()[-1].startswith("avsreplay: Dask scheduler: it ended before")
     assert sweep(campaign, out, "--workers", "0").exit_code == 0
     assert results(out) == reference
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not arithmetic.has_variants(), reason="this system has one arithmetic")
+def test_a_worker_with_another_arithmetic_makes_no_run(campaign, tmp_path):
+    """Its runs would have other bytes than those of the other workers."""
+    from distributed import LocalCluster
+
+    here = arithmetic.state()
+    pins = dict.fromkeys(arithmetic.PINS, "") if here == "pinned" else arithmetic.PINS
+    start = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-dashboard"]
+    with LocalCluster(n_workers=0, dashboard_address=":0") as cluster:
+        worker = subprocess.Popen(
+            [*start, cluster.scheduler_address],
+            stderr=subprocess.DEVNULL,
+            cwd=tmp_path,
+            env=os.environ | pins,
+        )
+        try:
+            done = sweep(campaign, tmp_path / "out", "--scheduler", cluster.scheduler_address)
+        finally:
+            worker.kill()
+            worker.wait()
+    assert isinstance(done.exception, UsageError)
+    assert f"this command has version {__version__}, {here} arithmetic" in str(done.exception)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

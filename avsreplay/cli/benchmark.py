@@ -132,6 +132,7 @@ def benchmark_command(
     Raises:
         UsageError: no output directory is given, or a name is unknown.
         UnreadableInput: a file cannot be read or written.
+        MissingBackend: Dask is not installed.
         DataLost: a run failed.
     """  # noqa: D301
     from avsreplay.benchmark.campaign import Order
@@ -173,10 +174,12 @@ def _made(order: Order, workers: int) -> tuple[Record, dict[str, float]]:
     """Make the runs that are not finished and write the results."""
     from avsreplay.benchmark import campaign, results
     from avsreplay.benchmark.plots import write_plots
+    from avsreplay.sweep.execute import check_workers
     from avsreplay.sweep.journal import Journal
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     check_output(order.folder, folder=True)
+    check_workers(workers)
     journal = Journal(order.folder)
     with journal:
         plan = campaign.planned(order, _tracked)

@@ -99,11 +99,11 @@ def sweep_command(
     Raises:
         UsageError: no output directory is given, or the campaign is invalid.
         UnreadableInput: a file cannot be read or written.
-        MissingBackend: pyarrow is not installed.
+        MissingBackend: pyarrow or Dask is not installed.
         DataLost: a run failed, crashed or lost data.
     """  # noqa: D301
     from avsreplay.sweep.campaign import load_campaign
-    from avsreplay.sweep.execute import run_tasks, write_results
+    from avsreplay.sweep.execute import check_workers, run_tasks, write_results
     from avsreplay.sweep.expansion import expand
     from avsreplay.sweep.journal import Journal, arrow
 
@@ -122,6 +122,7 @@ def sweep_command(
         return
     check_output(output, folder=True)
     arrow()  # raises before anything runs, not after
+    check_workers(workers, scheduler)
     journal = Journal(output)
     with journal:
         _report_damage(journal)

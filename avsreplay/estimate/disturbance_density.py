@@ -8,6 +8,10 @@ this covariance could no longer be factored. The likelihood of every root densit
 closed form in the eigenvectors of the information on u; so are the mean and the covariance of the
 present rate or velocity, given q.
 
+Half of the prior probability is that of no disturbance, the other half that of the densities that
+the poses do not exclude, in equal parts a decade. Were it spread over all densities, most of it
+would be that of excluded ones, and what they lose would count for no disturbance.
+
 The estimator uses one density. The distribution over all densities has a larger covariance than the
 likely density alone wherever the poses do not determine q: a density of small probability under
 which the velocity has moved far counts as much as its square. The density in use is therefore the
@@ -26,9 +30,9 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.geometry import Array
 
-DENSITIES = np.logspace(
-    -8.0, 0.0, 65
-)  # root densities of a disturbance that are compared with none
+# root densities of a disturbance that are compared with none; over a log of 100 s the least changes
+# a velocity by 1e-5 [rad/s, m/s], which is none for every task
+DENSITIES = np.logspace(-6.0, 0.0, 49)
 _EXCLUDED = math.log(0.01)  # log likelihood ratio to none below which a density is excluded
 # prior probability that torque and force are both random where one is, and neither where one is not
 _TOGETHER = 0.9
@@ -172,6 +176,21 @@ def probability_beside(evidence: float) -> float:
     return _TOGETHER * other + (1.0 - _TOGETHER) * (1.0 - other)
 
 
+def posterior(found: Marginal, probability: float) -> Array:
+    """(n + 1,) probabilities of no disturbance and of the ``DENSITIES``, after the poses.
+
+    Args:
+        found: the likelihood of the impulses.
+        probability: prior probability that there is a disturbance, of a density that the poses do
+            not exclude.
+    """
+    possible = found.excluded > DENSITIES
+    each = math.log(probability / max(int(np.count_nonzero(possible)), 1))
+    log = np.append(math.log1p(-probability), np.where(possible, found.log_odds + each, -math.inf))
+    weights = np.exp(log - log.max())
+    return np.asarray(weights / weights.sum())
+
+
 def density_in_use(found: Marginal, present: Present, probability: float = 0.5) -> float:
     """Root density for which the expected NEES of the present velocity is 1 under the posterior of
     all densities.
@@ -183,11 +202,7 @@ def density_in_use(found: Marginal, present: Present, probability: float = 0.5) 
         present: the rate or velocity at the last pose.
         probability: prior probability that there is a disturbance.
     """
-    log = np.append(
-        math.log1p(-probability), found.log_odds + math.log(probability / len(DENSITIES))
-    )
-    weights = np.exp(log - log.max())
-    weights /= weights.sum()
+    weights = posterior(found, probability)
     by_initial = np.zeros((3, len(found.R)))  # zero for unknowns besides the initial values
     by_initial[:, : present.by_initial.shape[1]] = present.by_initial
     own = np.linalg.solve(found.R.T, by_initial.T).T

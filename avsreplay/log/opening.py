@@ -73,6 +73,8 @@ def open_source(
         raise UnreadableInput(
             error.strerror or "cannot be read", where=shown(path), hint="check the path"
         ) from None
+    if upto is None:
+        source.watch()
     try:
         if not inspect:
             _refuse_undecided(source)

@@ -92,6 +92,7 @@ class Source:
             clouds.log_ns, clouds.publish_ns, clouds.header_ns, options.clock
         )
         self._lost, self.damaged = losses, dict[int, str]()
+        self._watched: dict[Path, tuple[int, int, int] | None] = {}
 
     def __enter__(self) -> Source:
         return self
@@ -110,8 +111,17 @@ class Source:
 
     @property
     def losses(self) -> list[Loss]:
-        """Return the parts that could not be read, in file order."""
-        return [*self._clouds.losses, *self._lost]
+        """Return the parts that could not be read, in file order, then the files that changed."""
+        changed = [
+            Loss("changed or removed while it was read", 0, 0, file=path.name)
+            for path, before in self._watched.items()
+            if _state(path) != before
+        ]
+        return [*self._clouds.losses, *self._lost, *changed]
+
+    def watch(self) -> None:
+        """Report every file that changes from now on as a loss."""
+        self._watched = {path: _state(path) for path in self._files}
 
     def add_loss(self, loss: Loss) -> None:
         """Add a part that is missing for a reason outside of the file.
@@ -487,6 +497,15 @@ class Source:
             C = np.diag(np.repeat(sigma, 3) ** 2)
         T_ac = self._sensor(t_ns, frame) @ found.T_ac @ Pose(geometry.IDENTITY_QUAT, offset)
         return MeasuredPose(T_ac, C)
+
+
+def _state(path: Path) -> tuple[int, int, int] | None:
+    """What differs after a change of a file; None if it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:

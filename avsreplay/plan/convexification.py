@@ -316,8 +316,10 @@ def excess(case: Case, path: StepPath) -> Array:
     if not case.limits.geometric:
         return np.zeros((2 * n, len(CONSTRAINTS)))
     times, found = dense_margins(case, path)
-    fraction = (times[1:] - times[0]) / (times[-1] - times[0])
-    over = np.maximum(RESERVE * case.buffer_m - found.between - allowed(case.start, fraction), 0.0)
+    begin = (times[:-1] - times[0]) / (times[-1] - times[0])
+    reserve = RESERVE * case.buffer_m
+    accepted = allowed(case.start - reserve, begin)
+    over = np.maximum(reserve - found.between - accepted, 0.0)
     half = over.reshape(2 * n, BETWEEN // 2, -1).max(axis=1)
     after = np.concatenate([half[1:], half[-1:]])
     return np.asarray(np.maximum(half, after))
@@ -484,10 +486,14 @@ def _withdrawal_rows(
 
 
 def allowed(start: Array, fraction: Array) -> Array:
-    """Return the violation that is accepted while the robot returns from a violation at the
-    start.
+    """Return the violation (n, 5) that is accepted while the robot returns from a violation at the
+    start: a robot at rest gains the way with the square of the time.
+
+    Args:
+        start: (5,) margins at the start [m].
+        fraction: (n,) of the flight.
     """
-    shrinking = np.maximum(1.0 - fraction / LEAD_BACK, 0.0)
+    shrinking = np.maximum(1.0 - (fraction / LEAD_BACK) ** 2, 0.0)
     return np.asarray(np.maximum(-start, 0.0)[None, :] * shrinking[:, None])
 
 

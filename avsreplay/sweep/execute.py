@@ -22,8 +22,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from avsreplay import __version__, settings, toml_document
-from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
+from avsreplay import __version__, arithmetic, settings, toml_document
+from avsreplay.errors import AvsError, MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import output_text
 from avsreplay.job_file import JobFile, read_job
 from avsreplay.log import SourceOptions
@@ -216,12 +216,24 @@ def run_tasks(
     Raises:
         MissingBackend: Dask is needed and not installed.
         UnreadableInput: The scheduler does not answer, or ended before the runs did.
+        UsageError: A worker has another version or arithmetic.
     """
     if workers == 0 and scheduler is None:
         yield from _here(tasks, work)
         return
     with connected(workers, scheduler, dashboard) as client:
         yield from _on(client, iter(tasks), work)
+
+
+def check_workers(workers: int, scheduler: str | None = None) -> None:
+    """Raise MissingBackend where the processes of ``run_tasks`` need Dask and it is not installed.
+
+    Args:
+        workers: processes on this machine.
+        scheduler: address of a Dask scheduler.
+    """
+    if workers or scheduler is not None:
+        _distributed()
 
 
 def _distributed() -> Any:
@@ -231,7 +243,7 @@ def _distributed() -> Any:
     except ImportError:
         hint = "pip install 'avsreplay[sweep]', or --workers 0 to run in this process"
         raise MissingBackend(
-            "Dask (distributed) is not installed", where="sweep", hint=hint
+            "Dask (distributed) is not installed", where="--workers", hint=hint
         ) from None
 
 
@@ -309,13 +321,30 @@ def _on(client: Any, tasks: Iterator[T], work: Callable[[T], RunResult]) -> Iter
         if count % WORKER_QUERY_PERIOD == 0:
             limit = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
         while held < limit and (task := next(tasks, None)) is not None:
-            running.add(client.submit(work, task, key=f"run-{task.id}", pure=False))
+            running.add(
+                client.submit(_worked, work, task, software(), key=f"run-{task.id}", pure=False)
+            )
             held += 1
         if held == 0:
             return
         future = next(running)
         held, count = held - 1, count + 1
         yield _collected(future)
+
+
+def software() -> tuple[str, str]:
+    """Version and arithmetic of this process; with other ones a run may have other bytes."""
+    return __version__, arithmetic.state()
+
+
+def _worked(work: Callable[[T], RunResult], task: T, expected: tuple[str, str]) -> RunResult:
+    """Run a task on a worker whose software is that of the command."""
+    found = software()
+    if found != expected:
+        there, here = (f"version {version}, {how} arithmetic" for version, how in (found, expected))
+        hint = "set the variables of 'python -m avsreplay.arithmetic' before it starts"
+        raise UsageError(f"has {there}; this command has {here}", where="a Dask worker", hint=hint)
+    return work(task)
 
 
 def _collected(future: Any) -> RunResult:
@@ -325,7 +354,10 @@ def _collected(future: Any) -> RunResult:
     if future.status != "error":  # cancelled or lost: nothing is known of the run
         hint = "the finished runs are saved; start it and give the same command"
         raise UnreadableInput("it ended before the runs did", where="Dask scheduler", hint=hint)
-    return crashed(str(future.key).removeprefix("run-"), future.exception())
+    error = future.exception()
+    if isinstance(error, AvsError):  # of the worker; one of the run is its result
+        raise error
+    return crashed(str(future.key).removeprefix("run-"), error)
 
 
 def crashed(task_id: str, error: BaseException | None) -> RunResult:

@@ -16,12 +16,13 @@ import socket
 import sys
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
-from avsreplay.files import output_path
+from avsreplay.files import kept_if_used, output_path
 from avsreplay.result_dir import OWN_FILES
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 
@@ -119,7 +120,8 @@ class Journal:
     added.
 
     Entering the context locks the folder, so that two campaigns cannot write to it at the same
-    time.
+    time. An error before the first run is finished leaves no file, nor a folder, that was not there
+    before.
 
     Attributes:
         folder: The folder.
@@ -149,7 +151,7 @@ class Journal:
         self.damaged: list[bytes] = []
         self._places: dict[str, tuple[int, int]] = {}
         self._stream: BinaryIO | None = None
-        self._lock: BinaryIO | None = None
+        self._stack = ExitStack()
         self._guarded(self._read)
         foreign = [name for name in (*RESULTS, *sorted(OWN_FILES)) if (folder / name).exists()]
         if foreign and not self.path.exists():
@@ -159,16 +161,28 @@ class Journal:
             )
 
     def __enter__(self) -> Journal:
-        def begin() -> BinaryIO:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self.folder / "lock")
-            self._read()  # another process may have written it before this one had the lock
-            if self.damaged or self._torn:
-                self._set_aside()
-            return self.path.open("ab")
-
-        self._stream = self._guarded(begin)
+        with ExitStack() as stack:
+            self._stream = self._guarded(lambda: self._begin(stack))
+            self._stack = stack.pop_all()
         return self
+
+    def _begin(self, stack: ExitStack) -> BinaryIO:
+        """Create and lock the folder, and open the journal for appending."""
+        stack.enter_context(kept_if_used(self.folder))
+        stack.enter_context(_locked(self.folder / "lock"))
+        stack.push(self._leave_nothing)
+        self._read()  # another process may have written it before this one had the lock
+        if self.damaged or self._torn:
+            self._set_aside()
+        return self.path.open("ab")
+
+    def _leave_nothing(self, kind: type[BaseException] | None, *_: object) -> None:
+        """After an error, remove a journal without runs, and its lock."""
+        kept = kind is None or self.status or any((self.folder / each).exists() for each in RESULTS)
+        with suppress(OSError):
+            if not kept:
+                self.path.unlink(missing_ok=True)
+                (self.folder / "lock").unlink()
 
     def __exit__(
         self,
@@ -176,10 +190,10 @@ class Journal:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        for stream in (self._stream, self._lock):
-            if stream is not None:
-                stream.close()
-        self._stream = self._lock = None
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = None
+        self._stack.__exit__(kind, error, traceback)
 
     def __contains__(self, run_id: str) -> bool:
         return run_id in self.status
@@ -350,6 +364,9 @@ def _locked(path: Path) -> BinaryIO:
     stream = path.open("a+b")
     try:
         _lock(stream)
+        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(stream.fileno())):
+            stream.close()  # the other process has removed it since it was opened
+            return _locked(path)
     except OSError:
         stream.seek(0)
         owner = stream.read(200).decode("utf-8", "replace").strip() or "another process"

@@ -1,7 +1,9 @@
 """The sentence of a run against what happened, for recorded scenarios with different attitudes.
 
-Each scenario is the built-in one for 60 s with another attitude, direction of the rate and seed.
-Finished runs are appended to a file and not made again.
+Each scenario is the built-in target for 90 s with another attitude, rate and seed. Of four, the
+first has the limits of the built-in scenario, the second also an occlusion of 6 s, the third random
+torques, and the fourth is approached from any side: its plans know no body. Finished runs are
+appended to a file and not made again; what was found is printed as a table.
 
 python tests/benchmarks/capture_scenarios.py FILE.jsonl [--count 12] [--seed 1] [--seconds S]
 """
@@ -20,7 +22,7 @@ import numpy as np
 
 SCENARIO = """name = "attitude-{k}"
 seed = {k}
-duration_s = 60.0
+duration_s = {span_s}
 rate_hz = 2.5
 
 [target]
@@ -29,7 +31,24 @@ shape = "satellite"
 [motion]
 attitude_xyzw = {q}
 rate_radps = {w}
+{more}"""
+LIMITS = """
+[run.limits]
+final_deg = 15.0
+clearance_m = 0.1
 """
+OCCLUSION = """
+[[fault]]
+kind = "occlusion"
+start_s = {start_s}
+duration_s = 6.0
+"""
+FREE = """
+[run.task]
+approach = "free"
+"""
+KINDS = ("limits", "limits, occlusion", "limits, torques", "free approach")
+SPAN_S = 90.0
 
 
 def command(*words: str) -> str:
@@ -40,14 +59,21 @@ def command(*words: str) -> str:
     return done.stdout
 
 
-def written(k: int, seed: int, folder: Path) -> Path:
+def written(k: int, seed: int, folder: Path, kind: str = "", span_s: float = 60.0) -> Path:
     """The log of one scenario, in a folder."""
     rng = np.random.default_rng([seed, k])
     q, w = rng.normal(size=4), rng.normal(size=3)
     q /= np.linalg.norm(q)
     w *= rng.uniform(0.04, 0.1) / np.linalg.norm(w)
+    more = ""
+    if "torques" in kind:  # over the trace of the inertia, drawn anew every second
+        more += f"torque_std_radps2 = {10.0 ** rng.uniform(-6.0, -4.0):.3g}\n"
+    if "occlusion" in kind:
+        more += OCCLUSION.format(start_s=round(rng.uniform(20.0, 40.0), 1))
+    more += LIMITS * ("limits" in kind) + FREE * ("free" in kind)
     scenario, log = folder / "scenario.toml", folder / "log.mcap"
-    scenario.write_text(SCENARIO.format(k=k, q=q.tolist(), w=w.tolist()))
+    text = SCENARIO.format(k=k, q=q.tolist(), w=w.tolist(), span_s=span_s, more=more)
+    scenario.write_text(text)
     command("record", str(scenario), "-o", str(log))
     return log
 
@@ -55,10 +81,10 @@ def written(k: int, seed: int, folder: Path) -> Path:
 def made(k: int, seed: int) -> dict[str, object]:
     """The assessment of one scenario."""
     with tempfile.TemporaryDirectory() as folder:
-        log = written(k, seed, Path(folder))
+        log = written(k, seed, Path(folder), kind := KINDS[k % len(KINDS)], SPAN_S)
         capture = json.loads(command("run", str(log), "--json"))["verdict"]["capture"]
     names = ("chance", "probability", "at_s", "contact", "sentence", "in_fact")
-    return {"k": k, "seed": seed, **{name: capture[name] for name in names}}
+    return {"k": k, "seed": seed, "kind": kind, **{name: capture[name] for name in names}}
 
 
 def main() -> None:
@@ -77,8 +103,11 @@ def main() -> None:
         rows.append(made(k, given.seed))
         with given.file.open("a") as stream:
             stream.write(json.dumps(rows[-1]) + "\n")
+    print("| scenario | what it has | sentence | what happened |\n|---|---|---|---|")
     for row in rows:
-        print(f"{row['k']:3d}  {row['sentence']}")
+        sentence, _, happened = row["sentence"].partition("; in fact ")
+        happened = happened.split(". ")[0] or "the flight did not end"
+        print(f"| {row['k']} | {row['kind']} | {sentence} | {happened} |")
     known = [row for row in rows if row["in_fact"] is not None]
     right = sum((row["chance"] == "likely") == row["in_fact"]["captured"] for row in known)
     print(f"{len(rows)} scenarios, {len(known)} flights that ended, {right} answers as it happened")

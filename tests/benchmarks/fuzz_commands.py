@@ -118,6 +118,7 @@ MODELS = ("model.ply", "model.obj", "model.stl", "model.ascii.stl", "model.off",
 RUN = ("--init", "truth", "--n-scans", "2", "--json")
 NO_MODEL = ("--model", "model.ply", "--init", "0,0,3,0,0,0,1", "--n-scans", "2", "--json")
 SEEN = ("--n-scans", "4", "--init", "truth")
+ONE_SCAN = ("--n-scans", "1", "--backend", "horn", "--workers", "0")
 MEASURED = ("--backend", "poses", "--extent", "2", "--n-scans", "3", "--json")
 # (command, input) -> (arguments, seeds); IN is the mutated input, OUT an output, the other words
 # name intact seeds or are values. One of several lines of arguments is drawn.
@@ -189,7 +190,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
         MODELS,
     ),
     ("benchmark", "data"): (
-        (("--only", "real-turntable", "--data", "IN", "-o", "OUT", "--n-scans", "1"),),
+        (("--only", "real-turntable", "--data", "IN", "-o", "OUT", *ONE_SCAN),),
         ("scans",),
     ),
     ("config", "log"): ((("IN",),), ("log.mcap", "zstd.mcap")),
@@ -263,7 +264,7 @@ class WrittenLog(GrowingLog):
             path.write_bytes(self._rest.pop(0) if rng.random() < 0.9 else b"")
         super().__init__(path, feed)
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         if self._rest:
             piece = self._rest.pop(0)
             with self.path.open("r+b") as file:
@@ -274,7 +275,7 @@ class WrittenLog(GrowingLog):
                 file.write(piece)
         elif not self._fed:
             self.stop()
-        return super()._advance()
+        return super().advance()
 
 
 def call(*args: object) -> None:

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from fuzz_commands import OUTPUTS, build
+from fuzz_commands import ONE_SCAN, OUTPUTS, build
 from fuzz_workers import Command, Done
 
 from avsreplay.cli.main import SUMMARIES, group
@@ -34,6 +34,7 @@ from avsreplay.log import open_source
 from avsreplay.log.header import read_surface
 from avsreplay.report.result import load_result
 
+REAL = ("--only", "real-turntable", "--data", "scans", *ONE_SCAN)
 RUN = ("log.mcap", "--init", "truth", "--n-scans", "2")
 # (command, output) -> arguments; OUT is the output, the other words name intact inputs.
 CASES: dict[tuple[str, str], tuple[str, ...]] = {
@@ -75,7 +76,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("model", "poses"): ("log.mcap", "-o", "other.ply", "--poses", "OUT", "--overwrite"),
     ("odometry", "output"): ("log.mcap", "-o", "OUT", "--overwrite", "--n-scans", "3"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
-    ("benchmark", "output"): ("--only", "real-turntable", "--data", "scans", "-o", "OUT"),
+    ("benchmark", "output"): (*REAL, "-o", "OUT"),
 }
 FOLDERS = {("run", "output"), ("sweep", "output"), ("benchmark", "output")}
 NODES = (
