@@ -62,7 +62,7 @@ def stages(
         estimator = estimator.at_interval(clock[1], surface.extent)
     task, target = task_and_target(config, surface)
     robot, arm = with_arm(config.task.with_gripper(config.robot))
-    limits = task.corridor(robot.limited(config.limits))
+    limits = robot.limited(task.corridor(config.limits))
     supervision = config.task.with_tolerance(config.supervisor).resolved(surface.extent)
     return Stages(
         registrar=registrar,

@@ -193,6 +193,7 @@ class Outcome:
         reinitialised: how often the filter or the given start was replaced by a fit so far.
         manoeuvres: all changes of the target's velocity found so far.
         drift: constant torque or force, if any.
+        cause: what the poses so far show besides free motion, in words.
         monitors: observability, consistency and convergence.
         action, supervisor_rule: command of the supervisor to the robot, and the rule that gave it.
         plan: capture plan in force, None before the first.
@@ -220,6 +221,7 @@ class Outcome:
     action: str
     supervisor_rule: str
     plan: Plan | None
+    cause: str = ""
 
 
 @value_class(eq=True)

@@ -93,7 +93,7 @@ class Replanning:
             saved.task,
             *(supervisor, saved.robot, axis, surface, closest, limits, saved.extent_m),
         )
-        self.limits = self.task.corridor(self.robot.limited(limits)).resolved(saved.extent_m)
+        self.limits = self.robot.limited(self.task.corridor(limits)).resolved(saved.extent_m)
         target = replace(target, axis_c=self.task.axis_c)
         self._target = target_at(target, self.task.grasp_c)
         self.truth = saved.truth(self.task.grasp_c)

@@ -619,6 +619,14 @@ class Row:
         "What the poses show of the motion of the target.",
         words=_MOTION_WORDS,
     )
+    cause: str | None = _exact(
+        lambda o, s: o.cause or None,
+        (
+            "What the healthy poses so far show besides free motion, in words with 1 sigma: steps,"
+            " constant and periodic torque, force, drag, jump and drift of the range; causes that"
+            " are nearly as likely follow after 'or'. Null where free motion may explain them."
+        ),
+    )
     torque_noise_radps15: float | None = _number(
         lambda o, s: None if o.disturbances is None else o.disturbances[0],
         "Root density of the random torque that the estimate allows for.",

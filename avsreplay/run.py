@@ -21,6 +21,7 @@ from avsreplay.config import Against, RunConfig, load_config, pose_text, with_ac
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
+from avsreplay.estimate.events.naming import Cause
 from avsreplay.estimate.grasp_point import at_grasp, noise_about
 from avsreplay.estimate.measurement import in_fixture
 from avsreplay.geometry import Array, Pose
@@ -30,7 +31,7 @@ from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan.flights import Motion
 from avsreplay.plan.robot import Limits
-from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.records import Belief, LogHeader, Moves, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register.backend import POSES
 from avsreplay.register.interrupt import shielded
 from avsreplay.register.model_check import ModelCheck
@@ -159,6 +160,7 @@ class Run:
         self._healthy = HealthyPoses(self.estimator)
         self._fitted = HealthyPoses(self.estimator)  # poses of the reference motion
         self._smoothed: tuple[int, Reference | None] | None = None
+        self._cause = Cause()
         self._reference_instants: list[int] = []
         self._state, self.done = first_state(self.stages), 0
         self._scored: Scorer | None = None
@@ -251,6 +253,13 @@ class Run:
         if self._image is None and outcome.verdict.gamma:
             self._follow(outcome)
         self._healthy.add(state, outcome)
+        self._cause = self._cause.after(
+            outcome.moves is not Moves.FREE or bool(outcome.manoeuvres),
+            self._healthy.store,
+            self.estimator.params,
+            outcome.start_ns,
+        )
+        outcome = replace(outcome, cause=self._cause.words)
         assert self._scored is not None
         truth = self._truth_of(outcome.scan)
         if self.job.growing:
@@ -298,7 +307,7 @@ class Run:
         """
         own = (
             *(self._state, self.done, self.model_check, self._end, self._image),
-            *(self._scored, self.flight),
+            *(self._scored, self.flight, self._cause),
         )
         motion = None if self._scored is None else self._scored.motion
         poses = *self._fitted.store.arrays(), *self._healthy.store.arrays()
@@ -317,13 +326,13 @@ class Run:
         """
         scored = self._scorer()
         motion, scored.motion = scored.motion, None  # it is named and not stored
-        judged = self.model_check, None, None, scored, self.flight
+        judged = self.model_check, None, None, scored, self.flight, self._cause
         empty = (*self._fitted.store.arrays(), *self._healthy.store.arrays())
         like: Any = (self._state, 0, *judged, *empty, [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self.model_check, self._end, *rest = found
         self.taken = rows
-        self._image, self._scored, self.flight, *rest = rest
+        self._image, self._scored, self.flight, self._cause, *rest = rest
         *arrays, self._reference_instants, stored = rest
         self._fitted.store.extend(*arrays[:2])
         self._healthy.store.extend(*arrays[2:])

@@ -35,6 +35,7 @@ _LEAST_CORRIDOR_OF_EXTENT = 0.06  # shorter ones are not needed, over the target
 # largest half opening that is assumed for a gripper, over the target's extent
 _MAX_OPENING_OF_EXTENT = 0.04
 _APPROACH_DEG = 15.0  # half-angle of the corridor along the axis where the limits set no cone
+_APPROACH_CLEARANCE_OF_EXTENT = 0.02  # and the clearance outside it, over the target's extent
 _FLAT_COS = math.cos(math.radians(8.0))  # faces of a patch have normals within this angle
 # and lie within this distance of its plane, over the target's extent
 _FLAT_OFFSET_OF_EXTENT = 0.003
@@ -69,8 +70,9 @@ class TaskParams(Settings):
     )
     approach: Approach = setting(
         Approach.AXIS,
-        "How the robot comes to the grasp point of a model where [limits] sets no cone: along the"
-        " axis, through a corridor of 15 deg (axis), or from any side (free).",
+        "How the robot comes to the grasp point of a model where [limits] sets no cone: through a"
+        " corridor of 15 deg along the axis, with a clearance of 0.02 of the extent (axis), or as"
+        " if there were no body (free).",
     )
     position_m: float | None = setting(
         None,
@@ -159,7 +161,7 @@ class Task:
             part that it encloses.
         deadline_s: latest time of the capture after the first scan; infinite without.
         corridor_m: length of a corridor that ends where the clearance is kept; 0: the usual one.
-        approach: how the robot comes to the grasp point where the limits set no cone.
+        approach_m: clearance of the approach along the axis where the limits set no cone; 0: free.
         assumed: names of the values that were not given.
         problem: why the grasp point cannot be used, "" where it can.
     """
@@ -172,7 +174,7 @@ class Task:
     mouth_m: float
     deadline_s: float
     corridor_m: float = 0.0
-    approach: Approach = Approach.FREE
+    approach_m: float = 0.0
     assumed: tuple[str, ...] = ()
     problem: str = ""
 
@@ -206,7 +208,7 @@ class Task:
             "angle_deg": self.tolerance.angle_deg,
             "opening_m": self.opening_m,
             "radius_m": self.radius_m,
-            "approach": self.approach.value,
+            "approach": (Approach.AXIS if self.approach_m > 0.0 else Approach.FREE).value,
             "deadline_s": self.deadline_s if math.isfinite(self.deadline_s) else None,
             "assumed": list(self.assumed),
             "problem": self.problem,
@@ -221,17 +223,21 @@ class Task:
         Args:
             limits: constraints of a plan; a cone and a length that are set are kept.
         """
-        if _chosen(self.approach, limits) is Approach.AXIS:
-            limits = replace(limits, final_deg=_APPROACH_DEG)
+        limits = _along_axis(limits, self.approach_m)
         if limits.final_deg is None or limits.final_range_m is not None:
             return limits
         return replace(limits, final_range_m=self.corridor_m) if self.corridor_m > 0.0 else limits
 
 
-def _chosen(approach: Approach, limits: Limits | None) -> Approach:
-    """How the robot comes to the grasp point with these limits."""
-    given = limits is not None and (limits.cone_deg is not None or limits.final_deg is not None)
-    return Approach.FREE if given else approach
+def _along_axis(limits: Limits, clearance_m: float) -> Limits:
+    """The limits of an approach along the axis, unless they set a cone or the clearance is 0.
+
+    Safe withdrawals are stated but not required: they take most of the time of a search.
+    """
+    if clearance_m <= 0.0 or limits.cone_deg is not None or limits.final_deg is not None:
+        return limits
+    clear = limits.clearance_m or clearance_m
+    return replace(limits, final_deg=_APPROACH_DEG, clearance_m=clear, abort=False)
 
 
 @value_class(eq=True)
@@ -299,12 +305,14 @@ def task_of(
     radius = params.with_gripper(robot).radius_m
     point, out = frozen(np.array(grasp, float), 3), np.array(axis, float)
     out = frozen(out / np.linalg.norm(out), 3)
-    clearance = radius if limits is None else (limits.clearance_m or 0.0) + radius
-    needed = _Room(params.opening_m, tolerance.position_m, clearance)
+    along = params.approach is Approach.AXIS and len(surface.faces) > 0
+    clear = _APPROACH_CLEARANCE_OF_EXTENT * extent if along else 0.0
+    chosen = _along_axis(Limits() if limits is None else limits, clear)
+    needed = _Room(params.opening_m, tolerance.position_m, (chosen.clearance_m or 0.0) + radius)
     access = _access(point, out, surface, closest, needed, extent)
     corridor = _CORRIDOR_RATIO * access.clear_m
-    usable = len(surface.faces) > 0 and not access.problem
-    approach = params.approach if usable else Approach.FREE
+    clear = 0.0 if access.problem else clear
+    derived = clear > 0.0 and chosen != limits
     return Task(
         point,
         out,
@@ -314,8 +322,8 @@ def task_of(
         access.mouth_m,
         math.inf if params.deadline_s is None else params.deadline_s,
         corridor if corridor > _LEAST_CORRIDOR_OF_EXTENT * extent else 0.0,
-        approach,
-        _assumed(params, supervisor, robot, _chosen(approach, limits)),
+        clear,
+        _assumed(params, supervisor, robot, derived),
         access.problem,
     )
 
@@ -329,7 +337,7 @@ def _named_patch(name: str, surface: Surface, closest: Closest) -> Patch:
 
 
 def _assumed(
-    params: TaskParams, supervisor: SupervisorParams, robot: RobotParams, approach: Approach
+    params: TaskParams, supervisor: SupervisorParams, robot: RobotParams, approach: bool
 ) -> tuple[str, ...]:
     """Names of the values that neither the task nor the settings of the robot give."""
     values = {
@@ -339,7 +347,7 @@ def _assumed(
         "speed": params.speed_mps,
         "angle": params.angle_deg,
         "opening": params.opening_m,
-        "approach along the axis": None if approach is Approach.AXIS else approach,
+        "approach along the axis": None if approach else "given",
         "radius": robot.radius_m or None if params.radius_m is None else params.radius_m,
     }
     return tuple(name for name, value in values.items() if value is None)

@@ -109,6 +109,7 @@ def test_the_approach_is_along_the_axis_unless_the_limits_set_a_cone():
     free, cone = Limits(), Limits(cone_deg=30.0)
     along = task(*body(Shape.BRACKET))
     assert along.corridor(free).final_deg == pytest.approx(15.0)
+    assert along.corridor(free).clearance_m > 0.0
     assert "approach along the axis" in along.assumed
     assert along.corridor(cone) == cone
     anywhere = task(*body(Shape.BRACKET), approach=Approach.FREE)

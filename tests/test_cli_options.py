@@ -262,3 +262,20 @@ def test_a_command_that_fails_at_its_first_check_leaves_nothing(
     assert done.exit_code
     assert isinstance(done.exception, AvsError | click.ClickException | SystemExit)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/.."])
+@pytest.mark.parametrize("command", ["run", "sweep", "benchmark"])
+def test_no_command_writes_its_folder_in_place_of_a_present_one(
+    command, name, tmp_path, fixtures_folder, monkeypatch
+):
+    """An empty name is that of a variable of the shell that is not set."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    log = str(fixtures_folder / "tumble.mcap")
+    words = {"run": [log], "sweep": ["campaign.toml"], "benchmark": ["--quick"]}[command]
+    done = CliRunner().invoke(group, [command, *words, "-o", name])
+    assert isinstance(done.exception, UsageError)
+    assert sorted(tmp_path.rglob("*")) == before

@@ -26,6 +26,7 @@ from avsreplay.estimate.chart import (
     to_errors,
 )
 from avsreplay.estimate.events.linear import LinearModel, passed, shock_gain
+from avsreplay.estimate.events.naming import Cause
 from avsreplay.estimate.events.smoothing import PoseStore, smoothed
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.geometry import Pose
@@ -242,6 +243,37 @@ def test_an_event_is_named_with_its_size_and_onset(case, kinds, seed):
         for f, x in zip(fixes, states, strict=True)
     ]
     assert np.sqrt(np.mean(np.square(errors))) < POS_M
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("torque", "said"),
+    [
+        (lambda t, w: np.array([3e-4 * np.sin(2.0 * np.pi * t / 20.0), 0.0, 0.0]), "periodic"),
+        (lambda t, w: -0.01 * w, "drag of"),
+    ],
+)
+def test_rows_name_a_cause_once_the_poses_show_it(torque, said):
+    """Free bodies are not searched; the first cause that is named is the true one, and remains."""
+    fixes, _, _, _ = _scene(341, seconds=100.0, torque_at=torque)
+    store, known, free, told = PoseStore(), Cause(), Cause(), []
+    for fix in fixes:
+        store.append(fix)
+        free = free.after(False, store, PARAMS, 0)
+        known = known.after(True, store, PARAMS, 0)
+        told.append(known.words)
+    assert (free.words, free.searched) == ("", 0)
+    named = [words for words in told if words]
+    assert len(named) > 40
+    assert all(said in words for words in named)
+    assert said in told[-1]
+
+
+def test_a_covariance_that_is_not_positive_is_an_error_of_arithmetic():
+    """So a smoothed motion that was not found ends no run."""
+    model = _model(5)
+    with pytest.raises(ArithmeticError, match="must be positive"):
+        passed(replace(model, R=model.R - 1e3 * np.eye(6)))
 
 
 @pytest.mark.slow

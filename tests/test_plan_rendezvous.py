@@ -7,6 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from avsreplay.estimate.estimator import Estimator
+from avsreplay.estimate.params import EstimatorParams
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.path import CostatePath, sample_goal
 from avsreplay.plan.reachable_set import (
@@ -19,6 +21,7 @@ from avsreplay.plan.reachable_set import (
     support,
 )
 from avsreplay.plan.rendezvous import PlanParams, _Margin, rendezvous
+from avsreplay.records import Belief, State
 
 ORIGIN = np.zeros(3)
 GAUSS = np.polynomial.legendre.leggauss(200)
@@ -322,3 +325,22 @@ def test_a_fast_target_is_proven_out_of_reach_of_a_weak_robot():
     """Its speed of 2.4 m/s cannot be reached in 40 s with 0.05 m/s2."""
     plan = rendezvous(spinning(8.0), np.zeros(3), np.zeros(3), PlanParams(horizon_s=40.0))
     assert plan.status is PlanStatus.INFEASIBLE
+
+
+def test_a_target_whose_reach_is_nearly_tangent_to_the_thrust_is_planned_or_refused():
+    """A Newton step from its first feasible time leads to instants before now."""
+    x = State(
+        np.array([0.26289033, 0.82955745, 0.46777322, 0.15463289]),
+        np.array([-0.00349092, -0.11927762, -0.00047804]),
+        np.array([1.00459758, 0.66787729, 5.69097189]),
+        np.array([0.00377189, 0.00904555, -0.00290264]),
+        np.array([0.11924969, -0.08914719]),
+        np.array([-0.54333073, -0.26959783, 0.21759411]),
+        np.array([-0.23570937, -0.30050797, 0.3059129, 0.8720971]),
+    )
+    motion = Estimator(EstimatorParams(), None, 5.2).motion(Belief(0, x, np.zeros((20, 20))))
+    r0 = np.array([0.8829696766253115, -0.1409870613604618, 3.426046788671196])
+    v0 = np.array([0.03717994215811352, 0.003184640391903593, 0.29347998083436383])
+    plan = rendezvous(lambda t: motion(t + 0.3), r0, v0, PlanParams(a_max_mps2=0.02))
+    assert not plan.found or plan.lower_bound_s <= plan.t_go_s < 60.0
+    assert plan.status is not PlanStatus.INFEASIBLE

@@ -21,7 +21,7 @@ from avsreplay.log import SourceOptions, open_source
 from avsreplay.log.cdr import pose_stamped
 from avsreplay.preflight import preflight
 from avsreplay.records import ScanStatus
-from avsreplay.report.summary_parts import events
+from avsreplay.report.summary_parts import of_sensor
 from avsreplay.run import Job, Run
 
 POS_M, ROT_RAD, HZ, SECONDS = 0.002, 0.003, 3.0, 20.0
@@ -121,7 +121,7 @@ def test_a_tracker_that_repeats_its_pose_is_frozen_and_the_estimate_goes_on(
     assert all(row.gamma for row in found[38:])
     assert found[38].pos_err_m < 0.02
     assert found[38].manoeuvres == 0
-    (said,) = (text for text in events(found, (), None) if "repeated" in text)
+    (said,) = (text for text in of_sensor(found) if "repeated" in text)
     assert "8 times, first at 10.0 s" in said
 
 

@@ -17,7 +17,7 @@ from avsreplay.estimate.chart import AXIS_PERMUTATIONS, permute_axes
 from avsreplay.geometry import exp, matrix
 from avsreplay.records import Label, State
 from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
-from avsreplay.report.summary_parts import Statistics, events
+from avsreplay.report.summary_parts import Statistics, of_motion
 from avsreplay.report.summary_tables import fact_lines, in_one_line, manoeuvre_table
 from avsreplay.tables import RowTable
 
@@ -457,7 +457,7 @@ def test_each_manoeuvre_is_listed_as_last_reported(make_rows):
     ]
     assert [line[0] for line in lines] == ["0.90", "2.10"]
     assert [line[2] for line in lines] == ["10", "30"]
-    (text,) = events(rows, found, None)
+    (text,) = of_motion(rows, found, None)
     assert (
         text == "the target's velocity changed 2 times, most significantly at 2.1 s by 30 +- 1 mm/s"
     )

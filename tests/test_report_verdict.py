@@ -54,16 +54,65 @@ def test_a_good_run_passes(make_rows):
     assert found.line == "PASS: no reason for concern was found."
 
 
+PERIODIC = "periodic torque of 0.3 +- 0.02 mrad/s2, period 20 s"
+
+
+def _by_all_poses(*events, rivals=(), onset_s=0.0):
+    """A header with events of the whole log: kind, words, log odds, first known."""
+    names = ("kind", "words", "log_odds", "first_known_s", "onset_s", "onset_1s_s")
+    found = [dict(zip(names, (*event, onset_s, 0.0), strict=True)) for event in events]
+    others = [{"log_odds": odds, "events": kinds} for odds, kinds in rivals]
+    return {**HEADER, "smoothed": {"events": found, "rivals": others}}
+
+
 @pytest.mark.parametrize(
-    ("known", "odds", "stated"), [(None, 40.0, True), (30.0, 40.0, False), (None, 2.0, False)]
+    ("known", "odds", "said"),
+    [
+        (None, 40.0, f"{PERIODIC} (no row states it)"),
+        (30.0, 40.0, f"{PERIODIC} (in the rows from 30.0 s on)"),
+        (None, 2.0, ""),
+    ],
 )
-def test_an_event_that_only_the_whole_log_shows_is_a_reason(make_rows, known, odds, stated):
-    words = "periodic torque of 0.3 +- 0.02 mrad/s2, period 20 s"
-    event = {"kind": "periodic_torque", "words": words, "log_odds": odds, "first_known_s": known}
-    found = _judged(_good(make_rows), header={**HEADER, "smoothed": {"events": [event]}})
-    assert (words in found.line) == stated
-    assert found.tracking is (Grade.CHECK if stated else Grade.PASS)
+def test_an_event_of_the_whole_log_is_a_reason_with_when_it_was_known(make_rows, known, odds, said):
+    header = _by_all_poses(("periodic_torque", PERIODIC, odds, known))
+    found = _judged(_good(make_rows), header=header)
+    assert (PERIODIC in found.line) == bool(said)
+    assert said in found.line
+    assert found.tracking is (Grade.CHECK if said else Grade.PASS)
     assert _judged(_good(make_rows), header={**HEADER, "smoothed": None}).tracking is Grade.PASS
+
+
+def test_what_rows_took_for_a_manoeuvre_is_no_manoeuvre_of_the_log(make_rows):
+    """All poses show drag: the change of the velocity and the torque that rows state are what was
+    believed before.
+    """
+    rows = _good(
+        make_rows,
+        manoeuvres=1,
+        manoeuvre_s=20.0,
+        manoeuvre_1s_s=0.1,
+        manoeuvre_mps=0.004,
+        manoeuvre_1s_mps=0.001,
+    )
+    alone = _judged(rows)
+    assert any("the target's velocity changed" in reason.text for reason in alone.reasons)
+    drag = ("drag", "drag of 1 +- 0.01 %/s", 90.0, 50.0)
+    found = _judged(rows, header=_by_all_poses(drag))
+    texts = [reason.text for reason in found.reasons]
+    assert not any("the target's velocity changed" in text for text in texts)
+    (before,) = (text for text in texts if text.startswith("rows before the cause was known"))
+    assert "a change of the velocity once, at 20.0 s" in before
+    step = ("velocity_step", "velocity changed by 4 +- 1 mm/s at 20.0 s", 90.0, 21.0)
+    header = _by_all_poses(step, onset_s=20.5)
+    assert not any("rows before" in r.text for r in _judged(rows, header=header).reasons)
+
+
+def test_a_set_of_events_that_is_nearly_as_likely_is_stated(make_rows):
+    drag = ("drag", "drag of 0.2 +- 0.01 %/s", 90.0, None)
+    rivals = [(-2.3, ["torque"]), (-3.0, ["drag", "rate_step"]), (-30.0, ["sensor_drift"])]
+    found = _judged(_good(make_rows), header=_by_all_poses(drag, rivals=rivals))
+    (said,) = (r.text for r in found.reasons if r.text.startswith("nearly as likely"))
+    assert said == "nearly as likely: torque in place of drag"
 
 
 def test_no_healthy_scan_fails(make_rows):

@@ -150,6 +150,7 @@ def benchmark_command(
             where="benchmark",
             hint="add -o DIR, or --list to print the scenarios",
         )
+    check_output(output, folder=True)
     order = Order(
         suite=suite,
         scenarios=chosen,
@@ -178,7 +179,6 @@ def _made(order: Order, workers: int) -> tuple[Record, dict[str, float]]:
     from avsreplay.sweep.journal import Journal
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_output(order.folder, folder=True)
     check_workers(workers)
     journal = Journal(order.folder)
     with journal:

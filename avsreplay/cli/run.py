@@ -336,9 +336,6 @@ class Outdated(Exception):
     """A log that has grown gives other rows than before; it is replayed again."""
 
 
-_SAME_EVENT_S = 2.0  # between the time of a manoeuvre in the rows and by all poses
-
-
 @value_class(eq=True)
 class _Finished:
     """Result of a replay; ``record`` is the content of ``run.json``."""
@@ -575,19 +572,25 @@ def _smoothed_record(run: Run, rows: Sequence[Row], summary: Summary) -> dict[st
 
 def _first_known_s(event: Mapping[str, Any], rows: Sequence[Row], summary: Summary) -> float | None:
     """Time of the first row that contains an event of the whole log; None where none does."""
+    from avsreplay.report.summary_parts import SAME_EVENT_S
     from avsreplay.tables import column_of
 
     kind, onset_s = event["kind"], event["onset_s"]
-    away = 3.0 * event["onset_1s_s"] + _SAME_EVENT_S
+    away = 3.0 * event["onset_1s_s"] + SAME_EVENT_S
     times = column_of(rows, "t_s")
+    begin = event["words"].partition(" of ")[0].partition(" by ")[0]
+    causes = zip(times, column_of(rows, "cause"), strict=True)
+    known = [t for t, cause in causes if cause and begin in cause]
     if kind in ("torque", "force"):
         stated = zip(times, column_of(rows, "drift_s"), strict=True)
-        return next((t for t, since in stated if since is not None), None)
+        known += [t for t, since in stated if since is not None]
     if kind == "sensor_offset":
         reasons = zip(times, column_of(rows, "reason"), strict=True)
-        return next((t for t, why in reasons if why == "sensor_bias" and t >= onset_s - away), None)
-    near = (c.reported_s for c in summary.velocity_changes if abs(c.t_s - onset_s) <= away)
-    return min(near, default=None) if kind in ("rate_step", "velocity_step") else None
+        known += [t for t, why in reasons if why == "sensor_bias"]
+    if kind in ("rate_step", "velocity_step"):
+        near = [c.reported_s for c in summary.velocity_changes if abs(c.t_s - onset_s) <= away]
+        return min(near, default=min((t for t in known if t >= onset_s), default=None))
+    return min((t for t in known if t >= onset_s - away), default=None)
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

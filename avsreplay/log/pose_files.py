@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
@@ -137,8 +139,62 @@ class TimedPoses:
         t_ns: times [ns], None where the format has no times.
     """
 
-    poses: tuple[MeasuredPose | str, ...]
-    t_ns: tuple[int, ...] | None
+    poses: Sequence[MeasuredPose | str]
+    t_ns: Sequence[int] | None
+
+
+class _Numbers(Sequence[MeasuredPose | str]):
+    """The poses of the lines of a file, of which only the numbers are in memory: seven of a line,
+    or twelve of KITTI.
+    """
+
+    def __init__(self) -> None:
+        self._numbers, self._width = array("d"), 0
+        self._reasons = dict[int, str]()  # of the lines without a pose
+
+    def __len__(self) -> int:
+        return len(self._numbers) // max(self._width, 1)
+
+    def add(self, numbers: list[float]) -> MeasuredPose | str:
+        """Append the numbers of a line and return its pose. Raises ValueError for another form."""
+        self._width = self._width or len(numbers)
+        if len(numbers) != self._width:
+            raise ValueError
+        pose = _pose(numbers)
+        if isinstance(pose, str):
+            self._reasons[len(self)] = pose
+        self._numbers.extend(numbers)
+        return pose
+
+    @overload
+    def __getitem__(self, at: int) -> MeasuredPose | str: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[MeasuredPose | str]: ...
+    def __getitem__(self, at: int | slice) -> MeasuredPose | str | list[MeasuredPose | str]:
+        """Return one pose or several, made from the numbers."""
+        if isinstance(at, slice):
+            return [self[k] for k in range(*at.indices(len(self)))]
+        place = range(len(self))[at]
+        begin = place * self._width
+        return self._reasons.get(place) or _pose(
+            self._numbers[begin : begin + self._width].tolist()
+        )
+
+
+def _pose(numbers: list[float]) -> MeasuredPose | str:
+    """The pose of seven numbers, or of twelve of KITTI, or why there is none.
+
+    Raises ValueError for another count or a matrix that is no pose.
+    """
+    if len(numbers) == 12:
+        finite = all(map(math.isfinite, numbers))
+        return MeasuredPose(_from_rows(numbers)) if finite else "a pose that is not finite"
+    if len(numbers) != 7:
+        raise ValueError
+    try:
+        return pose_of_numbers(numbers)
+    except BadMessage as error:
+        return str(error)
 
 
 _NOT_A_NAME = re.compile(r"[^a-z0-9]+")
@@ -169,27 +225,27 @@ def read_poses(path: Path) -> TimedPoses:
         UnreadableInput: the file cannot be read, a line has another form, or no pose is valid; with
             file and line.
     """
-    poses, times, first = list[MeasuredPose | str](), list[int](), ""
+    poses, times, first, any_valid = _Numbers(), array("q"), "", False
     columns: _Columns | None = None
     for where, words, commas in _lines(path):
         if columns is None and not poses and len(words) > 1 and not _is_number(words[0]):
             columns = _columns(words, where)
             continue
-        t_ns, pose = columns.read(words, where) if columns else _measured_line(words, commas, where)
+        try:
+            t_ns, numbers = columns.read(words, where) if columns else _line(words, commas)
+            pose = poses.add(numbers)
+        except (ValueError, OverflowError):
+            raise UnreadableInput("not a pose line", where=where, hint=_FORMATS_HELP) from None
         if isinstance(pose, str) and not first:
             first = f"; the first: {pose} ({where})"
-        poses.append(pose)
+        any_valid = any_valid or isinstance(pose, MeasuredPose)
         if t_ns is not None:
             times.append(t_ns)
-    if not any(isinstance(pose, MeasuredPose) for pose in poses):
+    if not any_valid:
         raise UnreadableInput(
             f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS_HELP
         )
-    if times and len(times) != len(poses):
-        raise UnreadableInput(
-            "some lines have a time and others do not", where=shown(path), hint="check the file"
-        )
-    return TimedPoses(tuple(poses), tuple(times) or None)
+    return TimedPoses(poses, times or None)
 
 
 @value_class(eq=True)
@@ -203,8 +259,8 @@ class _Columns:
     pose: tuple[int, ...]
     metres: float
 
-    def read(self, words: list[str], where: str) -> tuple[int, MeasuredPose | str]:
-        """Time [ns] and pose of a line.
+    def read(self, words: list[str], where: str) -> tuple[int, list[float]]:
+        """Time [ns] and the seven numbers of a line.
 
         Raises UnreadableInput if it has no time or too few columns.
         """
@@ -218,7 +274,7 @@ class _Columns:
             hint = "a column t_s is in seconds, t_ms in milliseconds, t_ns in nanoseconds"
             raise UnreadableInput(f"'{shown(text)}' is not a time", where=where, hint=hint)
         values = [_number(words[k]) for k in self.pose]
-        return t_ns, _checked([*(self.metres * v for v in values[:3]), *values[3:]])
+        return t_ns, [*(self.metres * v for v in values[:3]), *values[3:]]
 
 
 def _columns(names: list[str], where: str) -> _Columns:
@@ -244,34 +300,21 @@ def _columns(names: list[str], where: str) -> _Columns:
     return _Columns(place, _EXPONENTS.get(unit[0], ""), pose, _METRES[found["px"][1]])
 
 
-def _measured_line(
-    words: list[str], commas: bool, where: str
-) -> tuple[int | None, MeasuredPose | str]:
-    """A line without named columns; its number of columns determines the format."""
-    try:
-        if commas:
-            x, y, z, qw, *q = (_number(w) for w in words[1:8])
-            return _whole_ns(words[0]), _checked([x, y, z, *q, qw])
-        if len(words) == 12:
-            numbers = [_number(w) for w in words]
-            if not all(map(math.isfinite, numbers)):
-                return None, "a pose that is not finite"
-            return None, MeasuredPose(_from_rows(numbers))
-        t_ns = seconds_to_ns(words[0])
-        if t_ns is None or len(words) != 8:
-            raise ValueError
-        return t_ns, _checked([_number(w) for w in words[1:]])
-    except (ValueError, OverflowError):
-        raise UnreadableInput("not a pose line", where=where, hint=_FORMATS_HELP) from None
+def _line(words: list[str], commas: bool) -> tuple[int | None, list[float]]:
+    """Time and numbers of a line without named columns; its number of columns determines the
+    format.
 
-
-def _checked(values: list[float]) -> MeasuredPose | str:
-    if len(values) != 7:
+    Raises ValueError or OverflowError where it has none.
+    """
+    if commas:
+        x, y, z, qw, *q = (_number(w) for w in words[1:8])
+        return _whole_ns(words[0]), [x, y, z, *q, qw]
+    if len(words) == 12:
+        return None, [_number(w) for w in words]
+    t_ns = seconds_to_ns(words[0])
+    if t_ns is None or len(words) != 8:
         raise ValueError
-    try:
-        return pose_of_numbers(values)
-    except BadMessage as error:
-        return str(error)
+    return t_ns, [_number(w) for w in words[1:]]
 
 
 def _is_number(word: str) -> bool:

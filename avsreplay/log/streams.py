@@ -80,7 +80,7 @@ class PoseFile(_Files):
         self.timed = found.t_ns is not None
         steady = [FOLDER_EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
         self.log_ns = self.publish_ns = self.header_ns = (
-            steady if found.t_ns is None else list(found.t_ns)
+            steady if found.t_ns is None else found.t_ns
         )
 
     def load(self, place: int) -> RawCloud:

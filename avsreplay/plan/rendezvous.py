@@ -400,7 +400,8 @@ def _polish(
     search: _Search,
     found: Gauge,
 ) -> tuple[float, Gauge, float]:
-    """Solve G(t) = 0 by Newton's method on the exact goal.
+    """Solve G(t) = 0 by Newton's method on the exact goal, from the certified bound on: where G is
+    nearly tangent to 0 a step would go below it.
 
     Returns t, the normal and the lower bound.
     """
@@ -417,5 +418,5 @@ def _polish(
             best = (abs(margin), t, found, local.joined(sampled, t, abs(margin), search.t, a_max))
         if local.slope >= 0.0 or abs(margin) <= 1e-13 * found.value:
             break
-        t -= margin / local.slope
+        t = max(t - margin / local.slope, search.t)
     return best[1:]

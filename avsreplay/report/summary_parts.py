@@ -22,6 +22,7 @@ from avsreplay.tables import column_of
 # changes of the velocity from which a motion is not called free: a free target is pushed, or
 # manoeuvres, once or twice in a log; one that is towed, on a cable or in strong drag changes always
 _LEAST_DRIVEN_CHANGES = 3
+SAME_EVENT_S = 2.0  # between the time of a manoeuvre in the rows and by all poses
 
 
 @value_class(eq=True)
@@ -149,10 +150,10 @@ def times(count: int) -> str:
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 
-def events(
+def of_motion(
     rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None
 ) -> Iterator[str]:
-    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, errors.
+    """Yield what the rows state of the target's motion, in words: manoeuvres, torques and forces.
 
     Args:
         rows: all rows of the run.
@@ -167,7 +168,15 @@ def events(
         yield f"{whose} velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
-    yield from _not_free(rows)
+    yield from _disturbed(rows)
+
+
+def of_sensor(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield what the rows state of errors of the sensor, in words.
+
+    Args:
+        rows: all rows of the run.
+    """
     stated = list(zip(column_of(rows, "t_s"), column_of(rows, "reason"), strict=True))
     if biased := [t_s for t_s, reason in stated if reason == "sensor_bias"]:
         yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
@@ -175,13 +184,22 @@ def events(
         yield f"the sensor repeated a scan {times(len(frozen))}, first at {frozen[0]:.1f} s"
 
 
-def _not_free(rows: Sequence[Row]) -> Iterator[str]:
-    """That no free motion explains the poses, or only one with random torques or forces."""
-    moved = list(zip(column_of(rows, "t_s"), column_of(rows, "motion"), strict=True))
+def of_driving(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield that no free motion explains the poses, in words.
+
+    Args:
+        rows: all rows of the run.
+    """
+    moved = zip(column_of(rows, "t_s"), column_of(rows, "motion"), strict=True)
     if driven := [t_s for t_s, motion in moved if motion == "driven"]:
         scans = f"{len(driven)} of {len(rows)} scans, first at {driven[0]:.1f} s"
         yield f"the target does not move freely: no free motion explains the poses of {scans}"
-    elif moved and moved[-1][1] == "disturbed":
+
+
+def _disturbed(rows: Sequence[Row]) -> Iterator[str]:
+    """That random torques or forces explain the poses at the end."""
+    moved = column_of(rows, "motion")
+    if moved and moved[-1] == "disturbed" and "driven" not in moved:
         last = rows[-1]
         sizes = [
             f"{value:.2g} {unit}"

@@ -19,7 +19,14 @@ from avsreplay.errors import value_class
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
 from avsreplay.report.pose_checks import error_over_sigma
 from avsreplay.report.summary import Summary
-from avsreplay.report.summary_parts import events, length_text, times
+from avsreplay.report.summary_parts import (
+    SAME_EVENT_S,
+    length_text,
+    of_driving,
+    of_motion,
+    of_sensor,
+    times,
+)
 from avsreplay.rows import Row
 from avsreplay.tables import chosen, column_of, numbers, used_rows
 
@@ -156,7 +163,7 @@ def verdict_of(
             (*_errors(rows, extent_m), *_growth(rows, extent_m)) if summary.healthy else ()
         ),  # without a used scan there is no estimate to judge
         _faults(summary, extent_m),
-        _by_all_poses(header),
+        _motion(rows, summary, header),
         _filter(rows, summary),
         _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
     )
@@ -378,14 +385,76 @@ def _consistency(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(Grade.CHECK, text)
 
 
-def _by_all_poses(header: Mapping[str, Any]) -> Iterator[Concern]:
-    """Events of the whole log that no row contains: more poses show them than those up to a row."""
+def _motion(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any]) -> Iterator[Concern]:
+    """What moved the target besides its inertia, and the errors of the sensor.
+
+    The events by all poses of the log are final. What the rows state of the motion was known from
+    fewer poses: it is a reason of its own only where all poses show no event.
+    """
+    stated = tuple(of_motion(rows, summary.velocity_changes, summary.drift))
+    known = tuple(_sure_events(header))
+    for event in known:
+        first = event.get("first_known_s")
+        since = "no row states it" if first is None else f"in the rows from {first:.1f} s on"
+        yield Concern(Grade.CHECK, f"by all poses of the log: {event.get('words', '')} ({since})")
+    kinds = {str(event.get("kind")) for event in known}
+    rivals = _rivals(header, kinds)
+    if known and rivals:
+        instead = " or ".join(" and ".join(map(plain, rival)) for rival in rivals)
+        best = " and ".join(map(plain, sorted(kinds)))
+        yield Concern(Grade.CHECK, f"nearly as likely: {instead} in place of {best}")
+    kinds = kinds.union(*rivals)
+    if known and (other := _otherwise(known, kinds, summary)):
+        yield Concern(Grade.CHECK, f"rows before the cause was known state {other}")
+    elif not known:
+        yield from (Concern(Grade.CHECK, text) for text in stated)
+    for text in (*of_driving(rows), *of_sensor(rows)):
+        yield Concern(Grade.CHECK, text)
+
+
+def _sure_events(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     record = header.get("smoothed")
     found = record.get("events") if isinstance(record, Mapping) else None
     for event in found if isinstance(found, list) else ():
-        sure = isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT_LOG_ODDS
-        if sure and event.get("first_known_s") is None:
-            yield Concern(Grade.CHECK, f"by all poses of the log: {event.get('words', '')}")
+        if isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT_LOG_ODDS:
+            yield event
+
+
+def _rivals(header: Mapping[str, Any], kinds: set[str]) -> list[list[str]]:
+    """Kinds of the sets of events that are nearly as likely as the one stated, without those that
+    only add to it.
+    """
+    record = header.get("smoothed")
+    rivals = record.get("rivals") if isinstance(record, Mapping) else None
+    return [
+        names
+        for rival in (rivals if isinstance(rivals, list) else ())
+        if (rival.get("log_odds") or 0.0) > -SURE_EVENT_LOG_ODDS
+        and (names := rival.get("events") or [])
+        and not kinds <= set(names)
+    ]
+
+
+def _otherwise(known: Sequence[Mapping[str, Any]], kinds: set[str], summary: Summary) -> str:
+    """What rows state of the motion that the events by all poses, and those nearly as likely, do
+    not contain, in words.
+    """
+    onsets = [
+        (event.get("onset_s") or 0.0, 3.0 * (event.get("onset_1s_s") or 0.0) + SAME_EVENT_S)
+        for event in known
+        if event.get("kind") in ("rate_step", "velocity_step")
+    ]
+    changes = [
+        c
+        for c in summary.velocity_changes
+        if not any(abs(c.t_s - onset) <= away for onset, away in onsets)
+    ]
+    parts = []
+    if changes:
+        parts.append(f"a change of the velocity {times(len(changes))}, at {changes[0].t_s:.1f} s")
+    if summary.drift is not None and not kinds & {"torque", "force"}:
+        parts.append(f"a constant torque or force ({summary.drift})")
+    return " and ".join(parts)
 
 
 def _new_starts(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
@@ -396,9 +465,6 @@ def _new_starts(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
         )
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
-    yield from (
-        Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift)
-    )
     if summary.violations:
         when = next(compress(column_of(rows, "t_s"), column_of(rows, "violations")))
         text = (

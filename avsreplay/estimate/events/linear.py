@@ -73,9 +73,17 @@ class Passed:
 
 
 def passed(model: LinearModel) -> Passed:
-    """Filter and smoother over all knots (``kernel/shocks.cpp``)."""
+    """Filter and smoother over all knots (``kernel/shocks.cpp``).
+
+    Raises:
+        ArithmeticError: a covariance is not positive, because a motion that explains the poses was
+            not found.
+    """
     m = model
-    found = _motion.passes(m.F, m.b, m.Q, m.z, m.H, m.R, m.used, m.m0, m.P0)
+    try:
+        found = _motion.passes(m.F, m.b, m.Q, m.z, m.H, m.R, m.used, m.m0, m.P0)
+    except ValueError as error:
+        raise ArithmeticError(str(error)) from None
     return Passed(*found)
 
 

@@ -78,9 +78,15 @@ class PoseStore:
         self._last_ns = int(t_ns[-1]) if len(t_ns) else self._last_ns
         self._values.extend(values)
 
-    def fixes(self) -> list[PoseFix]:
-        """Return the poses."""
+    def fixes(self, places: NDArray[np.int64] | None = None) -> list[PoseFix]:
+        """Return the poses.
+
+        Args:
+            places: of those that are wanted, ascending; None for all.
+        """
         t_ns, values = self.arrays()
+        if places is not None:
+            t_ns, values = t_ns[places], values[places]
         C = np.zeros((len(t_ns), 6, 6))
         C[:, _LOWER[0], _LOWER[1]] = C[:, _LOWER[1], _LOWER[0]] = values[:, 8:29]
         return [
@@ -162,7 +168,7 @@ def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams) -> Smoothed:
         params: of the estimator, auto values filled in.
 
     Raises:
-        UsageError: fewer than four poses.
+        UsageError: fewer than four poses, or none of the motions that are tried explains them.
     """
     if len(fixes) < _FEWEST:
         hint = "a smoothed motion needs four healthy poses at least"
@@ -170,12 +176,18 @@ def smoothed(fixes: Sequence[PoseFix], params: EstimatorParams) -> Smoothed:
     poses = poses_of(tuple(fixes))
     body = Body(weak_prior(poses, params).one_sigma, params.correlated_rad)
     some = Problem(
-        poses.some(np.isin(np.arange(len(poses)), _spread(len(poses), _MOST_SEARCHED))), body
+        poses.some(np.isin(np.arange(len(poses)), spread(len(poses), _MOST_SEARCHED))), body
     )
-    sets = search(some, first_fit(some))
-    problem, fit = some, sets[0]
-    if len(poses) > _MOST_SEARCHED:
-        problem, fit = _denser(poses, some, fit)
+    try:
+        sets = search(some, first_fit(some))
+        problem, fit = some, sets[0]
+        if len(poses) > _MOST_SEARCHED:
+            problem, fit = _denser(poses, some, fit)
+    except ArithmeticError:
+        hint = "no motion of a rigid body explains them; is their noise (--pose-sigma) right?"
+        raise UsageError(
+            "the healthy poses have no smoothed motion", where="--reference fit", hint=hint
+        ) from None
     events = sorted((described(problem, fit, e) for e in fit.events), key=lambda f: f.onset_s)
     charts = [c.moved(y[:20]) for c, y in zip(fit.charts, fit.found.mean, strict=True)]
     t_ns = [fixes[0].t_ns + round(t * 1e9) for t in problem.times.tolist()]
@@ -205,14 +217,19 @@ def _belief(t_ns: int, chart: Chart, P: Array) -> Belief:
     return Belief(t_ns, to_state(chart), T @ P @ T.T)
 
 
-def _spread(count: int, most: int) -> NDArray[np.int64]:
-    """Places of at most ``most`` of ``count`` poses: equally spread, with both ends."""
+def spread(count: int, most: int) -> NDArray[np.int64]:
+    """Return the places of at most ``most`` of ``count`` poses: equally spread, with both ends.
+
+    Args:
+        count: number of poses.
+        most: largest number of places.
+    """
     return np.unique(np.round(np.linspace(0, count - 1, min(count, most))).astype(np.int64))
 
 
 def _denser(poses: Poses, some: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """The fit to all poses, averaged about the motion of a fit to some of them."""
-    places = _spread(len(poses), _MOST_KNOTS)
+    places = spread(len(poses), _MOST_KNOTS)
     charts = [c.moved(y[:20]) for c, y in zip(fit.charts, fit.found.mean, strict=True)]
     nearest = np.searchsorted(some.times, poses.times_s[places], side="right") - 1
     at = [
