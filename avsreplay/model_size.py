@@ -249,6 +249,7 @@ def find_model(
         if anywhere > any_pose + 1:  # one scan more may be chance
             text += (
                 f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
+                " If its position in their frame is known, give --sensor-at X,Y,Z instead"
             )
             return [Advice("check", "sensor", text, "--set register.camera=none")]
     if not any_pose:

@@ -235,7 +235,7 @@ def record_source(
                 opened.truth_of,
                 writer,
                 true_clock=False,
-                camera_of=lambda s: [(0, s.sensor)] if s.sensor else [],
+                camera_of=lambda s: [(0, at)] if (at := opened.frame_of(s)) else [],
             )
         lost = lost_text(opened.losses, opened.damaged, len(opened))
         done = replace(

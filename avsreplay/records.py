@@ -83,6 +83,7 @@ class AlignStatus(Enum):
     BUDGET_EXHAUSTED = (
         "budget_exhausted"  # implausible, and the work allowed for one scan was spent
     )
+    POSTPONED = "postponed"  # not searched, because a search of a scan like it found no pose
 
 
 class Reason(Enum):

@@ -361,6 +361,10 @@ _STATUS_WORDS = {
     "budget_exhausted": (
         "The pose is implausible or none was found, and the work allowed for the scan was spent."
     ),
+    "postponed": (
+        "Until a first pose is found, a scan that shows the same as one searched in vain is not"
+        " searched."
+    ),
     "empty": "The message has no finite point.",
     "damaged": "The message cannot be decoded.",
     "clock": "The time stamp is implausible; the clock of the log was used instead.",

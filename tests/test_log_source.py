@@ -422,6 +422,21 @@ def test_clouds_are_transformed_by_a_sensor_topic(tmp_path: Path) -> None:
     assert "the pose of the sensor is unknown" in found[-1].note
 
 
+def test_the_position_of_the_sensor_is_one_in_the_frame_of_the_clouds(tmp_path: Path) -> None:
+    """Alone it moves no point; with the pose of that frame it moves with it."""
+    poses = [
+        ("/cam", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(i))) for i, c in enumerate(CLOUDS)
+    ]
+    path, at = mcap(tmp_path / "a.mcap", [*clouds(), *poses]), (0.5, -1.0, 2.0)
+    for topic in (None, "/cam"):
+        with open_source(path, SourceOptions(sensor_m=at, sensor_topic=topic)) as source:
+            scan = source.scan_at(4)
+            frame = pose(4) if topic else Pose.identity()
+            np.testing.assert_allclose(scan.sensor.t, frame.apply(np.array([at]))[0], atol=1e-12)
+            np.testing.assert_allclose(scan.points, frame.apply(CLOUDS[4].points), atol=1e-6)
+            np.testing.assert_allclose(source.in_own_frame(scan), CLOUDS[4].points, atol=1e-6)
+
+
 def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
     loop = transforms(
         ("a", "b", pose(1)),

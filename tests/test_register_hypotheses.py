@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,12 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus
 from avsreplay.register.comparison import Measured, decided
 from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.evidence import Observed
+from avsreplay.register.generators.weak_directions import WeakDirections
+from avsreplay.register.hypotheses import Candidate, Case
 from avsreplay.register.poses import SAME_OF_EXTENT, Sameness
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.work import Work
 
 
 def _pose(rng: np.random.Generator, degrees: float, shift_m: float) -> Pose:
@@ -74,3 +80,27 @@ def test_a_target_with_few_of_the_points_of_a_scan_is_accepted() -> None:
     found = Registrar(surface).register(scan, T_ac @ turn)
     assert found.status is AlignStatus.ALIGNED
     assert np.degrees(geometry.angle((T_ac.inverse() @ found.T_ac).q)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("degrees", "shift_of_gate", "needed"),
+    [(0.0, 0.0, False), (0.2, 0.0, False), (1.2, 0.0, True), (0.0, 0.1, False), (0.0, 0.5, True)],
+)
+def test_a_part_of_the_target_is_compared_where_its_pose_left_the_guess(
+    degrees: float, shift_of_gate: float, needed: bool
+) -> None:
+    """By more than a quarter of the rejection distance, turned about its middle or moved."""
+    surface, T_ac = boxes(), example_pose()
+    registrar = Registrar(surface)
+    scan = T_ac.apply(view(surface, 1500, T_ac.inverse().t))
+    scan = scan[scan[:, 0] < np.median(scan[:, 0])]
+    middle = 0.5 * (surface.vertices.min(axis=0) + surface.vertices.max(axis=0))
+    q = exp(np.radians(degrees) * np.array([0.6, 0.0, 0.8]))
+    away = np.array([0.0, shift_of_gate * registrar.limits.gate_m, 0.0])
+    guess = T_ac @ Pose(q, middle - geometry.matrix(q) @ middle + away)
+    found = replace(registrar.register(scan, T_ac), T_ac=T_ac, status=AlignStatus.ALIGNED)
+    case = Case(Observed(scan), scan, scan, Work(10**6), guess)
+    case.current = Candidate(found)
+    loop = registrar.loop
+    generator = WeakDirections(registrar.target, loop.test, loop.screen, loop.poses)
+    assert generator.needed(case) is needed

@@ -210,17 +210,15 @@ def test_a_guess_that_few_points_confirm_gets_the_full_effort(
     ball *= 0.3 * surface.extent / np.linalg.norm(ball, axis=1)[:, None]
     ball = ball[ball[:, 2] < 0.0] + T_ac.apply(surface.vertices).mean(axis=0)
     other = registrar.register(ball, guess, effort=Effort.GUESS)
-    assert other.status is AlignStatus.BUDGET_EXHAUSTED
+    assert other.status is AlignStatus.POSTPONED
     assert not other.measured
-    assert "postponed" in other.message
 
 
 def test_without_the_full_effort_nothing_is_searched(registrar: Registrar) -> None:
     scan = np.random.default_rng(SEED).normal(size=(2000, 3)) + np.array([0.0, 0.0, 9.0])
     found = registrar.acquire(scan, effort=Effort.GUESS)
-    assert found.status is AlignStatus.BUDGET_EXHAUSTED
+    assert found.status is AlignStatus.POSTPONED
     assert not found.measured
-    assert "postponed" in found.message
     assert registrar.register(
         scan, Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0])), effort=Effort.GUESS
     ).status not in (

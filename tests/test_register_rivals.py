@@ -145,8 +145,7 @@ def test_an_ambiguous_scan_is_followed_until_the_mark_decides():
     assert gap_deg(found, T_ac) < 1.0
     ball = trimesh.creation.icosphere(4, 0.8)
     other = registrar.acquire(scan_of(ball, first.T_ac, 6), Effort.GUESS, first.T_ac)
-    assert other.status is AlignStatus.BUDGET_EXHAUSTED
-    assert "postponed" in other.message
+    assert other.status is AlignStatus.POSTPONED
 
 
 def test_the_information_left_without_motions_is_that_of_free_motions():

@@ -108,6 +108,7 @@ scan_options = added(
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--fixed-frame"),
     source_setting("--sensor-topic"),
+    source_setting("--sensor-at", "sensor_m", type=Numbers(3), metavar="X,Y,Z"),
     source_setting("--truth-gap", "truth_gap_s", type=float),
     source_setting("--scan-unit"),
     source_setting("--scan-duration", "scan_duration_s", type=float),

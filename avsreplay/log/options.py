@@ -183,6 +183,12 @@ class SourceOptions(Settings):
         None,
         "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame.",
     )
+    sensor_m: tuple[float, float, float] | None = setting(
+        None,
+        "Position of the sensor in the frame of the clouds, from which it measured all points.",
+        unit="m",
+        unset="the origin of that frame",
+    )
     intrinsics: str | None = setting(
         None,
         "Camera of depth images: FX,FY,CX,CY [pixel], or a file with the matrix, the YAML of a ROS"

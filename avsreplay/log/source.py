@@ -293,7 +293,18 @@ class Source:
         Args:
             scan: of this source.
         """
-        return scan.points if scan.sensor is None else scan.sensor.inverse().apply(scan.points)
+        frame = self.frame_of(scan)
+        return scan.points if frame is None else frame.inverse().apply(scan.points)
+
+    def frame_of(self, scan: Scan) -> Pose | None:
+        """Return the pose of the frame of a cloud in {A}; None if it is {A}.
+
+        Args:
+            scan: of this source.
+        """
+        if self._ground_truth.sensor is None or scan.sensor is None:
+            return None
+        return scan.sensor @ self._sensor_at.inverse()
 
     def moving_beside(self, frame: str) -> list[str]:
         """Return the frames of /tf that move and do not carry a frame.
@@ -447,10 +458,16 @@ class Source:
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
 
     def _place_of_sensor(self, t_ns: int, frame: str) -> Pose | None:
-        """Return the pose of the sensor in the fixed frame; None if the clouds stay in their
-        own frame.
-        """
-        return None if self._ground_truth.sensor is None else self._sensor(t_ns, frame)
+        """Return the pose of the sensor in {A}; None if that is the frame of the sensor."""
+        if self._ground_truth.sensor is None:
+            return None if self.options.sensor_m is None else self._sensor_at
+        return self._sensor(t_ns, frame) @ self._sensor_at
+
+    @cached_property
+    def _sensor_at(self) -> Pose:
+        """Return the pose of the sensor in the frame of the clouds."""
+        at = self.options.sensor_m
+        return Pose.identity() if at is None else Pose(geometry.IDENTITY_QUAT, np.array(at))
 
     def _sensor(self, t_ns: int, frame: str) -> Pose:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""

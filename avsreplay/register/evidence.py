@@ -82,7 +82,9 @@ GOES_ON = (
     " larger object"
 )
 CONTRADICTED = "the scan contradicts the pose: "
-TURNED_AWAY = "most points are on faces that face away from the camera"
+ELSEWHERE = "is the sensor at the origin of the clouds? If not, see --sensor-at"
+TURNED_AWAY = f"most points are on faces that face away from the camera; {ELSEWHERE}"
+THROUGH_IT = f"rays that pass through it; {ELSEWHERE}"
 TOO_FEW = f"fewer than {LEAST_RAYS_NEAR} of its points are near the model"
 PLANES = (1.0, 2.0, 3.0, 5.0)  # standard deviations between the classes of points on the model
 
@@ -199,7 +201,7 @@ class Evidence:
             "points beside the model": -self.beside * np.log(CONTRADICTING_PATCHES),
             "surface that is not in the scan, and points off the model": -self.elsewhere
             * np.log(CONTRADICTING_PATCHES),
-            "rays that pass through it": -self.through * np.log(CONTRADICTING_PATCHES),
+            THROUGH_IT: -self.through * np.log(CONTRADICTING_PATCHES),
             GOES_ON: -self.continued * np.log(CONTINUES / 0.5),
             f"distances to the model spread by {self.noise_m:.3g} m": 0.5
             * SHARES

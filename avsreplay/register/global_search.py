@@ -29,6 +29,7 @@ from avsreplay.register.plausibility import NOISE_OF_EXTENT
 from avsreplay.register.poses import Sameness
 from avsreplay.register.sampling import (
     attitudes,
+    line_of_sight,
     sample_evenly,
     scan_axes,
     thin_to,
@@ -180,11 +181,20 @@ class GlobalSearch:
         """
         return self._looked(points, number) + REGISTERED_WORK * min(points, FINE_POINTS)
 
-    def _looked(self, points: int, number: int) -> int:
-        """The cost of a round without that of the poses that are registered to the model."""
+    def _looked(self, points: int, number: int, sights: int = 1) -> int:
+        """The cost of a round without that of the poses that are registered to the model.
+
+        Args:
+            points: of the scan.
+            number: of the round.
+            sights: directions to the camera that are tried in the first round.
+        """
         p = self._params
         few, some = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS))
-        starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
+        starts, stride = (
+            p.starts * (sights, SHIFTS, 7)[number] // THINNED[number],
+            FIRST_STRIDES[number],
+        )
         halved = p.starts // KEPT_AFTER_FIRST * (1 + SECOND_PASSES)
         halved += p.starts // KEPT_AFTER_SECOND * (1 + COARSE_PASSES - SECOND_PASSES)
         looked = few * (starts * (1 + FIRST_PASSES) // stride + halved)
@@ -216,7 +226,6 @@ class GlobalSearch:
             kept: work of it that a later step needs.
         """
         self.most = min(int(REGISTERED_SHARE * left), left - kept)
-        self.spent = self._looked(len(points), number)
         self.registered = LAST_FINE_POINTS // (
             2 if left < SHORT * self.work(len(points), number) else 1
         )
@@ -226,7 +235,8 @@ class GlobalSearch:
             for n in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS)
         )
         sight = self._target.visibility.direction_to_camera(scan)
-        sights, shifts, facing = self._rounds(few, sight)[number]
+        sights, shifts, facing = self._rounds(few, scan, sight)[number]
+        self.spent = self._looked(len(points), number, len(sights))
         starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
@@ -234,18 +244,21 @@ class GlobalSearch:
         return self._verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(
-        self, few: Array, sight: Array | None
+        self, few: Array, scan: Array, sight: Array | None
     ) -> list[tuple[Sequence[Array | None], Array, bool]]:
         """Camera directions, shifts of the scan (k, 3) in {A} [m], and whether the directions can
-        be relied on.
+        be relied on. Where the camera is not known, its direction follows from the normals of the
+        scan, up to the sign.
         """
         none = np.zeros((1, 3))
         axes = np.linalg.svd((few - few.mean(axis=0)) if sight is None else sight[None])[2]
         turn = 2.0 * np.pi * np.arange(SHIFTS)[:, None] / SHIFTS
         u, v = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
         known = self._sided and sight is not None
+        line = line_of_sight(scan) if sight is None else none[0]
+        first = [sight] if sight is not None else [None, line, -line]
         return [
-            ([sight], none, known),
+            (first, none, known),
             ([sight], np.cos(turn) * u + np.sin(turn) * v, known),
             ([sight, *scan_axes(few)], none, False),
         ]

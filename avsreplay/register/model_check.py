@@ -58,7 +58,6 @@ from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import at_instant, diameter, without_scattered_points
 from avsreplay.register.sensor_frame import SensorFrame
-from avsreplay.register.shown import POSTPONED
 from avsreplay.register.size import (
     MOST_OF_MODEL,
     SIZE_SIGMAS,
@@ -187,7 +186,7 @@ class ModelCheck:
         if found.status is AlignStatus.AMBIGUOUS:
             self._ambiguous = self._ambiguous or found.free_directions
             self._several += 1
-        elif found.message != POSTPONED:
+        elif found.status is not AlignStatus.POSTPONED:
             self._several -= 1
 
     def _add_aligned(self, scan: Scan, found: Alignment) -> None:

@@ -100,7 +100,7 @@ class Registrar:
             hopeful, spent = self.loop.screen.confirms(scan, guess)
             work.spend(spent)
             if not hopeful:
-                status = AlignStatus.BUDGET_EXHAUSTED
+                status = AlignStatus.POSTPONED
                 return replace(quality.not_measured(len(scan), status, guess), message=POSTPONED)
         few, halves = self.loop.screen.part(scan), seq % self.params.split_every == 0
         case = Case(Observed(whole), scan, few, work, guess, carried, halves, unknown)
@@ -144,7 +144,7 @@ class Registrar:
             return found
         if effort is not Effort.FULL and (found is None or found.status not in ACCEPTED):
             return replace(
-                quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED
+                quality.not_measured(len(points), AlignStatus.POSTPONED), message=POSTPONED
             )
         return self.loop.without_guess(Case(seen, scan, few, self._work(scan)))
 

@@ -220,7 +220,7 @@ WHOLE = (
     "bench",
     "model",
 )  # commands that replay scans are drawn less often
-CHEAP = 12
+CHEAP = 40
 WITHOUT_OPTION = {case for case in CASES if " " in case[1] or case[1] == "interrupted"}
 
 
