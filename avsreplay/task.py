@@ -70,9 +70,9 @@ class TaskParams(Settings):
     )
     approach: Approach = setting(
         Approach.AXIS,
-        "How the robot comes to the grasp point of a model where [limits] sets no cone: through a"
-        " corridor of 15 deg along the axis, with a clearance of 0.02 of the extent (axis), or as"
-        " if there were no body (free).",
+        "Approach to a model where [limits] sets no cone: through a corridor of 15 deg along"
+        " the axis with a clearance of 0.02 of the extent (axis), or as if there were no body"
+        " (free).",
     )
     position_m: float | None = setting(
         None,

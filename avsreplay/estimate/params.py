@@ -56,9 +56,9 @@ class EstimatorParams(Settings):
 
     method: str = setting(
         OWN,
-        "Estimator: the program's own (own), the filter as printed in the paper (paper), or a"
-        " plug-in by its entry-point name ('avsreplay estimators' lists them), for example a plain"
-        " extended Kalman filter (ekf). A plug-in uses the settings of the start and of R0.",
+        "Estimator: the program's own (own), the filter of the paper (paper), or a plug-in"
+        " ('avsreplay estimators' lists them) such as a plain extended Kalman filter (ekf),"
+        " which uses the settings of the start and of R0.",
     )
     torque_noise_radps15: float | None = setting(
         None,
@@ -149,7 +149,7 @@ class EstimatorParams(Settings):
     )
     correlated_share: float | None = setting(
         None,
-        "Share of a registered pose's variance that is common to scans from nearly the same view. A"
+        "Share of a pose's variance that scans from nearly the same view have in common. A"
         " larger value gives such scans together less weight.",
         low=0.0,
         high=1.0,
@@ -172,9 +172,9 @@ class EstimatorParams(Settings):
     )
     refit_growth: float = setting(
         0.2,
-        "The batch fit is repeated when the number of healthy poses has grown by this share, until"
-        " its likelihood is close to Gaussian. A larger value takes less time and leaves more poses"
-        " to linear updates between two fits.",
+        "The batch fit is repeated when the healthy poses have grown by this share, until its"
+        " likelihood is close to Gaussian. A larger value takes less time and leaves more poses"
+        " to linear updates.",
         low=0.0,
         high=1.0,
     )
@@ -186,23 +186,22 @@ class EstimatorParams(Settings):
     )
     robust: bool = setting(
         True,
-        "Decide about scans with a large innovation by the test of hypotheses, and reduce the"
-        " weight of a healthy pose whose NIS exceeds its 99.99 % point. false switches both off, as"
-        " the paper's start does.",
+        "Test hypotheses about scans with a large innovation, and reduce the weight of a pose"
+        " whose NIS exceeds its 99.99 % point. The paper's start switches both off.",
     )
     bias_s: float = setting(
         20.0,
-        "Time for which poses must have been consistent before a step of the measured pose counts"
-        " as the beginning of a sensor error; an earlier step counts as its end. It is used if the"
-        " residuals of the registration do not distinguish the two.",
+        "Time of consistent poses after which a step of the measured pose counts as the"
+        " beginning of a sensor error, where the residuals of the registration do not show it;"
+        " an earlier step counts as its end.",
         unit="s",
         low=0.0,
     )
     change_probability: float = setting(
         0.02,
-        "Prior probability that rate or velocity of the target changed within the last five"
-        " intervals between scans. With a larger value the published covariance is larger where the"
-        " last scans make a change possible.",
+        "Prior probability that rate or velocity changed within the last five intervals between"
+        " scans. A larger value enlarges the covariance where the last scans make a change"
+        " possible.",
         low=0.0,
         below=1.0,
     )

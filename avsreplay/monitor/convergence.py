@@ -76,9 +76,9 @@ class ConvergenceParams(Settings):
 
     criterion: Criterion = setting(
         Criterion.PREDICTIVE,
-        "Test that decides: the covariance of every block alone, as in the paper (covariance), or"
-        " the 1 sigma of the grasp point predicted for the planned capture and the consistency of"
-        " the innovations (predictive).",
+        "Test that decides: the covariance of every block, as in the paper (covariance), or the"
+        " grasp point predicted for the planned capture and the consistency of the innovations"
+        " (predictive).",
     )
     dwell_s: float = setting(
         2.0,
@@ -88,9 +88,8 @@ class ConvergenceParams(Settings):
     )
     sigmas: float = setting(
         1.0,
-        "With predictive: the 1 sigma of the grasp point, predicted for the planned capture, times"
-        " this must be within the tolerances of the task. A larger value requires a more precise"
-        " estimate.",
+        "With predictive: the predicted 1 sigma of the grasp point times this must be within"
+        " the tolerances of the task. A larger value requires a more precise estimate.",
         above=0.0,
     )
     attitude_deg: float = setting(

@@ -60,9 +60,8 @@ class SupervisorParams(Settings):
     )
     patience_s: float = setting(
         1.5,
-        "Time without a healthy scan after which the approach continues only if the prediction is"
-        " within the tolerances up to the end of the plan. A hold that is not longer ends no"
-        " attempt.",
+        "Time without a healthy scan after which the approach continues only if the prediction"
+        " is within the tolerances. A hold that is not longer ends no attempt.",
         unit="s",
         above=0.0,
     )

@@ -64,9 +64,8 @@ class AcquireParams(Settings):
     )
     margin: float = setting(
         0.01,
-        "The result is ambiguous if the share of the points that a second pose leaves unexplained"
-        " exceeds that of the best pose by less than this. A larger value rejects more poses of"
-        " nearly symmetric targets.",
+        "The result is ambiguous if a second pose leaves less than this share more of the"
+        " points unexplained. A larger value rejects more poses of nearly symmetric targets.",
         low=0.0,
         high=1.0,
     )
@@ -89,9 +88,8 @@ class RegisterParams(Settings):
     )
     gate_m: float | None = setting(
         None,
-        "Largest rejection distance in the last iteration; a point closer to the model than this is"
-        " an inlier. A larger value accepts a less accurate model, but uses more points that are"
-        " not on the target.",
+        "Rejection distance in the last iteration; a point closer to the model is an inlier. A"
+        " larger value accepts a less accurate model and more points beside the target.",
         unit="m",
         above=0.0,
         of_extent=0.01,
