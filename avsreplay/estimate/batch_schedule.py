@@ -55,6 +55,8 @@ FEWEST_TO_CHECK = 50
 CHECK_GROWTH = 0.25
 FEWEST_WITH_OUTLIERS = 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
+_MOST_TURN_RAD = 12.0  # turn between two scans that no estimate has: poses cannot show it
+_LATEST = 5  # poses of which the least interval counts
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 # largest age of a given start over the fit's memory; until then disturbances change it little
 _RECENT = 0.1
@@ -253,6 +255,30 @@ class BatchSchedule:
         if sound and whole_memory and linear:
             return self.adopted(track, result, to_filter=True).changed(window=track.window)
         return track.changed(since=0)
+
+    def resolved(self, track: Track) -> Track:
+        """The track, begun anew from its last poses where it turns faster than poses can show.
+
+        A fit to poses with far larger errors than stated may diverge, and its motion cannot be
+        predicted.
+        """
+        stamps = [fix.t_ns for fix in track.fixes[-_LATEST:]]
+        if len(stamps) < 2:
+            return track
+        turn = float(np.linalg.norm(track.belief.x.w_b)) * float(np.diff(stamps).min()) * 1e-9
+        if turn <= _MOST_TURN_RAD:
+            return track
+        fixes = track.fixes[1 - FEWEST_TO_FIT :]
+        return Track(
+            first_belief(fixes, self.params),
+            "start",
+            R=track.R,
+            fixes=fixes,
+            started_ns=track.started_ns,
+            reinitialised=track.reinitialised + 1,
+            manoeuvres=track.manoeuvres,
+            errors=track.errors,
+        )
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.

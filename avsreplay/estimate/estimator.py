@@ -236,7 +236,8 @@ class Estimator:
             return after, finding
         after = self.anomalies.with_possible_change(after)
         due = after.mode in ("fit", "filter")
-        return self.disturbances.advanced(after, self._robust) if due else after, finding
+        after = self.disturbances.advanced(after, self._robust) if due else after
+        return self.batch.resolved(after), finding
 
     def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is
@@ -414,10 +415,11 @@ class Estimator:
                 change_P=prediction.Phi @ track.change_P @ prediction.Phi.T,
             )
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
-            return self.batch.initialised(track, prediction, innovation, converged, spread)
-        return self.batch.check_against_batch(
-            self.batch.filtered(track, prediction, innovation), spread
-        )
+            after = self.batch.initialised(track, prediction, innovation, converged, spread)
+        else:
+            after = self.batch.filtered(track, prediction, innovation)
+            after = self.batch.check_against_batch(after, spread)
+        return self.batch.resolved(after)
 
     def disturbances_of(self, track: Track) -> tuple[float, float] | None:
         """Root densities of the random torque [rad/s^1.5] and force [m/s^1.5] in use.

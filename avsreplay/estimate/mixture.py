@@ -160,9 +160,10 @@ def carried(
         weight,
     )
     found = misfits.tolist()
-    best = min(found)
+    # one of weight 0 keeps it, however well it explains the pose
+    best = min(value for c, value in zip(components, found, strict=True) if c.weight > 0.0)
     weights = [
-        c.weight * math.exp(0.5 * (best - value))
+        c.weight * math.exp(0.5 * (best - value)) if c.weight > 0.0 else 0.0
         for c, value in zip(components, found, strict=True)
     ]
     total = sum(weights)
