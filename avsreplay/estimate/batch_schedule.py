@@ -55,8 +55,8 @@ FEWEST_TO_CHECK = 50
 CHECK_GROWTH = 0.25
 FEWEST_WITH_OUTLIERS = 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
-_MOST_TURN_RAD = 12.0  # turn between two scans that no estimate has: poses cannot show it
-_LATEST = 5  # poses of which the least interval counts
+_UNSEEN_TURN_RAD = 12.0  # turn between two scans that no estimate has: poses cannot show it
+_LATEST_POSES = 5  # poses of which the least interval counts
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 # largest age of a given start over the fit's memory; until then disturbances change it little
 _RECENT = 0.1
@@ -262,11 +262,11 @@ class BatchSchedule:
         A fit to poses with far larger errors than stated may diverge, and its motion cannot be
         predicted.
         """
-        stamps = [fix.t_ns for fix in track.fixes[-_LATEST:]]
+        stamps = [fix.t_ns for fix in track.fixes[-_LATEST_POSES:]]
         if len(stamps) < 2:
             return track
         turn = float(np.linalg.norm(track.belief.x.w_b)) * float(np.diff(stamps).min()) * 1e-9
-        if turn <= _MOST_TURN_RAD:
+        if turn <= _UNSEEN_TURN_RAD:
             return track
         fixes = track.fixes[1 - FEWEST_TO_FIT :]
         return Track(

@@ -18,9 +18,9 @@ from avsreplay.estimate.events.smoothing import PoseStore, spread, words
 from avsreplay.estimate.initialise import poses_of, weak_prior
 from avsreplay.estimate.params import EstimatorParams
 
-_MOST_KNOTS = 60  # poses of a search: about 1 s of processor time
+_MOST_POSES = 60  # poses of a search: about 1 s of processor time
 _GROWTH = 1.5  # of the healthy poses between two searches
-_FEWEST = 30  # healthy poses of the first search
+_FEWEST_POSES = 30  # healthy poses of the first search
 SURE_LOG_ODDS = 6.0  # of a set of events against another, from which that one is left out
 _MOST_STATED = 3  # sets
 
@@ -47,7 +47,7 @@ class Cause:
             start_ns: instant of the first scan, from which onsets are stated [ns].
         """
         count = len(poses)
-        if not shown or count < max(_FEWEST, _GROWTH * self.searched):
+        if not shown or count < max(_FEWEST_POSES, _GROWTH * self.searched):
             return self
         return Cause(_named(poses, params, start_ns), count)
 
@@ -56,7 +56,7 @@ def _named(store: PoseStore, params: EstimatorParams, start_ns: int) -> str:
     """The most likely set of events and those that are nearly as likely, in words; "" where one of
     them is empty.
     """
-    fixes = store.fixes(spread(len(store), _MOST_KNOTS))
+    fixes = store.fixes(spread(len(store), _MOST_POSES))
     poses = poses_of(tuple(fixes))
     problem = Problem(poses, Body(weak_prior(poses, params).one_sigma, params.correlated_rad))
     try:
