@@ -20,7 +20,7 @@ from avsreplay.estimate.params import EstimatorParams
 
 _MOST_POSES = 60  # poses of a search: about 1 s of processor time
 _GROWTH = 1.5  # of the healthy poses between two searches
-_FEWEST_POSES = 30  # healthy poses of the first search
+_FIRST_SEARCH = 30  # healthy poses of the first search
 SURE_LOG_ODDS = 6.0  # of a set of events against another, from which that one is left out
 _MOST_STATED = 3  # sets
 
@@ -47,7 +47,7 @@ class Cause:
             start_ns: instant of the first scan, from which onsets are stated [ns].
         """
         count = len(poses)
-        if not shown or count < max(_FEWEST_POSES, _GROWTH * self.searched):
+        if not shown or count < max(_FIRST_SEARCH, _GROWTH * self.searched):
             return self
         return Cause(_named(poses, params, start_ns), count)
 
