@@ -37,7 +37,6 @@ from avsreplay.estimate.chart import (
     to_state,
 )
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.grasp_point import noise_about
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import Adaptation, NoiseSource
 from avsreplay.geometry import Array, Pose
@@ -510,15 +509,20 @@ def _measured(
     noise of the log, and no pose where the log had a blackout.
     """
     # The noise is known here, and a fit to the poses of the flight would have none of the log.
-    known = NoiseSource.REGISTRATION, Adaptation.OFF
-    params = replace(setup.estimator.params, noise=known[0], adapt=known[1], audit_poses=0)
+    params = replace(
+        setup.estimator.params,
+        noise=NoiseSource.REGISTRATION,
+        adapt=Adaptation.OFF,
+        audit_poses=0,
+    )
     estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)
     motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
     track, C = estimator.resumed(belief), setup.noise
     if C is None:
-        position, half = np.split(np.diag(estimator.params.resolved(setup.extent_m).R0), 2)
+        position, half = np.split(np.diag(estimator.params.R0), 2)
         C = np.diag(np.concatenate([4.0 * half, position]))
-    root = cholesky_root(C := noise_about(C, setup.task.grasp_c))
+    C = geometry.covariance_about(C, setup.task.grasp_c)
+    root = cholesky_root(C)
     step_ns = int(np.median(np.diff(log.stamps))) if len(log.stamps) > 1 else 100_000_000
     offset = int(rng.integers(len(log.gammas)))
     last_ns = round(setup.guidance.params.horizon_s * 2e9)

@@ -43,6 +43,29 @@ IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
 _CONJUGATE = frozen([-1.0, -1.0, -1.0, 1.0])
 
 
+def about(point: Array) -> Array:
+    """Return the matrix (6, 6) that takes a small motion d = [theta; v] of a frame to that of a
+    point which the frame carries: v + theta x point.
+
+    Args:
+        point: (3,) in the frame [m].
+    """
+    J = np.eye(6)
+    J[3:, :3] -= skew(point)
+    return J
+
+
+def covariance_about(C: Array, point: Array) -> Array:
+    """Return the covariance of d = [theta; v] about a point that the frame carries.
+
+    Args:
+        C: (6, 6) covariance of d about the origin of the frame [rad, m].
+        point: (3,) in the frame [m].
+    """
+    J = about(point)
+    return np.asarray(J @ C @ J.T)
+
+
 def skew(v: ArrayLike) -> Array:
     """Return the matrix [v x] with ``skew(v) @ u == cross(v, u)``.
 

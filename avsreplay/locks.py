@@ -64,6 +64,17 @@ def check_alone(part: Path, place: Path) -> None:
             os.close(held)
 
 
+def in_place(stream: BinaryIO, path: Path) -> bool:
+    """Return whether an open file is still the one at a path: another process may have renamed or
+    removed it before this one had the lock.
+
+    Args:
+        stream: the open file.
+        path: under which it was opened.
+    """
+    return path.exists() and os.path.samestat(path.stat(), os.fstat(stream.fileno()))
+
+
 def _output_of(part: Path) -> str:
     """The name of the output, with a leading dot, to which a temporary name belongs."""
     return part.name.rsplit(".", 3)[0]
@@ -89,7 +100,7 @@ def open_alone(path: Path) -> BinaryIO:
             raise UsageError("another process is writing it", where=str(path), hint=_WAIT) from None
         except OSError:
             pass  # a file system that cannot lock files
-        if path.exists() and os.fstat(stream.fileno()).st_ino == path.stat().st_ino:
+        if in_place(stream, path):
             stream.seek(0)
             stream.truncate()
             return stream

@@ -25,6 +25,9 @@ from avsreplay.records import (
     Verdict,
 )
 
+# log odds of a set of events from which it is stated, and behind it from which a rival is left out
+SURE_EVENT_LOG_ODDS = 6.0
+
 
 class PlanStatus(Enum):
     """Result of the planner."""

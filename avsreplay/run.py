@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from avsreplay import arithmetic, pipeline, settings
+from avsreplay import arithmetic, geometry, pipeline, settings
 from avsreplay.assess import FlightLog, Setup, assess
 from avsreplay.assessment import Assessment
 from avsreplay.build import first_state, grasp_advice, stages, task_and_target
@@ -22,7 +22,7 @@ from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.events.naming import Cause
-from avsreplay.estimate.grasp_point import at_grasp, noise_about
+from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.measurement import in_fixture
 from avsreplay.geometry import Array, Pose
 from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
@@ -417,8 +417,9 @@ class Run:
         if outcome.innovation is None or outcome.alignment is None:
             return None
         C = in_fixture(outcome.innovation.R, outcome.alignment.T_ac.q, outcome.belief.x.q_bc)
-        own = isinstance(self.estimator, Estimator)
-        return noise_about(C, np.array(self.estimator.frame.origin_c)) if own else C
+        if not isinstance(self.estimator, Estimator):
+            return C
+        return geometry.covariance_about(C, np.array(self.estimator.frame.origin_c))
 
     def _predictor(self) -> Estimator:
         """The estimator that predicts targets from a belief; a plug-in only predicts its own."""

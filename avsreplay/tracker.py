@@ -269,8 +269,7 @@ class Tracker:
         turn, move = before.turn.least_error, before.move.least_error
         if turn == move == 1.0:
             return found
-        about = np.eye(6)  # the factor on the position is that of the middle
-        about[3:, :3] = -geometry.skew(self.middle)
+        about = geometry.about(self.middle)  # the factor on the position is that of the middle
         scale = np.repeat([turn, move], 3)
         D = np.linalg.solve(about, scale[:, None] * about)
         back = np.linalg.solve(about, about / scale[:, None])

@@ -16,9 +16,9 @@ from avsreplay.assessment import Assessment, Chance, InFact, chance_of
 from avsreplay.build import target_geometry
 from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.estimator import Estimator
-from avsreplay.estimate.grasp_point import at_grasp, noise_about
+from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.geometry import exp, matrix
+from avsreplay.geometry import covariance_about, exp, matrix
 from avsreplay.log import SourceOptions
 from avsreplay.outcome import CaptureError
 from avsreplay.pipeline import planner_input
@@ -257,9 +257,9 @@ def test_the_noise_about_another_point_is_that_of_the_point_that_a_pose_carries(
     A = 1e-4 * rng.normal(size=(6, 6))
     d = rng.normal(size=(20000, 6)) @ A.T
     moved = d[:, 3:] + np.cross(d[:, :3], point)
-    found = noise_about(A @ A.T, point)
+    found = covariance_about(A @ A.T, point)
     assert np.abs(np.cov(moved.T) - found[3:, 3:]).max() < 0.05 * np.abs(found).max()
-    assert noise_about(found, -point) == pytest.approx(A @ A.T)
+    assert covariance_about(found, -point) == pytest.approx(A @ A.T)
 
 
 def test_a_log_that_ends_blind_at_its_first_plan_is_assessed():

@@ -528,7 +528,7 @@ def collect(
 
 
 def _changed(run: Run) -> list[str]:
-    """The settings that differ from their defaults; one that the user has not given says so."""
+    """The settings that differ from their defaults, each marked if the user has not given it."""
     from avsreplay.config import load_config
     from avsreplay.report.compare import changed_settings
 

@@ -58,12 +58,10 @@ class EstimatorFrame:
     _out: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        lower = np.zeros((6, 6))
-        lower[3:, :3] = -geometry.skew(self.centre_c)
         object.__setattr__(self, "shifted", bool(self.centre_c.any()))
         object.__setattr__(self, "falls", bool(self.acceleration.any()))
-        object.__setattr__(self, "_into", frozen(np.eye(6) + lower, 6, 6))
-        object.__setattr__(self, "_out", frozen(np.eye(6) - lower, 6, 6))
+        object.__setattr__(self, "_into", frozen(geometry.about(self.centre_c), 6, 6))
+        object.__setattr__(self, "_out", frozen(geometry.about(-self.centre_c), 6, 6))
 
     @property
     def origin_c(self) -> tuple[float, float, float]:

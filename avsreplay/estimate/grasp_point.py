@@ -1,4 +1,4 @@
-"""A belief, or the noise of a pose, about another point of the target than the origin of {C}."""
+"""A belief about another point of the target than the origin of {C}."""
 
 from __future__ import annotations
 
@@ -31,15 +31,3 @@ def at_grasp(belief: Belief, grasp_c: Array) -> Belief:
     if isinstance(belief, DrivenBelief):
         return replace(belief, x=x, P=P, cross=J @ belief.cross)
     return replace(belief, x=x, P=P)
-
-
-def noise_about(C: Array, point_c: Array) -> Array:
-    """Return the covariance of the error of a measured pose about another point.
-
-    Args:
-        C: (6, 6) covariance of d = [theta; v] about the origin of {C} [rad, m].
-        point_c: (3,) the point in {C} [m].
-    """
-    J = np.eye(6)
-    J[3:, :3] = -geometry.skew(point_c)  # v + theta x point
-    return np.asarray(J @ C @ J.T)

@@ -486,12 +486,8 @@ class Source:
         """
         options, C = self.options, found.covariance
         offset = np.zeros(3) if options.grasp is None else np.array(options.grasp)
-        if (
-            C is not None and options.grasp is not None
-        ):  # covariance at the new origin: v' = v + theta x offset
-            J = np.eye(6)
-            J[3:, :3] = -geometry.skew(offset)
-            C = J @ C @ J.T
+        if C is not None and options.grasp is not None:
+            C = geometry.covariance_about(C, offset)
         if options.pose_sigma is not None:
             sigma = math.radians(options.pose_sigma[1]), 1e-3 * options.pose_sigma[0]
             C = np.diag(np.repeat(sigma, 3) ** 2)

@@ -51,8 +51,7 @@ class Directions:
         """
         info, radius = scaled_information(total, count, centre)
         values, vectors = np.linalg.eigh(info)
-        to_x = np.eye(6)
-        to_x[3:, :3] = -geometry.skew(centre)  # the inverse of d = shift x in scaled_information
+        to_x = geometry.about(centre)  # the inverse of d = shift x in scaled_information
         to_x[:3] *= radius
         free = values < FREE_BELOW
         level = count * float(values[~free].mean())

@@ -39,8 +39,8 @@ SCATTERED = 2.0
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 BIMODAL = 2.5
-NORMAL_POINTS = 1500  # of a scan, whose normals show the line of sight
-NORMAL_NEIGHBOURS = 12  # points of a scan to which the plane at one of them is fitted
+SIGHT_POINTS = 1500  # of a scan, whose normals show the line of sight
+SIGHT_NEIGHBOURS = 12  # points of a scan to which the plane at one of them is fitted
 # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
 PARTIAL_OF_EXTENT = 0.85
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
@@ -239,11 +239,11 @@ def line_of_sight(points: Array) -> Array:
     Rays of even density hit a face in proportion to the cosine between its normal and the direction
     to the sensor, so that the mean square of this cosine is large.
     """
-    points = np.ascontiguousarray(points[:: max(1, len(points) // NORMAL_POINTS)], dtype=np.float64)
-    if len(points) <= NORMAL_NEIGHBOURS:
+    points = np.ascontiguousarray(points[:: max(1, len(points) // SIGHT_POINTS)], dtype=np.float64)
+    if len(points) <= SIGHT_NEIGHBOURS:
         return scan_axes(points)[0]
     tree = kernel_module().PointTree(points)
-    normals = tree.planes(points, points, points, points, NORMAL_NEIGHBOURS)[0]
+    normals = tree.planes(points, points, points, points, SIGHT_NEIGHBOURS)[0]
     return np.asarray(np.linalg.eigh(normals.T @ normals)[1][:, -1])
 
 
@@ -394,7 +394,7 @@ class Rays:
     """
 
     def __init__(self, points: Array) -> None:
-        """Leave out the points without a direction."""
+        """Take the points that have a direction; one at the sensor has none."""
         ranges = np.linalg.norm(points, axis=1)
         known = np.isfinite(ranges) & (ranges > 0.0)
         self.points: Array = points if (every := bool(known.all())) else points[known]

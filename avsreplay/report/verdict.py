@@ -16,6 +16,7 @@ import numpy as np
 
 from avsreplay.assessment import Assessment
 from avsreplay.errors import value_class
+from avsreplay.outcome import SURE_EVENT_LOG_ODDS
 from avsreplay.report.moments import Moment, median_of, plain, worst_moments
 from avsreplay.report.pose_checks import error_over_sigma
 from avsreplay.report.summary import Summary
@@ -52,7 +53,6 @@ LEAST_GROWN_DEG = 0.25
 # spread of the errors of the used scans (5 to 95 %) over their median below which they are the same
 SAME_ERROR_SPREAD = 0.2
 ALIASED_SHARE = 0.1  # share of the scans whose poses two angular rates explain
-SURE_EVENT_LOG_ODDS = 6.0  # of an event of the whole log from which it is stated
 FIT_CHECK_OF_EXTENT = 0.02  # median rms distance of the inliers over the model's extent
 
 
@@ -241,7 +241,7 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
 
 
 def _graded(size: float, check: float, fail: float) -> Grade | None:
-    """The grade of a size by its two limits; None where it is within both."""
+    """FAIL or CHECK of a size that exceeds the limit of that grade; None where it exceeds none."""
     if size <= check:
         return None
     return Grade.FAIL if size > fail else Grade.CHECK
@@ -412,10 +412,15 @@ def _motion(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any]) ->
         yield Concern(Grade.CHECK, text)
 
 
-def _sure_events(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def _by_all_poses(header: Mapping[str, Any], name: str) -> Sequence[Any]:
+    """A list of the record of the smoothing pass; empty where there is none."""
     record = header.get("smoothed")
-    found = record.get("events") if isinstance(record, Mapping) else None
-    for event in found if isinstance(found, list) else ():
+    found = record.get(name) if isinstance(record, Mapping) else None
+    return found if isinstance(found, list) else ()
+
+
+def _sure_events(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    for event in _by_all_poses(header, "events"):
         if isinstance(event, dict) and (event.get("log_odds") or 0.0) >= SURE_EVENT_LOG_ODDS:
             yield event
 
@@ -424,11 +429,9 @@ def _rivals(header: Mapping[str, Any], kinds: set[str]) -> list[list[str]]:
     """Kinds of the sets of events that are nearly as likely as the one stated, without those that
     only add to it.
     """
-    record = header.get("smoothed")
-    rivals = record.get("rivals") if isinstance(record, Mapping) else None
     return [
         names
-        for rival in (rivals if isinstance(rivals, list) else ())
+        for rival in _by_all_poses(header, "rivals")
         if (rival.get("log_odds") or 0.0) > -SURE_EVENT_LOG_ODDS
         and (names := rival.get("events") or [])
         and not kinds <= set(names)

@@ -190,7 +190,7 @@ class Identified(Protocol):
 
     @property
     def id(self) -> str:
-        """The id of its result."""
+        """Name of the run in the results."""
 
 
 T = TypeVar("T", bound=Identified)

@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import kept_if_used, output_path
+from avsreplay.locks import in_place
 from avsreplay.result_dir import OWN_FILES
 from avsreplay.sweep.campaign import SCAN_COLUMNS, RunResult
 
@@ -364,8 +365,8 @@ def _locked(path: Path) -> BinaryIO:
     stream = path.open("a+b")
     try:
         _lock(stream)
-        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(stream.fileno())):
-            stream.close()  # the other process has removed it since it was opened
+        if not in_place(stream, path):
+            stream.close()
             return _locked(path)
     except OSError:
         stream.seek(0)

@@ -17,11 +17,11 @@ from avsreplay.estimate.events.search import described, first_fit, search, total
 from avsreplay.estimate.events.smoothing import PoseStore, spread, words
 from avsreplay.estimate.initialise import poses_of, weak_prior
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.outcome import SURE_EVENT_LOG_ODDS
 
 _MOST_POSES = 60  # poses of a search: about 1 s of processor time
 _GROWTH = 1.5  # of the healthy poses between two searches
 _FIRST_SEARCH = 30  # healthy poses of the first search
-SURE_LOG_ODDS = 6.0  # of a set of events against another, from which that one is left out
 _MOST_STATED = 3  # sets
 
 
@@ -63,7 +63,7 @@ def _named(store: PoseStore, params: EstimatorParams, start_ns: int) -> str:
         sets = search(problem, first_fit(problem))
     except ArithmeticError:  # no motion of a rigid body explains the poses
         return ""
-    least = total(problem, sets[0]) - SURE_LOG_ODDS
+    least = total(problem, sets[0]) - SURE_EVENT_LOG_ODDS
     kinds: dict[tuple[str, ...], Fit] = {}
     for fit in sets:
         if total(problem, fit) > least:
