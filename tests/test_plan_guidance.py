@@ -124,16 +124,18 @@ def test_limits_hold_in_every_plan_of_a_flight():
     assert constrained > 3
 
 
+def exactly(target, t, gamma=1, one_sigma=1e-5):
+    """Input of guidance at a time [s] with the true target and a small predicted 1 sigma."""
+    forecast = lambda dt: Forecast(dt, *(one_sigma * np.ones((3, len(dt)))))  # noqa: E731
+    return PlannerInput(round(t * 1e9), gamma, True, target.after(t), forecast)
+
+
 @pytest.mark.parametrize("accel", [0.002, 0.05])
 def test_the_gripper_has_the_attitude_of_the_fixture_at_the_capture(accel):
     rng = np.random.default_rng(3)
     target, start = scene(rng), exp(np.array([1.5, -1.0, 0.4]))
     guidance = Guidance(ROBOT, Supervisor(PARAMS), gripper=(start, accel))
-    exact = lambda dt: Forecast(dt, *(1e-4 * np.ones((3, len(dt)))))  # noqa: E731
-    known = (
-        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
-        for t in np.arange(0.0, 120.0, 0.5)
-    )
+    known = (exactly(target, t, one_sigma=1e-4) for t in np.arange(0.0, 120.0, 0.5))
     attitudes, state = [], None
     for each, state in guidance.fly(known):
         turn = state.segment.turn
@@ -156,11 +158,7 @@ def loop(noise_mps2, seed=0, latency_s=0.0):
     """Result of one flight with an exact estimate and errors of the thrust."""
     rng = np.random.default_rng(seed)
     target = scene(rng)
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = (
-        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
-        for t in np.arange(0.4, 120.0, 0.2)
-    )
+    known = (exactly(target, t) for t in np.arange(0.4, 120.0, 0.2))
     guidance = Guidance(replace(ROBOT, latency_s=latency_s), Supervisor(PARAMS))
     return closed_loop(guidance, known, target, 0, noise_mps2, rng).outcome(Tolerance(0.02, 0.01))
 
@@ -183,11 +181,7 @@ def pin(y):
 @pytest.mark.slow
 def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flight_touches():
     target = scene(np.random.default_rng(2))
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = [
-        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
-        for t in np.arange(0.0, 60.0, 0.2)
-    ]
+    known = [exactly(target, t) for t in np.arange(0.0, 60.0, 0.2)]
     guidance = Guidance(ROBOT, Supervisor(PARAMS), Limits(final_deg=12.0).resolved(8.0))
     grip = Contact(pin, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
     whole = closed_loop(guidance, known, target, 0, contact=grip)
@@ -254,7 +248,6 @@ def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_it
 ):
     target, planned, state = scene(np.random.default_rng(3)), [], None
     guidance = Guidance(ROBOT, Supervisor(PARAMS))
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
     for t in np.arange(0.0, 12.0, 0.5):
         t_ns = round(t * 1e9)
         state = state or guidance.initial(t_ns)
@@ -262,7 +255,7 @@ def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_it
             state = replace(
                 state, segment=pushed(state.segment, t_ns, np.array([off_m, 0.0, 0.0]), np.zeros(3))
             )
-        state = guidance.step(state, PlannerInput(t_ns, int(t < 4.0), True, target.after(t), exact))
+        state = guidance.step(state, exactly(target, t, int(t < 4.0)))
         planned += [state.plan.t_ns * 1e-9] if t > 4.0 else []
     assert state.decision.action is Action.APPROACH_ON_PREDICTION
     assert sorted(set(planned)) == made_s
@@ -277,8 +270,7 @@ def test_a_robot_that_begins_inside_a_limit_returns_from_it_and_is_not_withdrawn
     where = CENTRE + np.array([0.0, 0.0, -1.4])
     start = replace(ROBOT, robot_position_m=tuple(where.tolist()))
     guidance = Guidance(start, Supervisor(PARAMS), limits)
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = [PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in (0.0, 0.5)]
+    known = [exactly(target, t) for t in (0.0, 0.5)]
     states = [state for _, state in guidance.fly(known)]
     assert margin(target, limits, where, np.zeros(3)) < -0.05
     assert states[0].plan.violation_m == pytest.approx(0.1, abs=1e-6)
@@ -304,8 +296,7 @@ def test_a_capture_that_an_arm_delayed_is_tried_again_at_the_instant_of_the_earl
 
     wait_s, target, arm = 0.3, scene(np.random.default_rng(3)), Slow()
     guidance = Guidance(replace(ROBOT, latency_s=wait_s), Supervisor(PARAMS), arm=arm)
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = [PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in (0.0, 1.5, 3.0)]
+    known = [exactly(target, t) for t in (0.0, 1.5, 3.0)]
     ends = [state.segment.end_ns * 1e-9 for _, state in guidance.fly(known)]
     assert ends == pytest.approx([30.3] * 3, abs=1e-6)
     assert arm.hints == pytest.approx([0.0, 30.0 - 1.5, 30.0 - 3.0], abs=1e-6)
@@ -331,11 +322,7 @@ def test_the_path_about_the_target_is_that_of_both_motions():
 @pytest.mark.slow
 def test_errors_of_the_thrust_belong_to_the_generator_of_the_flight():
     target = scene(np.random.default_rng(1))
-    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
-    known = [
-        PlannerInput(round(t * 1e9), 1, True, target.after(t), exact)
-        for t in np.arange(0.5, 40.0, 1.0)
-    ]
+    known = [exactly(target, t) for t in np.arange(0.5, 40.0, 1.0)]
     guidance = Guidance(ROBOT, Supervisor(PARAMS))
 
     def missed_m(seed, noise_mps2=0.01):

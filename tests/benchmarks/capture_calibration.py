@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
-import time
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+from finished_runs import continued
 
 from avsreplay import geometry
 from avsreplay.assess import FlightLog, Setup, assess
@@ -282,15 +282,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=12)
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
-    text = given.file.read_text() if given.file.exists() else ""
-    rows = [json.loads(line) for line in text.splitlines()]
-    done, until = {row["seed"] for row in rows}, time.monotonic() + given.seconds
-    for seed in range(given.count):
-        if seed in done or time.monotonic() > until or given.figure:
-            continue
-        rows.append(flown(seed, given.flights))
-        with given.file.open("a") as stream:
-            stream.write(json.dumps(rows[-1]) + "\n")
+    seeds = range(0 if given.figure else given.count)
+    fly = lambda seed: [flown(seed, given.flights)]  # noqa: E731
+    rows = continued(given.file, seeds, itemgetter("seed"), fly, given.seconds)
     report(rows)
     if given.figure:
         figure(rows, given.figure)

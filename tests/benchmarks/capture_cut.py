@@ -12,11 +12,12 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 from capture_scenarios import command, written
+from finished_runs import continued
 
 BEFORE_S = (0.3, 0.8, 1.5, 3.0, 6.0, 12.0)  # ends of the parts before the end of the flight
 
@@ -71,17 +72,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1200.0)
     given = parser.parse_args()
-    text = given.file.read_text() if given.file.exists() else ""
-    rows = [json.loads(line) for line in text.splitlines()]
-    done, until = {(row["k"], row["seed"]) for row in rows}, time.monotonic() + given.seconds
-    for k in range(given.count):
-        if (k, given.seed) in done or time.monotonic() > until:
-            continue
-        more = made(k, given.seed)
-        rows += more
-        with given.file.open("a") as stream:
-            stream.writelines(json.dumps(row) + "\n" for row in more)
-    report(rows)
+    keys = [(k, given.seed) for k in range(given.count)]
+    key_of = itemgetter("k", "seed")
+    report(continued(given.file, keys, key_of, lambda key: made(*key), given.seconds))
 
 
 if __name__ == "__main__":

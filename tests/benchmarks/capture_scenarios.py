@@ -15,10 +15,11 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+from finished_runs import continued
 
 SCENARIO = """name = "attitude-{k}"
 seed = {k}
@@ -94,15 +95,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=600.0)
     given = parser.parse_args()
-    text = given.file.read_text() if given.file.exists() else ""
-    rows = [json.loads(line) for line in text.splitlines()]
-    done, until = {(row["k"], row["seed"]) for row in rows}, time.monotonic() + given.seconds
-    for k in range(given.count):
-        if (k, given.seed) in done or time.monotonic() > until:
-            continue
-        rows.append(made(k, given.seed))
-        with given.file.open("a") as stream:
-            stream.write(json.dumps(rows[-1]) + "\n")
+    keys = [(k, given.seed) for k in range(given.count)]
+    key_of = itemgetter("k", "seed")
+    rows = continued(given.file, keys, key_of, lambda key: [made(*key)], given.seconds)
     print("| scenario | what it has | sentence | what happened |\n|---|---|---|---|")
     for row in rows:
         sentence, _, happened = row["sentence"].partition("; in fact ")
