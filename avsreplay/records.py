@@ -80,9 +80,6 @@ class AlignStatus(Enum):
     AMBIGUOUS = "ambiguous"  # global search: a second pose fits as well
     FAILED = "failed"  # the back end raised an error or its pose is not finite
     IMPLAUSIBLE = "implausible"  # the scan contradicts the pose (register.plausibility)
-    BUDGET_EXHAUSTED = (
-        "budget_exhausted"  # implausible, and the work allowed for one scan was spent
-    )
     POSTPONED = "postponed"  # not searched, because a search of a scan like it found no pose
 
 
@@ -347,7 +344,6 @@ class Fit:
         iterations: number of iterations.
         converged: whether the back end itself reports convergence.
         matches: correspondences of an ``IcpResult``, or None.
-        work: number of point searches, 0 if unknown.
         rough: whether only a part of the scan was used.
     """
 
@@ -355,7 +351,6 @@ class Fit:
     iterations: int
     converged: bool
     matches: Any = None
-    work: int = 0
     rough: bool = False
 
 

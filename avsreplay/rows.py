@@ -358,9 +358,6 @@ _STATUS_WORDS = {
         "that is not finite."
     ),
     "implausible": "The scan contradicts the pose.",
-    "budget_exhausted": (
-        "The pose is implausible or none was found, and the work allowed for the scan was spent."
-    ),
     "postponed": (
         "Until a first pose is found, a scan that shows the same as one searched in vain is not"
         " searched."

@@ -19,7 +19,6 @@ from avsreplay.register.generators.displaced import cube_rotations
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
 from avsreplay.register.symmetry import near_symmetries
-from avsreplay.register.work import HEALTHY_SCANS, Work, healthy_work
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import scenes
@@ -167,39 +166,3 @@ def test_the_rotations_of_a_cube_are_a_group() -> None:
     products = np.einsum("aij,bjk->abik", turns, turns).reshape(-1, 9)
     assert len(np.unique(np.round(products), axis=0)) == len(turns) == 24
     np.testing.assert_allclose(np.linalg.det(turns), 1.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "scene", "seed"),
-    [
-        ("chair:332", "30 % visible, 3 deg", 36629310),
-        ("lander:332", "random object, search", 50629352),
-        ("mug:322", "outliers 60 %, 3 deg", 40550132),
-        ("lander:312", "outliers 60 %, search", 50470872),
-        ("grid:51", "30 % visible, search", 2300),
-    ],
-)
-def test_comparing_poses_stays_within_the_budget(
-    name: str, scene: str, seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where displaced starts take several times their usual work, and where the turns of a
-    body are many.
-    """
-    spent, spend = [0], Work.spend
-
-    def counted(self: Work, searches: int) -> None:
-        spent[0] += searches
-        spend(self, searches)
-
-    monkeypatch.setattr(Work, "spend", counted)
-    surface = scenes.meshes([name])[name]
-    registrar, case = Registrar(surface), scenes.SCENES[scene](surface, 2000, seed)
-    found = (
-        registrar.acquire(case.points)
-        if case.guess is None
-        else registrar.register(case.points, case.guess)
-    )
-    assert (
-        0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(case.points), registrar.target.near_work)
-    )
-    assert found.status is not AlignStatus.FAILED

@@ -17,7 +17,6 @@ from avsreplay.register.generators.weak_directions import WeakDirections
 from avsreplay.register.hypotheses import Candidate, Case
 from avsreplay.register.poses import SAME_OF_EXTENT, Sameness
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.work import Work
 
 
 def _pose(rng: np.random.Generator, degrees: float, shift_m: float) -> Pose:
@@ -99,7 +98,7 @@ def test_a_part_of_the_target_is_compared_where_its_pose_left_the_guess(
     away = np.array([0.0, shift_of_gate * registrar.limits.gate_m, 0.0])
     guess = T_ac @ Pose(q, middle - geometry.matrix(q) @ middle + away)
     found = replace(registrar.register(scan, T_ac), T_ac=T_ac, status=AlignStatus.ALIGNED)
-    case = Case(Observed(scan), scan, scan, Work(10**6), guess)
+    case = Case(Observed(scan), scan, scan, guess)
     case.current = Candidate(found)
     loop = registrar.loop
     generator = WeakDirections(registrar.target, loop.test, loop.screen, loop.poses)

@@ -17,7 +17,6 @@ from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.shown import Effort, effort_for, shown
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.visibility import Visibility
-from avsreplay.register.work import HEALTHY_SCANS, Work, healthy_work
 
 SEED = 7
 
@@ -93,66 +92,6 @@ def test_what_is_called_aligned_is_right(
         found = registrar.register(scan, T_ac @ Pose(turn, np.zeros(3)))
         right = np.degrees(geometry.angle((T_ac.inverse() @ found.T_ac).q)) < 0.5
         assert right or found.status is not AlignStatus.ALIGNED
-
-
-def test_the_budget_counts_work() -> None:
-    budget = Work(20_000)
-    budget.spend(budget.left - 500)
-    assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
-    assert budget.allows(500)
-    assert not budget.exhausted
-    assert not budget.allows(501)
-    assert budget.exhausted
-
-
-@pytest.mark.parametrize("guessed", [True, False])
-@pytest.mark.parametrize("scene", ["clutter", "outliers", "another body", "plane"])
-def test_no_scan_costs_more_than_twenty_ordinary_registrations(
-    registrar: Registrar,
-    surface: Surface,
-    monkeypatch: pytest.MonkeyPatch,
-    scene: str,
-    guessed: bool,
-) -> None:
-    """Of the last step, too: it is counted how much each scan takes in all, whatever its
-    result is.
-    """
-    spent, spend, rng, T_ac = [0], Work.spend, np.random.default_rng(SEED), example_pose()
-
-    def counted(self: Work, searches: int) -> None:
-        spent[0] += searches
-        spend(self, searches)
-
-    monkeypatch.setattr(Work, "spend", counted)
-    scan, middle = hidden_view(surface, T_ac, 2500, rng), T_ac.t
-    if scene == "outliers":
-        scan[rng.random(len(scan)) < 0.6] += rng.uniform(-2.0, 2.0, 3)
-    elif scene != "clutter":
-        flat = 0.0 if scene == "plane" else 1.0
-        scan = middle + rng.uniform(-1.5, 1.5, (2500, 3)) * [1.0, 1.0, flat]
-    else:
-        scan = np.vstack([scan, middle + rng.uniform(-2.0, 2.0, (2500, 3)) * [1.0, 0.05, 1.0]])
-    turned = T_ac @ Pose(exp([0.5, 0.3, -0.4]), np.array([0.1, 0.0, 0.05]))
-    registrar.register(scan, turned) if guessed else registrar.acquire(scan)
-    assert 0 < spent[0] <= HEALTHY_SCANS * healthy_work(len(scan), registrar.target.near_work)
-
-
-def test_an_ordinary_registration_costs_about_what_is_assumed(
-    registrar: Registrar, surface: Surface, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spent, spend, T_ac = [0], Work.spend, example_pose()
-
-    def counted(self: Work, searches: int) -> None:
-        spent[0] += searches
-        spend(self, searches)
-
-    monkeypatch.setattr(Work, "spend", counted)
-    scan = hidden_view(surface, T_ac, 3000, np.random.default_rng(SEED))
-    found = registrar.register(
-        scan, T_ac @ Pose(exp([0.02, 0.0, 0.03]), np.array([0.02, 0.0, 0.0]))
-    )
-    assert found.status is AlignStatus.ALIGNED
-    assert 0.8 < spent[0] / healthy_work(len(scan), registrar.target.near_work) < 2.0
 
 
 def _searched(scans: list[Array]) -> list[int]:

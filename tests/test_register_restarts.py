@@ -14,7 +14,7 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import loop, quality
+from avsreplay.register import quality
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.generators.weak_directions import WeakDirections
 from avsreplay.register.global_search import GlobalSearch
@@ -22,7 +22,6 @@ from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.screening import Screen
 from avsreplay.register.shown import Effort
-from avsreplay.register.valley import along_valley
 from avsreplay.simulate.scenario import scenario_of
 from avsreplay.simulate.simulation import simulate
 from avsreplay.simulate.target import builtin_surface
@@ -74,22 +73,6 @@ def test_a_close_guess_is_registered_once(scans, monkeypatch):
     for scan in scans:
         registrar.register(scan.points, scan.truth)
     assert len(calls) == len(scans)
-
-
-def test_a_scan_of_scattered_points_costs_few_restarts():
-    """A few stray returns are worth at most eight restarts: a result equal to the guess is
-    not a second start.
-    """
-    registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
-    screen = registrar.loop.screen
-    calls, graduated = [], screen.graduated
-    screen.graduated = lambda *args: calls.append(args[1]) or graduated(*args)
-    stray = rng.uniform([-3.0, -3.0, 2.0], [3.0, 3.0, 8.0], (120, 3))
-    found = registrar.register(stray, Pose.identity() @ Pose([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 5.0]))
-    assert not found.measured
-    assert 0 < len(calls) <= 8
-    poses = {np.round(pose.matrix, 6).tobytes() for pose in calls}
-    assert len(poses) >= len(calls) - 1  # the guess begins narrow and wide
 
 
 def seen(surface: Surface, T_ac: Pose, noise: float, rng: np.random.Generator) -> Array:
@@ -152,7 +135,7 @@ def test_a_part_of_a_scan_with_noise_shows_that_its_first_fit_is_not_close(noise
     assert whole.converged
     assert found.converged is not rough
     assert (found.T_ca.matrix.tobytes() == whole.T_ca.matrix.tobytes()) is not rough
-    assert rough is (found.work < 0.5 * whole.work)
+    assert found.rough is rough
     assert registrar.register(scan, guess.inverse()).status is AlignStatus.ALIGNED
 
 
@@ -225,42 +208,10 @@ def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() 
     error = found.T_ac.inverse() @ guess
     d = np.concatenate([geometry.log(error.q), error.t])
     sure = replace(found, covariance=1e-4 * found.covariance)
-    wider = registrar.loop.decision.consistent(scan, guess, sure)[0].covariance
+    wider = registrar.loop.decision.consistent(scan, guess, sure).covariance
     assert d @ np.linalg.solve(sure.covariance, d) > 100.0 * d @ np.linalg.solve(wider, d)
     assert np.all(np.linalg.eigvalsh(wider - sure.covariance) > -1e-12)
-    assert registrar.loop.decision.consistent(scan, T_ac @ T_ac, sure)[0] is sure
-
-
-def test_a_pose_beside_the_truth_is_left_along_the_valley():
-    """A stage with one fin, turned about its axis: the cost is nearly flat there and has its
-    minimum at the truth.
-    """
-    angle = 2.0 * np.pi * np.arange(48) / 48.0
-    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(48)])
-    up = np.array([0.0, 0.0, 2.0])
-    ends = [rim - up, rim + up, -up[None], up[None]]
-    k, after = np.arange(48), (np.arange(48) + 1) % 48
-    sides = [np.column_stack(f) for f in ((k, after, after + 48), (k, after + 48, k + 48))]
-    caps = [
-        np.column_stack(f)
-        for f in ((after, k, np.full(48, 96)), (k + 48, after + 48, np.full(48, 97)))
-    ]
-    fin = boxes()
-    low, high = fin.vertices[:8].min(axis=0), fin.vertices[:8].max(axis=0)
-    corners = (fin.vertices[:8] - low) / (high - low) * [0.4, 0.1, 0.6] + [-1.2, -0.05, -0.3]
-    faces = fin.faces[(fin.faces < 8).all(axis=1)]
-    surface = Surface(
-        np.vstack([*ends, corners]),
-        np.vstack([*sides, *caps, faces + 98]).astype(np.int32),
-        "stage with a fin",
-        "",
-    )
-    T_ac = Pose(geometry.exp([0.0, -np.pi / 3, 0.0]), np.array([0.0, 0.0, 12.0]))
-    registrar = Registrar(surface)
-    scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
-    turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
-    moved = along_valley(registrar.target, registrar.loop.screen, scan, turned.inverse())[0]
-    assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
+    assert registrar.loop.decision.consistent(scan, T_ac @ T_ac, sure) is sure
 
 
 @pytest.mark.parametrize(
@@ -295,16 +246,6 @@ def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(
     alone = registrar.register(part, guess)
     assert alone.inlier_ratio > 0.95, error
     assert off(alone.T_ac) > 0.009, error
-
-
-def test_a_pose_with_one_point_on_the_model_has_no_valley():
-    """One inlier has no radius about its own mean, so that rotations have no scale."""
-    surface, T_ac = boxes(), example_pose()
-    scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
-    scan[1:] += [0.0, 0.0, 50.0]
-    registrar = Registrar(surface)
-    kept = along_valley(registrar.target, registrar.loop.screen, scan, T_ac.inverse())[0]
-    assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
 
 
 def test_a_target_of_another_size_is_said_and_covered():
@@ -361,10 +302,9 @@ def test_where_the_guess_is_only_tested_nothing_is_searched(
     """
     rng = np.random.default_rng(8)
     sphere = rng.standard_normal((600, 3))
-    scan = 2.0 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
+    scan = 1.2 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
     made: list[str] = []
     for kind, name in (
-        (loop, "along_valley"),
         (Screen, "graduated"),
         (GlobalSearch, "search"),
     ):

@@ -11,14 +11,10 @@ import trimesh
 from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.evidence import Observed
-from avsreplay.register.generators.turns import Turns
-from avsreplay.register.hypotheses import Candidate, Case, Hypothesis
 from avsreplay.register.quality import left_undetermined
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sensor_frame import SensorFrame
 from avsreplay.register.shown import Effort
-from avsreplay.register.work import Work, healthy_work
 
 
 def stage(edge_m: float, sides: int, nozzle: bool, tilt: float) -> trimesh.Trimesh:
@@ -162,25 +158,6 @@ def test_the_information_left_without_motions_is_that_of_free_motions():
     assert np.allclose(left.info @ d, 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("points", [600, 2000, 2600, 6000])
-def test_the_budget_of_a_scan_suffices_for_the_search_of_a_marked_body_with_most_turns(
-    points: int,
-) -> None:
-    """A round of the search that is never allowed would leave every scan of the body without a
-    pose.
-    """
-    handle = trimesh.creation.box((0.3, 0.1, 0.4)).apply_translation((0.5, 0.0, 0.1))
-    mug = trimesh.util.concatenate([trimesh.creation.cylinder(0.4, 0.9, sections=64), handle])
-    symmetry = Registrar(surface_of(mug)).loop.symmetry
-    assert symmetry.marked
-    assert len(symmetry._marks) > 400
-    assert sum(len(motions) for motions in symmetry._kinds) > 100
-    assert (
-        symmetry.search_work(points, 0)
-        < 0.9 * Work(healthy_work(points, symmetry._target.near_work)).left
-    )
-
-
 def pot() -> trimesh.Trimesh:
     """A vessel of revolution with a spout and a handle, which every turn moves to a place where the
     scan shows none.
@@ -213,33 +190,3 @@ def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
         assert not found[np.arange(len(marks)) % stride > 0].any()
         agree = (found == (open_ & (steep > 0.25)))[::stride]
         assert agree.mean() > 0.97  # a grazing ray may differ, because the margins do
-
-
-def test_the_marks_tested_for_all_turns_are_part_of_the_work(monkeypatch):
-    """Where the scan contradicts most turns, the marks are tested at many of them."""
-    registrar = Registrar(surface_of(pot()))
-    symmetry, tested = registrar.loop.symmetry, list[int]()
-    T_ac = seen_from(0.3, 0.5)
-    scan = scan_of(pot(), T_ac, 1)
-    visible = symmetry._visible
-
-    def counted(T_ca, stride):
-        tested.append(-(-len(symmetry._marks) // stride))
-        return visible(T_ca, stride)
-
-    monkeypatch.setattr(symmetry, "_visible", counted)
-    case = Case(Observed(scan), scan, scan, Work(10**9))
-    case.current = Candidate(registrar.register(scan, T_ac))
-    turns, found, work = Turns(symmetry), list[Hypothesis](), 0
-    steps = turns.hypotheses(case)
-    while True:
-        try:
-            found.append(next(steps))
-        except StopIteration as end:
-            work = end.value
-            break
-    best, at = turns.compared(case, found)
-    assert best is None
-    assert not at.rivals
-    assert work > turns.work(case)
-    assert 3 * sum(tested) <= work

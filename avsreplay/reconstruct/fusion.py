@@ -27,7 +27,6 @@ from avsreplay.reconstruct.tracking import (
     patchwork,
 )
 from avsreplay.reconstruct.views import (
-    NORMAL_NEIGHBOURS,
     ScanView,
     Survey,
     Twist,
@@ -160,7 +159,7 @@ def _with_merged_normals(
     normals, squares, count = point_tree(p).planes(
         p, n, p, n, NORMAL_POINTS, NORMAL_REACH_OF_EXTENT * extent, SAME_SIDE_COSINE
     )
-    good = count >= NORMAL_NEIGHBOURS
+    good = count >= sampling.NORMAL_NEIGHBOURS
     normals *= np.where(np.einsum("ni,ni->n", normals, n) < 0.0, -1.0, 1.0)[:, None]
     normals = np.where(good[:, None], normals, n)
     weight = np.concatenate([views[k].weight for k in keys])

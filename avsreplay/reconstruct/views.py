@@ -12,11 +12,10 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Scan
-from avsreplay.register.sampling import at_instant
+from avsreplay.register.sampling import at_instant, fitted_normals, line_of_sight
 from avsreplay.register.surface_index import kernel_module
 
 SURVEYED_SCANS = 24  # most scans from which extent and position of the camera are determined
-NORMAL_NEIGHBOURS = 12  # nearest points from which a normal is estimated
 # a point is isolated if its fourth neighbour is farther than this many times the median
 ISOLATED_DISTANCE_RATIO = 4.0
 # points closer than this many times the typical distance of the fourth neighbour belong together
@@ -221,22 +220,18 @@ def _camera(clouds: Sequence[Array]) -> Array:
     it.
 
     Scans that were moved toward the origin do not show where the camera was, only that it is the
-    same place for all of them. It is then taken as far away along one line of sight: a surface is
-    sampled in proportion to the cosine of its inclination to that line, so the mean square of the
-    cosine is largest along it. The camera is at the end of the line from which the surfaces are
-    convex on average, because it sees the outside of the target.
+    same place for all of them. It is then taken as far away along one line of sight, at the end
+    from which the surfaces are convex on average, because it sees the outside of the target.
     """
     extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
     if np.median(distances) > ORIGIN_DISTANCE_OF_EXTENT * np.median(extents):
         return np.zeros(3)
-    scatter, sides = np.zeros((3, 3)), []
+    sides = []
     for points, extent in zip(clouds, extents, strict=True):
         thin = central_points(points, extent / 40.0)
-        normals = normals_of(thin, points, points.mean(axis=0))
-        scatter += normals.T @ normals
-        sides.append((thin - points.mean(axis=0), normals))
-    towards = np.linalg.eigh(scatter)[1][:, 2]
+        sides.append((thin - points.mean(axis=0), fitted_normals(thin, points)))
+    towards = line_of_sight(np.concatenate([normals for _, normals in sides]))
     bulge = sum(float(np.einsum("ni,ni->", n * np.sign(n @ towards)[:, None], p)) for p, n in sides)
     return np.asarray(np.copysign(100.0 * max(extents), bulge) * towards)
 
@@ -310,11 +305,10 @@ def normals_of(points: Array, full: Array, camera: Array) -> Array:
         full: all points (m, 3) of the scan in {A} [m].
         camera: position (3,) of the camera in {A} [m].
     """
-    full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
-    normals = point_tree(full).planes(full, full, points, points, NORMAL_NEIGHBOURS)[0]
+    normals = fitted_normals(points, full)
     away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
     normals[away] *= -1.0
-    return np.asarray(normals)
+    return normals
 
 
 def sight_lines(views: Sequence[ScanView], T_ca: Sequence[Pose]) -> Array:

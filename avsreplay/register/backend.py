@@ -45,7 +45,6 @@ PLANE_PASSES = 3
 CLOUD_PLANE_PASSES = 30  # point-to-plane passes of a second alignment to a model of points
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
-NO_LIMIT = 2**62  # of point searches
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 # of the rejection distance over the root of the points; usual rms radius
 SETTLED_ERROR_OF_GATE = 0.05
@@ -69,7 +68,6 @@ class Target:
         index: exact closest points on this surface.
         limits: rejection distances and stopping rule.
         visibility: which faces the camera can have measured.
-        near_work: cost of a search near this surface in point searches, see ``budget.near_work``.
         own: parameters of the back end, lengths that scale with the target filled in.
     """
 
@@ -77,7 +75,6 @@ class Target:
     index: SurfaceIndex
     limits: RegistrationLimits
     visibility: Visibility
-    near_work: float = 1.0
     own: Settings = NoParameters()
 
     def parameters(self, kind: type[S]) -> S:
@@ -227,12 +224,9 @@ class HornBackend(Backend):
         gate_m: float,
         near: bool = False,
         most: int = MOST_WITHIN,
-        most_work: int = NO_LIMIT,
     ) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most
         ``most``.
-
-        After ``most_work`` point searches it ends, not converged.
 
         ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes
         over few points come
@@ -255,9 +249,8 @@ class HornBackend(Backend):
             eps_m=max(limits.eps_m or 0.0, error),
             eps_rad=max(limits.eps_rad, rad),
         )
-        most_work = max(1, min(most_work, _most(WITHIN_WORK, len(points))))
         return self._run(
-            points, guess, lambda facing: replace(self._rules[facing], **within), most_work
+            points, guess, lambda facing: replace(self._rules[facing], **within), WITHIN_WORK
         )
 
     def _run(
@@ -265,24 +258,17 @@ class HornBackend(Backend):
         points: NDArray[Any],
         guess: Pose,
         rules: Callable[[bool], IcpParams],
-        most_work: int = 0,
+        work: tuple[int, int] = ALIGN_WORK,
     ) -> Fit:
-        """Align with one of the rules; ``most_work`` point searches at most, 0: those of an
-        alignment.
-        """
-        most = most_work or _most(ALIGN_WORK, len(points))
+        """Align with one of the rules; ``work``: most point searches, fixed and per point."""
+        most = work[0] + work[1] * max(len(points), LEAST_BUDGET_POINTS)
 
         def align(start: Pose, facing: bool) -> Fit:
             found = self._index.icp(points, start, rules(facing), most)
             T_ca, rough = Pose.from_matrix(found.T_ca), found.matches is None
-            return Fit(T_ca, found.iterations, found.converged, found.matches, found.work, rough)
+            return Fit(T_ca, found.iterations, found.converged, found.matches, rough)
 
         return self._visibility.consistent(self._index, points, guess, align)
-
-
-def _most(work: tuple[int, int], points: int) -> int:
-    """The most point searches of an alignment."""
-    return work[0] + work[1] * max(points, LEAST_BUDGET_POINTS)
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:

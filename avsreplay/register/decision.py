@@ -1,5 +1,5 @@
 """The decision on a registered pose: aligned, ambiguous with its members, degenerate with its
-directions, implausible by the term of the evidence that excludes it, or exhausted.
+directions, or implausible by the term of the evidence that excludes it.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import Sameness
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.screening import Screen
 from avsreplay.register.size import SIZE_UNSEEN, size_error, size_remark
-from avsreplay.register.work import LEAST_RATIO, SIZE_WORK
 
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
@@ -65,7 +65,6 @@ class Decision:
         if at.found.status is AlignStatus.FAILED:
             return at.found
         for rule in (
-            self._exhausted,
             self._no_overlap,
             self._implausible,
             self._ambiguous,
@@ -77,15 +76,6 @@ class Decision:
                 return decided
         return at.found
 
-    def _exhausted(self, case: Case, at: Candidate) -> Alignment | None:  # noqa: ARG002
-        """Poses that had to be compared with it were not; a good one with a known rival is
-        ambiguous.
-        """
-        bad = not at.found.measured or at.reason or self.too_little(at)
-        if not at.missing or (at.searched and at.rivals and not bad):
-            return None
-        return _without(at.found, AlignStatus.BUDGET_EXHAUSTED, at.missing)
-
     def _no_overlap(self, case: Case, at: Candidate) -> Alignment | None:  # noqa: ARG002
         """Too few points of the scan are on the model, for a pose without a guess."""
         little = at.searched and (not at.found.measured or self.too_little(at))
@@ -96,13 +86,11 @@ class Decision:
         p, alone = self._params, at.alone or at.covered
         return at.share < (p.least_separate if alone else p.least_ratio)
 
-    def _implausible(self, case: Case, at: Candidate) -> Alignment | None:
+    def _implausible(self, case: Case, at: Candidate) -> Alignment | None:  # noqa: ARG002
         """The evidence is against the pose."""
         if not at.reason:
             return None
-        exhausted = not at.searched and case.work.exhausted
-        status = AlignStatus.BUDGET_EXHAUSTED if exhausted else AlignStatus.IMPLAUSIBLE
-        return replace(_without(at.found, status, at.reason), free_directions="")
+        return replace(_without(at.found, AlignStatus.IMPLAUSIBLE, at.reason), free_directions="")
 
     def _ambiguous(self, case: Case, at: Candidate) -> Alignment | None:
         """Another pose explains the scan as well, which differs not only along its unobservable
@@ -168,24 +156,23 @@ class Decision:
             others = [T for T in others if not self._poses.same(T, free.nearest(at, T))]
         return others
 
-    def with_size(self, case: Case, found: Alignment) -> tuple[Alignment, int]:
+    def with_size(self, case: Case, found: Alignment) -> Alignment:
         """Return an alignment with what its scan says about the size, if that is still to be
-        fitted; and the work.
+        fitted.
 
         The covariance is enlarged by the change of the pose that an error of the size of two
         standard errors causes.
         """
         P, part = found.covariance, found.systematic
         if found.size_1s is None or P is None or part is None:
-            return found, 0
+            return found
         T_ca, target = found.T_ac.inverse(), self._target
         camera_c = target.visibility.camera_c(target.index, case.points, T_ca)
         size = size_error(target.index, case.points, T_ca, camera_c)
         if size is not None and size.likely:
             P, part = (geometry.frozen(C + np.outer(size.shift, size.shift)) for C in (P, part))
         message = size_remark(size, found.size_1s)
-        sized = replace(found, covariance=P, systematic=part, message=message, size_1s=None)
-        return sized, SIZE_WORK
+        return replace(found, covariance=P, systematic=part, message=message, size_1s=None)
 
     def stated(self, found: Alignment) -> Alignment:
         """Return the alignment; an attitude that noise leaves uncertain is stated if nothing else
@@ -200,11 +187,9 @@ class Decision:
         known = f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma)"
         return replace(found, message=f"{known} only")
 
-    def consistent(
-        self, points: NDArray[Any], guess: Pose, found: Alignment
-    ) -> tuple[Alignment, int]:
+    def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment) -> Alignment:
         """Return the alignment with a covariance that is not contradicted by the distances at the
-        predicted pose; and the work.
+        predicted pose.
 
         Where little of the target is in the scan, the distances can be nearly as small along a
         curve of poses, far beyond the covariance at its lowest point. With d the step to the
@@ -218,7 +203,7 @@ class Decision:
         """
         P, predicted = found.covariance, self._test.predicted(found.T_ac.inverse(), guess)
         if P is None or found.inlier_ratio >= LEAST_RATIO or not predicted:
-            return found, 0
+            return found
         at, before = (
             self._screen.measure(points, T_ac.inverse(), guess) for T_ac in (found.T_ac, guess)
         )
@@ -229,12 +214,11 @@ class Decision:
         by_distances = found.points * (before.cost(width) - at.cost(width)) * (width / noise) ** 2
         by_covariance = max(float(d @ np.linalg.solve(P, d)), tiny)
         missing = 1.0 / max(by_distances, 1.0) - 1.0 / by_covariance
-        work = at.work + before.work
         if missing <= 0.0:
-            return found, work
+            return found
         wider = P + missing * np.outer(d, d)
         info = geometry.frozen(np.linalg.inv(wider))
-        return replace(found, covariance=geometry.frozen(wider), info=info), work
+        return replace(found, covariance=geometry.frozen(wider), info=info)
 
 
 def _without(found: Alignment, status: AlignStatus, message: str | None = None) -> Alignment:

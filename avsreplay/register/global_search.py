@@ -24,11 +24,15 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.comparison import Measured, as_good, least_noise
+from avsreplay.register.evidence import MEASURED_OF_EXTENT
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT
 from avsreplay.register.poses import Sameness
 from avsreplay.register.sampling import (
+    NORMAL_NEIGHBOURS,
+    SIGHT_POINTS,
     attitudes,
+    fitted_normals,
     line_of_sight,
     sample_evenly,
     scan_axes,
@@ -51,10 +55,9 @@ FINE_STARTS = 10
 # sampled from the model; cells of the grid along its diagonal
 MODEL_POINTS = 3000
 CELLS = 40
-# distances of unexplained points; the largest
+# distances of unexplained points
 COARSE_OF_EXTENT = 0.03
 MIDDLE_OF_EXTENT = 0.02
-MOST_OF_EXTENT = 0.05
 # rejection distance of the first pass, and its factor from pass to pass
 FIRST_GATE_OF_EXTENT = 0.3
 GATE_FALL = 0.7
@@ -94,16 +97,6 @@ FINE_PASSES = 15
 # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
 RIVAL_AFTER = 0.05
 MOST_RIVALS = 4
-# look-ups in the grid that cost as much as a search on the model; cost of a round
-LOOK_UPS = 6
-ROUND_WORK = 28_000
-# with less work left than so many usual rounds, the last poses are registered with half of the
-# points
-SHORT = 1.5
-# of the work left, for the last poses; usual cost for each fine point
-REGISTERED_SHARE = 0.8
-REGISTERED_WORK = 10
-DIFFERENT_STARTS = 0.6  # usual share of different starts
 # number and size of the shifts of the starts across the direction to the camera
 SHIFTS = 6
 SHIFT_OF_EXTENT = 0.3
@@ -120,7 +113,6 @@ class SearchResult:
         width_m: distance beyond which a point is not on the model; it follows the noise.
         inlier_ratio: share of the points of the scan on the model at the best pose.
         candidates: all poses that were registered to the end, for a further round.
-        work: of the round, in point searches.
     """
 
     best: Pose
@@ -128,7 +120,6 @@ class SearchResult:
     width_m: float
     inlier_ratio: float
     candidates: tuple[Measured, ...]
-    work: int
 
 
 class GlobalSearch:
@@ -139,8 +130,6 @@ class GlobalSearch:
         symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the
             identity.
         field, centroids, middle: sampled points by place, their mean from each side, and of all.
-        spent, most, registered: work of the last round, its limit [point searches], and the points
-            of its last registrations.
     """
 
     def __init__(
@@ -161,11 +150,6 @@ class GlobalSearch:
             points, normals if self._sided else np.zeros_like(normals), self._extent
         )
         self.middle = points.mean(axis=0)
-        self.spent, self.most, self.registered = (
-            0,
-            2**62,
-            LAST_FINE_POINTS,
-        )  # work of the round, its limit; points
         coarse = replace(target.limits, eps_rad=ENDED_RAD, eps_m=ENDED_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
@@ -175,42 +159,12 @@ class GlobalSearch:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
 
-    def work(self, points: int, number: int) -> int:
-        """Return the usual cost of round ``number`` in point searches, for a scan of so many
-        points.
-        """
-        return self._looked(points, number) + REGISTERED_WORK * min(points, FINE_POINTS)
-
-    def _looked(self, points: int, number: int, sights: int = 1) -> int:
-        """The cost of a round without that of the poses that are registered to the model.
-
-        Args:
-            points: of the scan.
-            number: of the round.
-            sights: directions to the camera that are tried in the first round.
-        """
-        p = self._params
-        few, some = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS))
-        starts, stride = (
-            p.starts * (sights, SHIFTS, 7)[number] // THINNED[number],
-            FIRST_STRIDES[number],
-        )
-        halved = p.starts // KEPT_AFTER_FIRST * (1 + SECOND_PASSES)
-        halved += p.starts // KEPT_AFTER_SECOND * (1 + COARSE_PASSES - SECOND_PASSES)
-        looked = few * (starts * (1 + FIRST_PASSES) // stride + halved)
-        looked += some * int(DIFFERENT_STARTS * MIDDLE_STARTS) * (1 + MIDDLE_FIRST) // MIDDLE_STRIDE
-        looked += some * KEPT_IN_MIDDLE * (1 + MIDDLE_PASSES - MIDDLE_FIRST)
-        looked += some * len(self.symmetries) * (1 + TURNED_PASSES)
-        return ROUND_WORK + looked // LOOK_UPS
-
     def search(
         self,
         points: NDArray[Any],
         number: int = 0,
         before: SearchResult | None = None,
         known: Pose | None = None,
-        left: int = 2**62,
-        kept: int = 0,
     ) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
 
@@ -222,13 +176,7 @@ class GlobalSearch:
             before: result of another round for the same points, whose poses are compared as well.
             known: a pose T_ca that is compared as well: another one is unique only if it explains
                 the scan better.
-            left: work that is left, in point searches; after most of it no pose is registered.
-            kept: work of it that a later step needs.
         """
-        self.most = min(int(REGISTERED_SHARE * left), left - kept)
-        self.registered = LAST_FINE_POINTS // (
-            2 if left < SHORT * self.work(len(points), number) else 1
-        )
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         few, some, fine = (
             np.ascontiguousarray(thin_to(scan, n))
@@ -236,7 +184,6 @@ class GlobalSearch:
         )
         sight = self._target.visibility.direction_to_camera(scan)
         sights, shifts, facing = self._rounds(few, scan, sight)[number]
-        self.spent = self._looked(len(points), number, len(sights))
         starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
@@ -255,8 +202,11 @@ class GlobalSearch:
         turn = 2.0 * np.pi * np.arange(SHIFTS)[:, None] / SHIFTS
         u, v = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
         known = self._sided and sight is not None
-        line = line_of_sight(scan) if sight is None else none[0]
-        first = [sight] if sight is not None else [None, line, -line]
+        first: list[Array | None] = [sight]
+        if sight is None and len(scan) > NORMAL_NEIGHBOURS:
+            part = scan[:: max(1, len(scan) // SIGHT_POINTS)]
+            line = line_of_sight(fitted_normals(part, part))
+            first += [line, -line]
         return [
             (first, none, known),
             ([sight], np.cos(turn) * u + np.sin(turn) * v, known),
@@ -348,7 +298,7 @@ class GlobalSearch:
         be as good as the best; and the least cost after the few passes, also of other poses
         (``least``).
         """
-        part = np.ascontiguousarray(fine[:: max(1, len(fine) // self.registered)])
+        part = np.ascontiguousarray(fine[:: max(1, len(fine) // LAST_FINE_POINTS)])
         brief = [self._ended(self._brief, part, T_ca, width_m) for T_ca in poses]
         found = [self.measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
@@ -358,13 +308,8 @@ class GlobalSearch:
         ]
         last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
         ended = [self._ended(self._refine, part, found[k].T_ca, width_m, True) for k in last]
-        best, others = (
-            [self.measured(fine, T_ca) for T_ca in ended],
-            (found[k].T_ca for k in order if k not in last),
-        )
-        return best + [
-            self.measured(fine, T_ca) for T_ca in others if self.spent < self.most
-        ], least
+        others = [found[k].T_ca for k in order if k not in last]
+        return [self.measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself: different
@@ -387,25 +332,16 @@ class GlobalSearch:
         off = self._target.index.closest(moved).d2 > (CARRIED_OF_EXTENT * self._extent) ** 2
         return bool(np.count_nonzero(off) <= MOST_UNCARRIED * len(points))
 
-    def measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Measured:
+    def measured(self, points: Array, T_ca: Pose, most: float = MEASURED_OF_EXTENT) -> Measured:
         """Return the distances of points (n, 3) in {A} at a pose, at most ``most`` extents."""
-        distance, work = self._target.visibility.distances(
-            self._target.index, points, T_ca, most * self._extent
-        )
-        self.spent += work
-        return Measured(T_ca, distance)
+        index, visibility = self._target.index, self._target.visibility
+        return Measured(T_ca, visibility.distances(index, points, T_ca, most * self._extent))
 
     def _ended(
         self, horn: HornBackend, points: Array, T_ca: Pose, width_m: float, near: bool = False
     ) -> Pose:
-        """The pose registered to the model; the pose itself where the work of the round is
-        spent.
-        """
-        if self.spent >= self.most:
-            return T_ca
-        fit = horn.align_within(points, T_ca, width_m, near, most_work=self.most - self.spent)
-        self.spent += fit.work
-        return fit.T_ca
+        """The pose registered to the model."""
+        return horn.align_within(points, T_ca, width_m, near).T_ca
 
     def _verdict(self, found: Sequence[Measured]) -> SearchResult:
         noise = least_noise(found)
@@ -423,7 +359,6 @@ class GlobalSearch:
             width,
             float(np.mean(best.distance < width)),
             tuple(found),
-            self.spent,
         )
 
     def margin(self, noise_m: float) -> float:

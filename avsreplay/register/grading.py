@@ -2,8 +2,7 @@
 
 Hypotheses are registered by the program's own method, whatever the back end is: most of them are
 wrong, and a library can need hundreds of times its usual work to find no fit. The back end
-registers the guess where few points confirm it, and the pose that the decision would accept. The
-work of another library is not counted, since this is at most two alignments of a scan.
+registers the guess where few points confirm it, and the pose that the decision would accept.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from avsreplay.register import quality
 from avsreplay.register.backend import Backend, HornBackend, Target, aligned
 from avsreplay.register.hypotheses import Case
 from avsreplay.register.params import RegisterParams, RegistrationLimits
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.screening import Screen
-from avsreplay.register.work import LEAST_RATIO, TEST_WORK, alignment_work, grade_work
 
 # a result rotated by more from its guess is verified by the global search
 FAR_RAD = np.radians(30.0)
@@ -52,8 +51,8 @@ class Grader:
         width_m: float | None = None,
         by_backend: bool = False,
         rough: bool = False,
-    ) -> tuple[Alignment, int]:
-        """Register a scan and measure the quality of the pose; also return the work.
+    ) -> Alignment:
+        """Register a scan and measure the quality of the pose.
 
         A close fit that is not at a minimum before the last pass that is allowed is registered once
         more from there.
@@ -68,31 +67,28 @@ class Grader:
                 not converged.
         """
         start = T_ca = guess.inverse()
-        index, limits, scan = self._target.index, self._target.limits, case.points
+        limits, scan = self._target.limits, case.points
         limits = limits if width_m is None else replace(limits, gate_m=width_m)
         used = self._backend if by_backend else self.own
         name = self._params.backend if by_backend else used.name
-        closest, spent, left = used is self.own, 0, case.work.left
+        closest = used is self.own
         for last in (False, True):
             align = used.align_roughly if rough and not last else used.align
             if width_m is not None:
-                most = max(1, left - spent - grade_work(len(scan), noisy=True) - TEST_WORK)
-                align = partial(self.own.align_within, gate_m=width_m, near=True, most_work=most)
+                align = partial(self.own.align_within, gate_m=width_m, near=True)
             fit = aligned(name, partial(align, scan, T_ca))
             if isinstance(fit, str):
                 none = quality.not_measured(len(scan), AlignStatus.FAILED, guess)
-                return replace(none, message=fit), spent
-            found, of = self._measured(case, fit, limits, used.accuracy, start, closest)
-            noisy = not fit.rough and found.rms_m > quality.SMALL_NOISE * index.extent_m
-            spent += alignment_work(fit, found, of, noisy) if closest else 0
-            ended = last or fit.iterations >= limits.n_max or left - spent < case.work.healthy
+                return replace(none, message=fit)
+            found = self._measured(case, fit, limits, used.accuracy, start, closest)
+            ended = last or fit.iterations >= limits.n_max
             open_end = found.status is AlignStatus.NOT_CONVERGED and self._worth_more(guess, found)
             if ended or not open_end:
                 break
             T_ca = fit.T_ca
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{name}' {found.message}")
-        return found, spent
+        return found
 
     def _measured(
         self,
@@ -102,10 +98,8 @@ class Grader:
         accuracy: tuple[float, float],
         start: Pose,
         closest: bool,
-    ) -> tuple[Alignment, int]:
-        """Measure the quality of a fit, of a rough one by a part of the scan; also return the
-        number of points.
-        """
+    ) -> Alignment:
+        """Measure the quality of a fit, of a rough one by a part of the scan."""
         scan, full = case.points, not fit.rough
         of = scan if full else self._screen.part(scan)
         found = quality.grade(
@@ -122,9 +116,9 @@ class Grader:
             simulated=full and closest,
         )
         if full:
-            return found, len(of)
+            return found
         inliers = found.inliers * len(scan) // len(of)
-        return replace(found, points=len(scan), inliers=inliers), len(of)
+        return replace(found, points=len(scan), inliers=inliers)
 
     def close(self, found: Alignment) -> bool:
         """Return whether an alignment is a close fit of nearly all points."""

@@ -5,7 +5,7 @@ hypotheses is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator as Steps
+from collections.abc import Iterator
 from enum import Enum
 from typing import Any
 
@@ -17,7 +17,6 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.evidence import Evidence, Observed
 from avsreplay.register.screening import Screened
-from avsreplay.register.work import Work
 
 
 class Refine(Enum):
@@ -34,18 +33,16 @@ class Hypothesis:
 
     Attributes:
         T_ca: the pose.
-        work: that was spent on it [point searches].
         at: its distances on part of the scan, where they were measured.
     """
 
     T_ca: Pose
-    work: int = 0
     at: Screened | None = None
 
     @staticmethod
-    def of(at: Screened, more: int = 0) -> Hypothesis:
-        """Return a screened pose as a hypothesis, which took ``more`` work than it says."""
-        return Hypothesis(at.T_ca, at.work + more, at)
+    def of(at: Screened) -> Hypothesis:
+        """Return a screened pose as a hypothesis."""
+        return Hypothesis(at.T_ca, at)
 
 
 @value_class
@@ -63,7 +60,6 @@ class Candidate:
         undetermined: (6, k) motions that turned poses, which explain the scan as well, leave open.
         images: poses T_ca onto which exact symmetries of the model carry it; None: not known yet.
         beside: another minimum near the pose explains the scan as well.
-        missing: why poses that had to be compared with it were not, "" if they were.
         share, alone: of the result of a search: share of the searched points that are on the model,
             and whether the others are those of another object.
         searched: by a search, not from a guess.
@@ -79,7 +75,6 @@ class Candidate:
     undetermined: Array | None = None
     images: tuple[Pose, ...] | None = None
     beside: bool = False
-    missing: str = ""
     share: float = 1.0
     alone: bool = False
     searched: bool = False
@@ -111,9 +106,7 @@ class Case:
         guess: predicted T_ac; None: none.
         carried, halves: as of ``Registrar.register``.
         unknown: (6, k) motions of the model of which the guess has no information.
-        work: work that is left. Generators ask for it, and only the loop spends it.
         current: the best candidate so far.
-        restarted: the best of the restarts so far.
     """
 
     def __init__(
@@ -121,7 +114,6 @@ class Case:
         seen: Observed,
         points: NDArray[Any],
         few: NDArray[Any],
-        work: Work,
         guess: Pose | None = None,
         carried: bool = False,
         halves: bool = True,
@@ -130,9 +122,7 @@ class Case:
         self.seen, self.points, self.few, self.target = seen, points, few, points
         self.guess, self.carried, self.halves = guess, carried, halves
         self.unknown = np.zeros((6, 0)) if unknown is None else unknown
-        self.work = work
         self.current: Candidate | None = None
-        self.restarted: Screened | None = None
 
     @property
     def at(self) -> Candidate:
@@ -146,24 +136,15 @@ class Generator(ABC):
 
     Attributes:
         refine: how the best of its hypotheses is registered to the whole scan.
-        until_accepted: no further hypotheses are drawn when one that a second one confirmed is
-            accepted by its evidence.
-        missing: what is not known if there is no work for it, in words.
         examined: the evidence of the candidate so far is needed for the comparison.
     """
 
     refine = Refine.NOISE
-    until_accepted = False
-    missing = ""
     examined = False
 
-    def work(self, case: Case) -> int:  # noqa: ARG002 (most count the work of each hypothesis)
-        """Return the usual work without which no hypothesis is drawn [point searches]."""
-        return 0
-
     @abstractmethod
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
-        """Yield hypotheses, and return the work that none of them contains [point searches]."""
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
+        """Yield hypotheses."""
 
     def compared(
         self, case: Case, found: list[Hypothesis]

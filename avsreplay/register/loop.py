@@ -1,10 +1,11 @@
 """The loop over hypotheses: draws them from generators, registers the best of each to the whole
-scan, measures its evidence, and counts the work.
+scan, and measures its evidence.
+
+The work of a scan is bounded, because every generator yields a limited number of hypotheses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -18,12 +19,10 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
-from avsreplay.register import quality
 from avsreplay.register.backend import Backend, Target
 from avsreplay.register.decision import ACCEPTED, Decision
 from avsreplay.register.generators.displaced import Displaced
 from avsreplay.register.generators.guess import NEARER, Guess, WithinNoise
-from avsreplay.register.generators.restarts import Restarts
 from avsreplay.register.generators.search import SearchRound, SearchTools
 from avsreplay.register.generators.turns import NearestImage, Turns, TurnsOfGuess
 from avsreplay.register.generators.weak_directions import WeakDirections
@@ -33,28 +32,16 @@ from avsreplay.register.near_symmetry import LEAST_OFF_MODEL, NearSymmetry, prep
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, without_scattered_points
 from avsreplay.register.screening import Screen, Screened
-from avsreplay.register.valley import VALLEY_WORK, along_valley
-from avsreplay.register.work import (
-    LAST_WORK,
-    LEAST_RATIO,
-    NOT_COMPARED,
-    SCATTER_WORK,
-    TEST_WORK,
-)
 
 # with more inliers too few points are left that could continue beyond an edge of the model
 COMPLETE = 0.985
 LEAST_BEYOND = 10  # of 1,000 points well off the model, from which a close fit is judged
 # rotation from the guess above which a pose of a model with near-symmetries is far
 TURNED_RAD = np.radians(12.0)
-NOT_VERIFIED = (
-    f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a"
-    " search"
-)
 LEFT = "the back end ends at another pose than the search, although it begins there"
-NOT_FOUND = "no pose of the model explains the scan, and no work is left for a longer search"
 
 
 class Loop:
@@ -85,8 +72,9 @@ class Loop:
 
     @cached_property
     def _tools(self) -> SearchTools:
-        params, symmetry = self._params.acquire, self.symmetry
-        return SearchTools(self._target, params, self.test, self.screen, symmetry, self._weak)
+        return SearchTools(
+            self._target, self._params.acquire, self.test, self.screen, self.symmetry
+        )
 
     @cached_property
     def _displaced(self) -> Displaced:
@@ -102,50 +90,15 @@ class Loop:
         """Draw the hypotheses of a generator; the best becomes the candidate of the case where it
         is better than the one before.
         """
-        usual = generator.work(case)
-        if usual and usual > case.work.left:
-            case.work.exhausted = True
-            case.current = replace(case.at, missing=generator.missing)
-            return
-        found = list(self._drawn(case, generator))
+        found = list(generator.hypotheses(case))
         if found and generator.examined and not case.at.examined:
             self._examine(case)
         best, case.current = generator.compared(case, found)
         if best is None:
             return
-        if generator.missing and case.work.left < LAST_WORK:
-            case.current = replace(case.at, missing=NOT_COMPARED)
-            return
         self._register(case, best, generator.refine)
         if generator.refine is not Refine.BACKEND:
             self._examine(case)
-
-    def _drawn(self, case: Case, generator: Generator) -> Iterator[Hypothesis]:
-        """The hypotheses of a generator, whose work is counted; a generator that requests it ends
-        at the first that another one confirmed and its evidence accepts.
-        """
-        steps, found, refused = generator.hypotheses(case), list[Screened](), None
-        while True:
-            try:
-                hypothesis = next(steps)
-            except StopIteration as end:
-                case.work.spend(end.value)
-                return
-            case.work.spend(hypothesis.work)
-            yield hypothesis
-            if not generator.until_accepted or hypothesis.at is None:
-                continue
-            found.append(hypothesis.at)
-            best = self.screen.least(found)
-            others = (each.T_ca for each in found if each is not best)
-            if best is refused or not any(
-                self.poses.same(best.T_ca, each, ONE_MINIMUM) for each in others
-            ):
-                continue
-            case.work.spend(TEST_WORK)
-            if not self.test.judged(case.seen, best.T_ca)[1]:
-                return
-            refused = best
 
     # Registration of a hypothesis to the whole scan, and its evidence
 
@@ -156,17 +109,15 @@ class Loop:
             found = self._graded(case, hypothesis.T_ca, by_backend=by_backend, rough=True)
         else:
             found = self._within(case, hypothesis)
-        if refine is Refine.BOTH and case.work.allows(LAST_WORK):
+        if refine is Refine.BOTH:
             wide = self._graded(case, hypothesis.T_ca)
             same = self.poses.same(wide.T_ac.inverse(), found.T_ac.inverse(), ONE_MINIMUM)
             found = wide if same else self._nearest(case, [found, wide], self._gate)
         self._replace(case, found, by_backend)
 
     def _hopeful(self, case: Case, T_ca: Pose) -> bool:
-        """Whether a back end of another library is called at a pose: few points confirm it. As of
-        its alignment, the work is not counted, so that hypotheses do not depend on the back end.
-        """
-        return not self.grader.foreign or self.screen.confirms(case.points, T_ca.inverse())[0]
+        """Whether a back end of another library is called at a pose: few points confirm it."""
+        return not self.grader.foreign or self.screen.confirms(case.points, T_ca.inverse())
 
     def _replace(self, case: Case, found: Alignment, by_backend: bool) -> None:
         """An alignment becomes the candidate; what is known of other poses stays."""
@@ -196,33 +147,15 @@ class Loop:
     def _graded(
         self, case: Case, T_ca: Pose, width_m: float | None = None, **how: bool
     ) -> Alignment:
-        found, work = self.grader.graded(case, T_ca.inverse(), width_m, **how)
-        case.work.spend(work)
-        return found
+        return self.grader.graded(case, T_ca.inverse(), width_m, **how)
 
     def _measured(self, case: Case, T_ca: Pose) -> Screened:
-        at = self.screen.measure(case.few, T_ca)
-        case.work.spend(at.work)
-        return at
+        return self.screen.measure(case.few, T_ca)
 
     def _within(self, case: Case, hypothesis: Hypothesis) -> Alignment:
-        """An alignment with a rejection distance that follows the noise; among other objects along
-        the valley.
-        """
+        """An alignment with a rejection distance that follows the noise."""
         at = hypothesis.at or self._measured(case, hypothesis.T_ca)
-        width = self.screen.width(at)
-        found = self._graded(case, hypothesis.T_ca, width)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
-            return found
-        if not case.work.allows(VALLEY_WORK + LAST_WORK):
-            status = AlignStatus.BUDGET_EXHAUSTED
-            return replace(found, status=status, covariance=None, message=NOT_COMPARED)
-        T_ca = found.T_ac.inverse()
-        moved, work = along_valley(self._target, self.screen, case.few, T_ca)
-        case.work.spend(work)
-        if moved.t.tobytes() == T_ca.t.tobytes():
-            return found
-        return self._nearest(case, [found, self._graded(case, moved, width)], width)
+        return self._graded(case, hypothesis.T_ca, self.screen.width(at))
 
     def _nearest(self, case: Case, found: list[Alignment], width_m: float) -> Alignment:
         """The second alignment if the points, none farther than ``width_m``, are nearer to the
@@ -236,7 +169,6 @@ class Loop:
         at = case.at
         if at.examined or not at.found.measured:
             return
-        case.work.spend(TEST_WORK)
         evidence, reason = self.test.judged(case.seen, at.T_ca, case.guess)
         case.current = replace(
             at,
@@ -276,34 +208,22 @@ class Loop:
     def _recover(self, case: Case) -> None:
         """Draw further hypotheses until the candidate leaves no doubt."""
         overlap = case.at.found.status is not AlignStatus.NO_OVERLAP  # without: another object
-        hopeful = self._draw_both(case)
+        self._draw_both(case)
         self._examine(case)
         if not self._open(case):
             return
-        restart = not overlap or (hopeful and not self._far(case))
-        kept = self.symmetry.search_work(len(case.points), 0) if overlap and restart else 0
-        once = Restarts(self._target, self.screen, False, kept if case.at.reason else 0)
-        turned = Restarts(self._target, self.screen, True)
-        for step in (once, None, turned) if restart else (None, once, turned):
-            if step is not None:
-                self._draw(case, step)
-                if case.at.found.measured and not case.at.reason:
-                    return
-            elif overlap and self._searched(case, 1):
-                return
+        if overlap:
+            self._searched(case, 1)
 
-    def _draw_both(self, case: Case) -> bool:
-        """Register the first result and the guess within the noise; whether one of them is near
-        enough for it.
-        """
+    def _draw_both(self, case: Case) -> None:
+        """Register the first result and the guess within the noise."""
         tried = []
-        for hypothesis in self._drawn(case, self._within_noise):
+        for hypothesis in self._within_noise.hypotheses(case):
             self._register(case, hypothesis, self._within_noise.refine)
             tried.append(case.at)
         if len(tried) == 2:
             best = self._nearest(case, [each.found for each in tried], self._gate)
             case.current = tried[best is tried[1].found]
-        return bool(tried)
 
     def _open(self, case: Case) -> bool:
         """Whether the candidate may be a local minimum: after a failure, against its evidence, or
@@ -335,11 +255,7 @@ class Loop:
 
     def _verify(self, case: Case) -> None:
         """Replace a far candidate by the result of a search."""
-        n = len(case.seen.points)
-        if case.work.allows(self.symmetry.search_work(n, 0) + sum(SCATTER_WORK) * n):
-            self._searched(case, MOST_ATTEMPTS, always=True)
-        else:
-            case.current = replace(case.at, missing=NOT_VERIFIED)
+        self._searched(case, MOST_ATTEMPTS, always=True)
 
     def _compare(self, case: Case) -> None:
         """Compare the candidate with the minima near it and with the poses turned by a
@@ -348,7 +264,7 @@ class Loop:
         if self._weak.needed(case):
             self._draw(case, self._weak)
         at = case.at
-        if at.beside or at.missing or at.reason or not at.accepted:
+        if at.beside or at.reason or not at.accepted:
             return
         if case.unknown.size or at.found.points - at.found.inliers >= LEAST_OFF_MODEL:
             turns = TurnsOfGuess(self._target, self.symmetry)
@@ -360,7 +276,7 @@ class Loop:
         that of its equal poses that is nearest to the guess. ``always``: also if it is not.
         """
         known = case.at.T_ca if case.at.found.measured else None
-        whole = Case(case.seen, case.seen.points, case.few, case.work)
+        whole = Case(case.seen, case.seen.points, case.few)
         accepted = self._search(whole, rounds, known).status in ACCEPTED
         if accepted or always:
             case.points, case.few, case.target = whole.points, whole.few, whole.target
@@ -377,11 +293,8 @@ class Loop:
             self._finish(case)
             found = self.decision.decide(case)
         if case.guess is not None and not case.at.searched:
-            found, work = self.decision.consistent(case.few, case.guess, found)
-            case.work.spend(work)
-        found, work = self.decision.with_size(case, found)
-        case.work.spend(work)
-        return self.decision.stated(found)
+            found = self.decision.consistent(case.few, case.guess, found)
+        return self.decision.stated(self.decision.with_size(case, found))
 
     # Without a guess
 
@@ -403,90 +316,68 @@ class Loop:
         return self.decision.equal(case, self._decided(case))
 
     def _search(self, case: Case, rounds: int, known: Pose | None) -> Alignment:
-        """The best result of the searches that the work allows becomes the candidate of a case;
-        return the decision on it.
+        """The best result of the searches becomes the candidate of a case; return the decision on
+        it.
 
         Args:
             case: the scan.
             rounds: most rounds of the search.
             known: a pose T_ca that is compared as well.
         """
-        n = len(case.points)
         case.target = without_scattered_points(np.asarray(case.points, dtype=np.float64))
-        case.work.spend(sum(SCATTER_WORK[: 2 if len(case.target) < n else 1]) * n)
-        few, tried, enough = self.screen.part(case.target), list[Round](), True
+        few, tried = self.screen.part(case.target), list[Round]()
         parts = attempts(case.target, self._extent, lambda: tried[0].found.measured)
         for part, number in islice(parts, rounds):
-            enough = self._affords(case, part, number, tried)
-            if not enough:
-                break
             tried.append(self._round(case, part, number, known, tried))
             if tried[-1].ends:
                 break
-        best = self._best(case, few, tried)
-        if best is None:
-            T_ac = None if known is None else known.inverse()
-            none = quality.not_measured(n, AlignStatus.NO_OVERLAP, T_ac)
-            case.current = Candidate(none, searched=True)
-        else:
-            case.current = best.case.current
+        best = self._best(few, tried)
+        case.current = best.case.current
         case.few = self.screen.part(case.points)
-        if best is not None and best.found.status in ACCEPTED and self._displaced.needed(case):
+        if best.found.status in ACCEPTED and self._displaced.needed(case):
             self._draw(case, self._displaced)
-        sure = best is not None and best.found.measured and not best.unsure
-        if not sure and (case.work.exhausted or not enough):
-            case.current = replace(case.at, missing=NOT_FOUND)
         return self.decision.decide(case)
-
-    def _affords(self, case: Case, part: Array, number: int, tried: list[Round]) -> bool:
-        """Whether there is work for a round of the search, and for the comparison after it where a
-        pose is accepted already.
-        """
-        accepted = any(each.found.status in ACCEPTED and not each.unsure for each in tried)
-        kept = self._displaced.usual(len(part), len(case.points), True) if accepted else 0
-        return case.work.allows(self.symmetry.search_work(len(part), number), kept)
 
     def _round(
         self, case: Case, part: Array, number: int, known: Pose | None, tried: list[Round]
     ) -> Round:
         """Search a part (n, 3) of a scan, and decide on the result."""
-        one = Case(case.seen, case.points, self.screen.part(part), case.work)
+        one = Case(case.seen, case.points, self.screen.part(part))
         one.target = part
         whole = [each.search.result for each in tried if each.case.target is part]
-        kept = self._displaced.usual(len(part), len(case.points), True) if number == 1 else 0
         before = whole[-1] if whole else None
-        search = SearchRound(self._tools, part, number, before, known, kept)
+        search = SearchRound(self._tools, part, number, before, known)
         self._draw(one, search)
         self._resolve(one)
         return Round(one, search, self.decision.decide(one))
 
     def _resolve(self, case: Case) -> None:
-        """Compare the result of a search with the poses turned by a near-symmetry."""
+        """Compare the result of a search with the other side of a panel and with the poses turned
+        by a near-symmetry.
+        """
         at = case.at
         if not at.found.measured or at.reason or self.decision.too_little(at):
             return
-        if self._turns.needed(case):
-            self._draw(case, self._turns)
+        for generator in (self._weak, self._turns):
+            if generator.needed(case):
+                self._draw(case, generator)
         self._size(case)
 
     def _size(self, case: Case) -> None:
         """Fit the size to the result of a search where the scan shows a part of the target."""
         at = case.at
         if at.accepted and not at.rivals and not at.covered:
-            found, work = self.decision.with_size(case, at.found)
-            case.work.spend(work)
-            case.current = replace(at, found=found)
+            case.current = replace(at, found=self.decision.with_size(case, at.found))
 
-    def _best(self, case: Case, few: NDArray[Any], tried: list[Round]) -> Round | None:
+    def _best(self, few: NDArray[Any], tried: list[Round]) -> Round:
         """The round whose pose has the least cost; the first if none has a pose."""
-        measured = []
-        for each in tried:
-            if each.found.measured:
-                at = self.screen.measure(few, each.found.T_ac.inverse())
-                case.work.spend(at.work)
-                measured.append((each, at))
+        measured = [
+            (each, self.screen.measure(few, each.found.T_ac.inverse()))
+            for each in tried
+            if each.found.measured
+        ]
         if not measured:
-            return tried[0] if tried else None
+            return tried[0]
         width = max(self._gate, 3.0 * min(at.noise_m for _, at in measured))
         return min(measured, key=lambda pair: pair[1].cost(width))[0]
 
@@ -503,7 +394,7 @@ class Round:
     def unsure(self) -> bool:
         """Return whether another pose may have more evidence."""
         at = self.case.at
-        return at.doubtful or bool(at.reason or at.missing) or not self.found.measured
+        return at.doubtful or bool(at.reason) or not self.found.measured
 
     @property
     def ends(self) -> bool:

@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
 from avsreplay.register import index_cache
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, Target
 from avsreplay.register.comparison import OFF, Measured, decided, least_noise
-from avsreplay.register.global_search import FINE_PASSES, GlobalSearch
+from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import Sameness
 from avsreplay.register.sampling import EMPTY, Rays, sample
 from avsreplay.register.surface_index import kernel_module
 from avsreplay.register.symmetry import FINALISTS, NONE, distances, near_symmetries
-from avsreplay.register.work import TEST_WORK, healthy_work
 
 MARKS_VERSION = 12  # version of the kept data of a model
 # points to find marks, times as many around them, kept
@@ -35,11 +34,12 @@ MOST_MARKS = 500
 # Most work of a search of all samples [point searches]: of a model with long thin faces, at which
 # a search costs up to a hundred times as much, fewer points are sampled, which misses small marks.
 SAMPLES_WORK = 40_000
+# points with the noise of an ordinary scan that show the cost of a search
+NEAR_POINTS = 500
+ORDINARY_NOISE_OF_EXTENT = 0.002
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED_MOTIONS = 16  # motions of a kind by which the marks are found
 MARK_SPACINGS = 2.0  # more points are sampled within so many spacings of a point on a mark
-# a point within this (over the extent), or within three sigma of the noise, is on the model
-ON_MODEL_OF_EXTENT = 0.004
 MARK_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 # an exact symmetry carries all but this share of the surface to within this of it, over the extent
@@ -47,7 +47,6 @@ EXACT_OF_EXTENT = 5e-4
 MOST_INEXACT = 5e-4
 LEAST_OFF_MODEL = 8  # fewer points off the model decide nothing
 SCREENED_MARKS = 100  # marks with which all motions are compared
-RAY_WORK = 3  # cost of the ray to a mark in the mean: many of them face away
 # points of the scan; those on and off the model with which all motions are compared
 MOST_COMPARED_POINTS = 6000
 SCREENED = 150
@@ -70,7 +69,7 @@ class NearSymmetry:
         self._target, self._test, self.search = target, test, search
         self.poses, self._gate = search.poses, target.limits.gate_m
         surface = target.surface
-        self._samples = min(SAMPLES, int(SAMPLES_WORK / target.near_work))
+        self._samples = min(SAMPLES, int(SAMPLES_WORK / _near_work(target)))
         if "kinds" not in kept:
             found = (
                 near_symmetries(search, target.index, *sample(surface, self._samples))
@@ -137,11 +136,6 @@ class NearSymmetry:
         return moved
 
     @property
-    def count(self) -> int:
-        """Return the number of kinds of motions."""
-        return len(self._kinds)
-
-    @property
     def turned(self) -> bool:
         """Whether some motion carries most of the model onto itself."""
         return len(self._kinds) > 0
@@ -155,40 +149,6 @@ class NearSymmetry:
     def marked(self) -> bool:
         """Whether a mark distinguishes the turned copies of the model, and nothing else does."""
         return self.near and self._share > 0.0
-
-    @property
-    def turning_work(self) -> int:
-        """The usual cost of :meth:`better` in point searches, where no pose is better."""
-        return 2 * SCREENED * sum(len(motions) for motions in self._kinds)
-
-    def work(self, points: int, others: int = 0) -> int:
-        """Return the usual cost of a decision between so many other poses and the turned ones in
-        point searches.
-        """
-        finalists = FINALISTS * len(self._kinds)
-        measured = self.compared_work(points, 1 + others + finalists)
-        return (
-            self.turning_work + finalists * (FINE_PASSES * 2 * SCREENED + self.ray_work) + measured
-        )
-
-    def compared_work(self, points: int, poses: int) -> int:
-        """Return the usual cost of comparing so many poses by the rays of a scan."""
-        return poses * (min(points, MOST_COMPARED_POINTS) + RAY_WORK * len(self._marks))
-
-    def after_search(self, points: int) -> int:
-        """Return the usual cost of what follows a search for a scan of so many points, in point
-        searches.
-        """
-        turned = self.work(points, FINALISTS) if self.marked else 0
-        return TEST_WORK + healthy_work(points, self._target.near_work) + turned
-
-    def search_work(self, points: int, number: int) -> int:
-        """Return the usual cost of round ``number`` of the search and of registering its result."""
-        return (
-            self.search.work(points, number)
-            + TEST_WORK
-            + healthy_work(points, self._target.near_work)
-        )
 
     def rays(self, scan: NDArray[np.floating]) -> Rays:
         """Return the rays of at most about ``MOST_COMPARED_POINTS`` points of a scan (n, 3) in
@@ -217,7 +177,7 @@ class NearSymmetry:
         return max(self._gate, self._near(least_noise(found)))
 
     def _near(self, noise_m: float) -> float:
-        return max(ON_MODEL_OF_EXTENT * self._target.index.extent_m, 3.0 * noise_m)
+        return max(LEAST_GATE_OF_EXTENT * self._target.index.extent_m, 3.0 * noise_m)
 
     def images(self, T_ca: Pose) -> list[Pose]:
         """Return the poses onto which the exact symmetries of the model carry a pose, where they
@@ -242,16 +202,16 @@ class NearSymmetry:
     def _distances(self, points: Array, motions: Array, most_m: float) -> Array:
         return distances(self._target.index, points, motions, most_m)
 
-    def turned_poses(self, rays: Rays, T_ca: Pose, better: bool) -> tuple[list[Pose], int]:
-        """Return the best poses that the near-symmetries give, registered, and at how many of them
-        the marks were tested.
+    def turned_poses(self, rays: Rays, T_ca: Pose, better: bool) -> list[Pose]:
+        """Return the best poses that the near-symmetries give, registered.
 
         Of equal ones those are taken at which fewer than ``LEAST_OFF_MODEL`` rays more than at the
         pose pass through a mark. ``better``: only poses that explain more rays, by
         ``LEAST_OFF_MODEL`` at least; also those turned by a few degrees, because a body of
         revolution with marks has a minimum wherever a mark of the model meets some of the points.
         """
-        stride, tested = self._stride, 0
+        # where all motions are compared, one mark in so many is tested
+        stride = max(1, -(-len(self._marks) // SCREENED_MARKS))
         passed = self._passed(rays, T_ca, stride)[0]
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
@@ -276,7 +236,6 @@ class NearSymmetry:
                 start = Pose.from_matrix(motions[k]) @ T_ca
                 if self.poses.among(start, kept if better else [T_ca, *kept]):
                     continue
-                tested += 1
                 if self._passed(rays, start, stride)[0] < min(
                     passed + LEAST_OFF_MODEL, most_cost - cost[k]
                 ):
@@ -284,21 +243,11 @@ class NearSymmetry:
                 if len(kept) == most:
                     break
         evenly = np.ascontiguousarray(rays.points[:: max(1, len(rays.points) // len(part))])
-        return [self.search.refined(evenly, start, width) for start in kept], tested
+        return [self.search.refined(evenly, start, width) for start in kept]
 
     def measured(self, rays: Rays, T_ca: Pose) -> Measured:
         """Return the distances of the points of rays at a pose, and what contradicts it."""
         return Measured(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
-
-    @property
-    def _stride(self) -> int:
-        """The marks of which one in so many is tested where all motions are compared."""
-        return max(1, -(-len(self._marks) // SCREENED_MARKS))
-
-    @property
-    def ray_work(self) -> int:
-        """Return the cost of the rays to the marks where all motions are compared."""
-        return RAY_WORK * -(-len(self._marks) // self._stride)
 
     def _passed(self, rays: Rays, T_ca: Pose, stride: int = 1) -> tuple[float, float]:
         """Rays that passed through marks that should be visible at a pose, and those expected where
@@ -332,6 +281,16 @@ class NearSymmetry:
         seen = np.flatnonzero(np.einsum("ij,ij->i", away, self._normals[::stride]) < -MARK_COSINE)
         first = self._target.index.cast(T_ca.t, away[seen])[0]
         return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
+
+
+def _near_work(target: Target) -> float:
+    """The cost of a search near a surface, in units of an ordinary one: it depends on the size of
+    the faces.
+    """
+    points, normals = sample(target.surface, NEAR_POINTS)
+    points = points[:: max(1, len(points) // NEAR_POINTS)]
+    near = points + ORDINARY_NOISE_OF_EXTENT * target.index.extent_m * normals[: len(points)]
+    return target.index.distances(near, Pose.identity(), np.inf, False, 1, 0.0)[1] / len(near)
 
 
 def prepared(

@@ -47,7 +47,9 @@ AS_NEAR = 1.02
 # error of size from sums of patches: over the least reported one, sigmas
 SUGGESTED = 0.4
 SUGGESTED_SIGMAS = 2.5
-MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
+# share of the points on the model, from which a fit is close and little is left to explain; with a
+# smaller one the sums of the inliers alone do not show the size
+LEAST_RATIO = 0.9
 # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
 UNCHANGED = 0.06
 NUMBERS = 1024  # normal numbers of the simulated noise
@@ -333,7 +335,7 @@ def _other_size(found: PoseQuality) -> bool:
     not on the model.
     """
     suggested = abs(found.size) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
-    return found.inliers < MANY_INLIERS * found.points or suggested
+    return found.inliers < LEAST_RATIO * found.points or suggested
 
 
 def _message(settled: bool, size_1s: float) -> str:
@@ -374,7 +376,7 @@ def _rule(
         move_m=accuracy[1] * extent,
         across=np.ascontiguousarray(across),
         beyond_m=WELL_OFF * gate_m,
-        least_close=MANY_INLIERS,
+        least_close=LEAST_RATIO,
         part=PART,
         numbers=normal_numbers(NUMBERS) if simulated else np.empty(0),
         many=SIMULATED,

@@ -22,7 +22,6 @@ from avsreplay.register.sampling import usable_points
 from avsreplay.register.shown import POSTPONED, Effort
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
-from avsreplay.register.work import Work, healthy_work, near_work
 
 
 class Registrar:
@@ -58,8 +57,7 @@ class Registrar:
         self.index = SurfaceIndex.build(
             surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir
         )
-        near = near_work(surface, self.index)
-        self.target = Target(surface, self.index, self.limits, self._visibility, near)
+        self.target = Target(surface, self.index, self.limits, self._visibility)
         self.backend = create_backend(self.params, factory, self.target)
         self.loop = Loop(self.target, self.params, self.backend, cache_dir)
 
@@ -95,21 +93,14 @@ class Registrar:
         whole = usable_points(points, self.params.subsample_m)
         if refused := self.loop.test.refused(whole, len(points), guess):
             return refused
-        scan, work = self.loop.test.around(whole, guess), self._work(whole)
-        if effort is Effort.GUESS:
-            hopeful, spent = self.loop.screen.confirms(scan, guess)
-            work.spend(spent)
-            if not hopeful:
-                status = AlignStatus.POSTPONED
-                return replace(quality.not_measured(len(scan), status, guess), message=POSTPONED)
+        scan = self.loop.test.around(whole, guess)
+        if effort is Effort.GUESS and not self.loop.screen.confirms(scan, guess):
+            status = AlignStatus.POSTPONED
+            return replace(quality.not_measured(len(scan), status, guess), message=POSTPONED)
         few, halves = self.loop.screen.part(scan), seq % self.params.split_every == 0
-        case = Case(Observed(whole), scan, few, work, guess, carried, halves, unknown)
+        case = Case(Observed(whole), scan, few, guess, carried, halves, unknown)
         found = self.loop.from_guess(case)
         return found if found.points == len(whole) else replace(found, points=len(whole))
-
-    def _work(self, scan: NDArray[Any]) -> Work:
-        """The work that a scan may cost."""
-        return Work(healthy_work(len(scan), self.target.near_work))
 
     def acquire(
         self,
@@ -139,14 +130,14 @@ class Registrar:
         few, seen = self.loop.screen.part(scan), Observed(scan)
         found = None
         if ambiguous is not None:
-            found = self.loop.turned(Case(seen, scan, few, self._work(scan), ambiguous))
+            found = self.loop.turned(Case(seen, scan, few, ambiguous))
         if found is not None and found.status is AlignStatus.AMBIGUOUS:
             return found
         if effort is not Effort.FULL and (found is None or found.status not in ACCEPTED):
             return replace(
                 quality.not_measured(len(points), AlignStatus.POSTPONED), message=POSTPONED
             )
-        return self.loop.without_guess(Case(seen, scan, few, self._work(scan)))
+        return self.loop.without_guess(Case(seen, scan, few))
 
     def images(self, T_ac: Pose) -> list[Pose]:
         """Return the poses that no scan can tell from a pose, because an exact symmetry of the

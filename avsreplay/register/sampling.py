@@ -40,7 +40,7 @@ DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 BIMODAL = 2.5
 SIGHT_POINTS = 1500  # of a scan, whose normals show the line of sight
-SIGHT_NEIGHBOURS = 12  # points of a scan to which the plane at one of them is fitted
+NORMAL_NEIGHBOURS = 12  # points of a scan to which the plane at one of them is fitted
 # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
 PARTIAL_OF_EXTENT = 0.85
 LARGER = 1.2  # a connected part larger than this many extents contains more than the target
@@ -232,18 +232,25 @@ def scan_axes(points: Array) -> list[Array]:
     return [*axes, *-axes]
 
 
-def line_of_sight(points: Array) -> Array:
-    """Return the unit direction (3,), up to its sign, from which a scan (n, 3) was probably
-    measured.
+def fitted_normals(points: Array, full: Array) -> Array:
+    """Return the unit normals (n, 3), up to their signs, of the planes through the nearest points.
+
+    Args:
+        points: (n, 3) [m].
+        full: (m, 3) all points of the scan, m > ``NORMAL_NEIGHBOURS`` [m].
+    """
+    full, points = (np.ascontiguousarray(each, dtype=np.float64) for each in (full, points))
+    tree = kernel_module().PointTree(full)
+    return np.asarray(tree.planes(full, full, points, points, NORMAL_NEIGHBOURS)[0])
+
+
+def line_of_sight(normals: Array) -> Array:
+    """Return the unit direction (3,), up to its sign, from which surface with normals (n, 3) was
+    probably measured.
 
     Rays of even density hit a face in proportion to the cosine between its normal and the direction
-    to the sensor, so that the mean square of this cosine is large.
+    to the sensor, so that the mean square of this cosine is largest along it.
     """
-    points = np.ascontiguousarray(points[:: max(1, len(points) // SIGHT_POINTS)], dtype=np.float64)
-    if len(points) <= SIGHT_NEIGHBOURS:
-        return scan_axes(points)[0]
-    tree = kernel_module().PointTree(points)
-    normals = tree.planes(points, points, points, points, SIGHT_NEIGHBOURS)[0]
     return np.asarray(np.linalg.eigh(normals.T @ normals)[1][:, -1])
 
 

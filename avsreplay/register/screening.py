@@ -1,7 +1,7 @@
 """Poses measured and registered by part of a scan, cheaply enough for many hypotheses.
 
 A graduated registration takes point-to-plane passes while the rejection distance falls
-geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``SCREEN_STOP_OF_EXTENT`` of the
+geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``LEAST_GATE_OF_EXTENT`` of the
 extent. The falling distance rejects outliers, which the rms rule of the normal alignment cannot do
 if they are the majority. Poses are compared by truncated squared distances at a common width.
 """
@@ -16,38 +16,32 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, Target
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.quality import PART
+from avsreplay.register.quality import LEAST_RATIO, PART
 from avsreplay.register.surface_index import IcpParams
-from avsreplay.register.work import CALL_WORK, LEAST_RATIO, STAGE_WORK
 
 POINTS = PART  # points of the scan by which hypotheses are screened
 HOPEFUL_POINTS = 150  # points that show whether a guess is hopeful
 # first and last rejection distance over the extent
 SCREEN_START_OF_EXTENT = 0.05
-SCREEN_STOP_OF_EXTENT = 0.004
 # factor on the rejection distance per stage, and passes per stage
 SCREEN_FALL = 0.6
 PASSES = 4
 # A pose replaces the first of several with a cost below this share of its cost. Nearer to 1, poses
 # are exchanged by the chance of noise.
 BETTER_THAN = 0.9
-# points nearer than so many widths are near; a rest is another object if most of these are on
+# points nearer than so many widths are near; a rest is another object if nearly all of these are on
 NEAR_WIDTHS = 5.0
-MOSTLY = 0.9
 
 
 @value_class
 class Screened:
-    """A pose T_ca, the distances (k,) [m] of the points used, their robust noise [m], and the work
-    in point searches that it took.
-    """
+    """A pose T_ca, the distances (k,) [m] of the points used, and their robust noise [m]."""
 
     T_ca: Pose
     distance: Array
     noise_m: float
-    work: int = 0
 
     def costs(self, width_m: float) -> Array:
         """Return min(1, squared distance in units of the width) of each point."""
@@ -64,7 +58,7 @@ class Screened:
         on, near = (
             int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR_WIDTHS)
         )
-        return on >= MOSTLY * near
+        return on >= LEAST_RATIO * near
 
 
 class Screen:
@@ -86,7 +80,7 @@ class Screen:
         test.
         """
         gates, gate = [], start_m
-        while gate > SCREEN_STOP_OF_EXTENT * self._extent:
+        while gate > LEAST_GATE_OF_EXTENT * self._extent:
             gates.append(gate)
             gate *= SCREEN_FALL
         rule = IcpParams(
@@ -109,35 +103,28 @@ class Screen:
         """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of
         ``PlausibilityTest.noise``.
         """
-        at, work = self._target.visibility.distances(self._target.index, points, T_ca, np.inf)
-        return Screened(T_ca, at, self._test.noise(at, T_ca, guess), work + CALL_WORK)
+        at = self._target.visibility.distances(self._target.index, points, T_ca, np.inf)
+        return Screened(T_ca, at, self._test.noise(at, T_ca, guess))
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float) -> Screened:
         """Return the pose after passes with a falling rejection distance, from ``start_m``
         [m] on.
         """
-        index, work = self._target.index, 0
+        index = self._target.index
         for rules in self._stages[start_m]:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
-            found = index.icp(points, T_ca, rules[facing])
-            T_ca = Pose.from_matrix(found.T_ca)
-            work += found.work + STAGE_WORK
-        at = self.measure(points, T_ca)
-        return replace(at, work=at.work + work)
+            T_ca = Pose.from_matrix(index.icp(points, T_ca, rules[facing]).T_ca)
+        return self.measure(points, T_ca)
 
-    def passes(self, start_m: float) -> int:
-        """Return the largest number of passes of one graduated registration."""
-        return PASSES * len(self._stages[start_m])
-
-    def confirms(self, scan: NDArray[Any], guess: Pose) -> tuple[bool, int]:
+    def confirms(self, scan: NDArray[Any], guess: Pose) -> bool:
         """Return whether few points of a scan (n, 3) in {A}, registered from a guess T_ac, are
-        mostly on the model; and the work.
+        mostly on the model.
         """
         few = scan[:: max(1, len(scan) // HOPEFUL_POINTS)]
         found = self.graduated(few, guess.inverse(), self.wide_m)
         width = max(self._target.limits.gate_m, 3.0 * found.noise_m)
         on = float(np.mean(found.distance < width))
-        return found.noise_m <= NOISE_OF_EXTENT * self._extent and on >= LEAST_RATIO, found.work
+        return found.noise_m <= NOISE_OF_EXTENT * self._extent and on >= LEAST_RATIO
 
     def width(self, at: Screened) -> float:
         """Return the rejection distance [m] for a scan that is not clean: three standard deviations
@@ -148,7 +135,7 @@ class Screen:
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(
-            min(self._target.limits.gate_m, SCREEN_STOP_OF_EXTENT * self._extent), 3.0 * noise
+            min(self._target.limits.gate_m, LEAST_GATE_OF_EXTENT * self._extent), 3.0 * noise
         )
 
     def least(self, found: list[Screened]) -> Screened:

@@ -33,7 +33,7 @@ SHAPE_POINTS = 2000  # of a scan, from which its shape is measured
 class Effort(Enum):
     """What is done for a scan of a run without an accepted pose."""
 
-    FULL = "registration, restarts and searches"
+    FULL = "registration and searches"
     GUESS = "the same if few points confirm the guess"
 
 

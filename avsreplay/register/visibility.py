@@ -91,13 +91,13 @@ class Visibility:
 
     def distances(
         self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, most_m: float
-    ) -> tuple[Array, int]:
+    ) -> Array:
         """Return the distances (n,) [m] of a scan to the faces that the camera sees, at most
-        ``most_m``; the work.
+        ``most_m``.
         """
         return index.distances(
             points, T_ca, most_m, self.faced(index, points, T_ca), TESTED_POINTS, LEAST_FACING
-        )
+        )[0]
 
     def may_be_camera(self, T_ca: Pose) -> bool:
         """Return whether the outer sides are known, and the origin of {A} is clear of the bounding
@@ -148,7 +148,7 @@ class Visibility:
                 camera left out.
 
         Returns:
-            The result, with the passes and the work of all alignments made, three at most.
+            The result, with the passes of all alignments made, three at most.
         """
         if not self.sided or self.may_be_camera(guess):
             return align(guess, self.camera_c(index, points, guess) is not None)
@@ -157,11 +157,7 @@ class Visibility:
             made.append(align(guess, False))
             if self.camera_c(index, points, made[1].T_ca) is not None:
                 made.append(align(made[1].T_ca, True))
-        return replace(
-            made[-1],
-            iterations=sum(fit.iterations for fit in made),
-            work=sum(fit.work for fit in made),
-        )
+        return replace(made[-1], iterations=sum(fit.iterations for fit in made))
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
         """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin; None if the

@@ -10,7 +10,7 @@ main directions of its faces; the displacements are in the plane of the scan.
 
 from __future__ import annotations
 
-from collections.abc import Generator as Steps
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import permutations, product
@@ -24,12 +24,9 @@ from avsreplay.register.global_search import (
     FINE_POINTS,
     FIRST_PASSES,
     GATE_FALL,
-    LAST_FINE_POINTS,
-    LOOK_UPS,
     MIDDLE_OF_EXTENT,
     MIDDLE_POINTS,
     MODEL_POINTS,
-    REGISTERED_WORK,
     RIVAL_AFTER,
     best_of,
 )
@@ -37,8 +34,8 @@ from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
 from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import SAME_RAD
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.sampling import sample_evenly, thin_to
-from avsreplay.register.work import LEAST_RATIO, NOT_COMPARED
 
 # of displaced starts: points, their distance, and steps each way
 START_POINTS = 50
@@ -58,9 +55,6 @@ LAST = 6
 # poses that are compared with more points, and that are registered to the model
 COMPARED_FIRST = 16
 REGISTERED_STARTS = 4
-# cost of these poses; usual one for each point, of a part of the target
-FIXED_WORK = 10_000
-POINT_WORK = (540, 900)
 # cosines of normals at right angles and parallel; share of the surface
 SQUARE = 0.1
 ALONG = 0.98
@@ -73,12 +67,10 @@ class Displaced(Generator):
     another object.
     """
 
-    missing = NOT_COMPARED
-
     def __init__(self, target: Target, test: PlausibilityTest, symmetry: NearSymmetry) -> None:
         self._target, self._test, self._symmetry = target, test, symmetry
         self._search, self._extent = symmetry.search, target.surface.extent
-        self._gate, self._most = target.limits.gate_m, 2**62
+        self._gate = target.limits.gate_m
 
     def needed(self, case: Case) -> bool:
         """Return whether such poses are possible."""
@@ -88,35 +80,14 @@ class Displaced(Generator):
     def _partial(self, case: Case) -> bool:
         return self._test.partial(case.target, case.at.T_ca)
 
-    def work(self, case: Case) -> int:
-        """Return the usual cost for the points on the model."""
-        return self.usual(case.at.found.inliers, len(case.points), self._partial(case))
-
-    def usual(self, on: int, points: int, partial: bool) -> int:
-        """Return the usual cost for a scan with so many points on the model, and in all.
-
-        Args:
-            on: points on the model.
-            points: of the scan.
-            partial: the scan shows a part of the target.
-        """
-        registered = REGISTERED_WORK * min(on, LAST_FINE_POINTS)
-        compared = self._symmetry.compared_work(points, 1 + REGISTERED_STARTS)
-        return FIXED_WORK + POINT_WORK[partial] * START_POINTS + registered + compared
-
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield at most ``REGISTERED_STARTS`` poses that explain the points on the model nearly
         as well.
         """
         rays, T_ca = self._symmetry.rays(case.points), case.at.T_ca
         on = self._test.measure(rays.points, T_ca) < self._gate
-        compared = self._symmetry.compared_work(len(rays.points), 1 + REGISTERED_STARTS)
-        found, work = self._poses(
-            rays.points[on], T_ca, self._partial(case), case.work.left - compared
-        )
-        for each in found:
+        for each in self._poses(rays.points[on], T_ca, self._partial(case)):
             yield Hypothesis(each)
-        return work + compared
 
     def compared(
         self, case: Case, found: list[Hypothesis]
@@ -134,13 +105,9 @@ class Displaced(Generator):
         moved = not self._symmetry.poses.same(best.T_ca, at.T_ca)
         return (Hypothesis(best.T_ca) if moved else None), kept
 
-    def _poses(self, points: Array, T_ca: Pose, partial: bool, left: int) -> tuple[list[Pose], int]:
-        """Other poses that explain points (n, 3) in {A} on the model nearly as well, and the work.
-
-        After most of the work that is ``left`` no pose is registered.
-        """
+    def _poses(self, points: Array, T_ca: Pose, partial: bool) -> list[Pose]:
+        """Other poses that explain points (n, 3) in {A} on the model nearly as well."""
         search = self._search
-        search.spent, search.registered = 0, LAST_FINE_POINTS
         L, width = self._extent, MIDDLE_OF_EXTENT * self._extent
         threads = self._target.limits.threads
         few, some, fine = (
@@ -150,7 +117,6 @@ class Displaced(Generator):
         sight = self._target.visibility.direction_to_camera(points)
         facing = self._target.visibility.sided and sight is not None
         starts = self._displaced(few, T_ca, sight, STEPS_EACH_WAY if partial else 1)
-        looked = len(few[::2]) * sum(map(len, starts)) * 3
         rule = (GATE_FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         kept = []
         for each, most in zip(starts, MOST, strict=True):
@@ -159,19 +125,16 @@ class Displaced(Generator):
             )
             kept.append(search.poses.different(best_of(poses, costs, len(poses)), most, 0.3))
         poses = np.concatenate(kept)
-        looked += len(few) * len(poses) * (1 + SECOND)
         poses, costs = search.field.refine(few, poses, SECOND, SECOND_GATE * L, *rule)
         poses = search.poses.different(best_of(poses, costs, len(poses)), sum(MOST), 0.3)
         moved = few @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
         d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=width).d2.reshape(
             len(poses), -1
         )
-        costs, search.spent = np.minimum(d2 / width**2, 1.0).mean(axis=1), d2.size
+        costs = np.minimum(d2 / width**2, 1.0).mean(axis=1)
         poses = search.poses.different(best_of(poses, costs, len(poses)), COMPARED_FIRST, 0.5)
-        looked += len(some) * len(poses) * (1 + LAST)
         rule = (GATE_FALL, 0.01 * L, width, facing, threads)
         poses, _ = search.field.refine(some, poses, LAST, 2.0 * width, *rule)
-        search.most = left - FIXED_WORK - looked // LOOK_UPS
         first, *found = [
             search.measured(some, each, MIDDLE_OF_EXTENT)
             for each in (T_ca, *map(Pose.from_matrix, poses))
@@ -187,7 +150,7 @@ class Displaced(Generator):
             for T in search.poses.different(np.stack(near), 1 + REGISTERED_STARTS, 0.5)[1:]
         ]
         ended = search.to_the_end(fine, others, width)[0]
-        return [each.T_ca for each in ended], FIXED_WORK + looked // LOOK_UPS + search.spent
+        return [each.T_ca for each in ended]
 
     def _displaced(
         self, few: Array, T_ca: Pose, sight: Array | None, most: int

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator as Steps
+from collections.abc import Iterator
 
 from avsreplay.register.backend import Target
 from avsreplay.register.hypotheses import Case, Generator, Hypothesis, Refine
 from avsreplay.register.plausibility import NOISE_OF_EXTENT
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.screening import BETTER_THAN, Screen
-from avsreplay.register.work import LEAST_RATIO
 
 # The second of two results from these poses replaces the first with a cost below this share of its
 # cost, so that equal ones are not exchanged.
@@ -20,11 +20,10 @@ class Guess(Generator):
 
     refine = Refine.BACKEND
 
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield the predicted pose."""
         assert case.guess is not None
         yield Hypothesis(case.guess.inverse())
-        return 0
 
 
 class WithinNoise(Generator):
@@ -39,7 +38,7 @@ class WithinNoise(Generator):
         self._gate, self._screen = target.limits.gate_m, screen
         self._most_noise = NOISE_OF_EXTENT * target.surface.extent
 
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield none, one or both of these poses."""
         assert case.guess is not None
         first, guess = case.at.found, case.guess
@@ -50,5 +49,4 @@ class WithinNoise(Generator):
         found = [at] if worse or first.inlier_ratio >= LEAST_RATIO else [at, before]
         for each in found:
             if first.measured and each.noise_m <= self._most_noise:
-                yield Hypothesis(each.T_ca, at=each)
-        return at.work + before.work
+                yield Hypothesis.of(each)

@@ -5,22 +5,19 @@ because that could only move them away.
 
 from __future__ import annotations
 
-from collections.abc import Generator as Steps
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array
 from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import motions_outside
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis, Refine
 from avsreplay.register.near_symmetry import LEAST_OFF_MODEL, NearSymmetry
 from avsreplay.register.poses import ONE_MINIMUM
-from avsreplay.register.symmetry import FINALISTS
-from avsreplay.register.work import TEST_WORK
 
-NOT_TURNED = "the model is nearly symmetric, and no work is left to compare its turned poses"
 # share of points off the model from which bodies with large marks are compared with their turned
 # poses
 MANY_OFF = 0.1
@@ -29,7 +26,6 @@ MANY_OFF = 0.1
 class Turns(Generator):
     """Poses turned by near-symmetries, for the result of a search."""
 
-    missing = NOT_TURNED
     examined = True
 
     def __init__(self, symmetry: NearSymmetry) -> None:
@@ -39,26 +35,19 @@ class Turns(Generator):
         """Return whether a mark alone distinguishes the turned copies of the model."""
         return self._symmetry.marked
 
-    def work(self, case: Case) -> int:
-        """Return the usual cost of the comparison."""
-        return self._symmetry.work(len(case.target), len(case.at.rivals))
-
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield the different poses that are known to explain the scan, and the turned ones."""
         for each in case.at.rivals:
             yield Hypothesis(each)
-        poses, tested = self._turned(case, False)
-        for each in poses:
-            yield Hypothesis(each)
-        more = max(0, tested - FINALISTS * self._symmetry.count) * self._symmetry.ray_work
-        return Turns.work(self, case) + more
+        yield from self._turned(case, False)
 
-    def _turned(self, case: Case, better: bool) -> tuple[list[Pose], int]:
-        """The turned poses, and at how many of them the marks were tested."""
+    def _turned(self, case: Case, better: bool) -> Iterator[Hypothesis]:
+        """The turned poses."""
         rays = self._symmetry.rays(case.target)
         if not len(rays.points):
-            return [], 0
-        return self._symmetry.turned_poses(rays, case.at.T_ca, better)
+            return
+        for each in self._symmetry.turned_poses(rays, case.at.T_ca, better):
+            yield Hypothesis(each)
 
     def compared(
         self, case: Case, found: list[Hypothesis]
@@ -85,7 +74,7 @@ class TurnsOfGuess(Turns):
 
     def __init__(self, target: Target, symmetry: NearSymmetry) -> None:
         super().__init__(symmetry)
-        self._extent, self._complete = target.surface.extent, True
+        self._extent = target.surface.extent
 
     def needed(self, case: Case) -> bool:
         """Return whether enough points are off the model, or some motion is not known."""
@@ -98,25 +87,12 @@ class TurnsOfGuess(Turns):
         """The motions (6, k) that neither guess nor view determine."""
         return motions_outside(case.unknown, case.at.found.free, self._extent)
 
-    def work(self, case: Case) -> int:  # noqa: ARG002
-        """Return the usual cost of finding that no turned pose explains more."""
-        return self._symmetry.turning_work
-
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield the turned poses."""
-        self._complete = True
         if self._open(case).size:
-            work = yield from super().hypotheses(case)
-            return work
-        poses, tested = self._turned(case, True)
-        screened = self._symmetry.turning_work + (1 + tested) * self._symmetry.ray_work
-        if not poses:
-            return screened
-        work = Turns.work(self, case)
-        self._complete = case.work.allows(work + TEST_WORK)
-        for each in poses if self._complete else ():
-            yield Hypothesis(each)
-        return work if self._complete else screened
+            yield from super().hypotheses(case)
+        else:
+            yield from self._turned(case, True)
 
     def compared(
         self, case: Case, found: list[Hypothesis]
@@ -124,8 +100,6 @@ class TurnsOfGuess(Turns):
         """Return the pose for which the rays decide; the others leave only motions open of which
         the guess has no information.
         """
-        if not self._complete:
-            return None, replace(case.at, missing=self.missing)
         chosen, kept = super().compared(case, found)
         assert kept is not None
         motions = self._open(case)
@@ -138,11 +112,10 @@ class NearestImage(Generator):
     guess.
     """
 
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
         """Yield these poses unmoved."""
         for each in case.at.images or ():
             yield Hypothesis(each)
-        return 0
 
     def compared(
         self, case: Case, found: list[Hypothesis]

@@ -9,7 +9,7 @@ that is displaced towards the camera.
 
 from __future__ import annotations
 
-from collections.abc import Generator as Steps
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,15 +20,13 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, RADIUS_OF_EXTENT, Target
 from avsreplay.register.comparison import as_good
 from avsreplay.register.degenerate import scaled_information
-from avsreplay.register.generators.restarts import screened
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
-from avsreplay.register.screening import SCREEN_STOP_OF_EXTENT, Screen, Screened
-from avsreplay.register.work import FAR_WORK, LAST_WORK, NOT_COMPARED
+from avsreplay.register.screening import Screen, Screened
 
 DISPLACED_POINTS = 300  # points that are registered from displaced poses
 DIRECTIONS = 3  # weak directions, each both ways
@@ -38,7 +36,6 @@ DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 BESIDE_SIGMAS = 4.0
 LEAST_INLIERS = 6  # which determine a pose
 UNMOVED = 0.25  # a pose nearer to its guess, in gates, is not compared
-RADIUS_OF_EXTENT = 0.25  # usual rms radius of a scan over the extent
 
 
 @value_class
@@ -49,14 +46,12 @@ class Weak:
         centre, radius_m: (3,) mean and rms radius of the inliers in {C} [m].
         motions: (k, 6) displacements x = [L theta; u] [m] with the radius L about the centre.
         at: the distances at the pose.
-        camera_c: (3,) the camera in {C} if only faces towards it are matched.
     """
 
     centre: Array
     radius_m: float
     motions: Array
     at: Screened
-    camera_c: Array | None
 
     def displaced(self, x: Array) -> Pose:
         """Return the pose moved by x (6,)."""
@@ -67,9 +62,8 @@ class Weak:
 
 def weak_motions(
     target: Target, screen: Screen, few: NDArray[Any], T_ca: Pose, count: int
-) -> tuple[Weak | None, int]:
-    """Return the ``count`` motions that points (n, 3) in {A} determine least at a pose; and the
-    work.
+) -> Weak | None:
+    """Return the ``count`` motions that points (n, 3) in {A} determine least at a pose.
 
     None with fewer than ``LEAST_INLIERS`` on the model, which do not determine a pose.
     """
@@ -78,31 +72,30 @@ def weak_motions(
     on = at.distance < gate
     sums = target.index.normal_equations(few, T_ca, gate, facing=camera_c is not None)
     if min(sums.inliers, int(on.sum())) < LEAST_INLIERS:
-        return None, at.work
+        return None
     centre = T_ca.apply(few[on]).mean(axis=0)
     info, radius = scaled_information(sums.info, sums.inliers, centre)
     motions = np.linalg.eigh(info)[1][:, :count].T
-    return Weak(centre, radius, motions, at, camera_c), at.work
+    return Weak(centre, radius, motions, at)
 
 
 class WeakDirections(Generator):
     """Poses registered again after displacements along weak directions and towards the camera."""
-
-    missing = NOT_COMPARED
 
     def __init__(
         self, target: Target, test: PlausibilityTest, screen: Screen, poses: Sameness
     ) -> None:
         self._target, self._test, self._screen, self._poses = target, test, screen, poses
         self._extent = target.surface.extent
-        self._complete = True
 
     def needed(self, case: Case) -> bool:
         """Return whether other minima near the candidate are possible: not at the predicted pose,
-        and not where the scan shows all of the target on faces that face the camera.
+        and not where the scan shows all of the target on faces that face the camera. Of the result
+        of a search, whether a panel can be matched to its other side.
         """
-        assert case.guess is not None
-        at = case.at
+        at, target = case.at, self._target
+        if case.guess is None:
+            return target.visibility.camera_c(target.index, case.few, at.T_ca) is None
         if not at.accepted or not self._moved(at.T_ca, case.guess):
             return False
         aligned = at.found.status is AlignStatus.ALIGNED
@@ -116,51 +109,23 @@ class WeakDirections(Generator):
         turned = float(geometry.angle(step.q)) * RADIUS_OF_EXTENT * self._extent
         return turned + self._poses.shift(step) > UNMOVED * self._target.limits.gate_m
 
-    def work(self, case: Case | None = None) -> int:  # noqa: ARG002
-        """Return the usual cost of the minima around a pose."""
-        passes = self._screen.passes(self._screen.narrow_m)
-        return int((1 + 2 * DIRECTIONS) * FAR_WORK * passes * DISPLACED_POINTS)
-
-    def hypotheses(self, case: Case) -> Steps[Hypothesis, None, int]:
-        """Yield the candidate so far and the minima around it; of a degenerate view only the other
-        side of a panel, because the others differ by motions that the view leaves free anyway.
+    def hypotheses(self, case: Case) -> Iterator[Hypothesis]:
+        """Yield the candidate so far, and the minima to which displacements towards the camera and
+        along the weak directions both ways lead; of a degenerate view only the other side of a
+        panel, because the others differ by motions that the view leaves free anyway.
         """
-        aligned = case.at.found.status is AlignStatus.ALIGNED
-        return self.around(case, case.at.T_ca, DIRECTIONS if aligned else 0)
-
-    def around(
-        self, case: Case, T_ca: Pose, count: int, kept: int = 0
-    ) -> Steps[Hypothesis, None, int]:
-        """Yield a pose, and those registered after a displacement towards the camera and along
-        ``count`` directions both ways, while the work besides ``kept`` allows it.
-        """
+        aligned, T_ca = case.at.found.status is AlignStatus.ALIGNED, case.at.T_ca
         few = case.few[:: max(1, len(case.few) // DISPLACED_POINTS)]
-        weak, work = weak_motions(self._target, self._screen, few, T_ca, count)
-        yield Hypothesis.of(self._screen.measure(case.few, T_ca), work)
-        self._complete, dearest = True, 0  # work of one registration so far
+        weak = weak_motions(self._target, self._screen, few, T_ca, DIRECTIONS if aligned else 0)
+        yield Hypothesis.of(self._screen.measure(case.few, T_ca))
         if weak is None:
-            return 0
+            return
         towards = T_ca.t - weak.centre
         nearer = np.concatenate([np.zeros(3), towards])[None] / np.linalg.norm(towards)
         moves = np.concatenate([nearer, weak.motions, -weak.motions])
         for x in DISPLACED_OF_EXTENT * self._extent * moves:
-            if dearest + kept > case.work.left:
-                self._complete = False
-                break
             ended = self._screen.graduated(few, weak.displaced(x), self._screen.narrow_m)
-            at = self._screen.measure(case.few, ended.T_ca)
-            dearest = max(dearest, at.work + ended.work)
-            yield Hypothesis.of(at, ended.work)
-        return 0
-
-    def possible(self, case: Case, at: Screened) -> bool:
-        """Return whether the result of a search can be matched to the other side of a panel, and
-        can be accepted.
-        """
-        target = self._target
-        known = target.visibility.camera_c(target.index, case.few, at.T_ca) is not None
-        hopeless = at.noise_m > NOISE_OF_EXTENT * self._extent
-        return not known and not hopeless and self.work() + LAST_WORK <= case.work.left
+            yield Hypothesis.of(self._screen.measure(case.few, ended.T_ca))
 
     def compared(
         self, case: Case, found: list[Hypothesis]
@@ -168,15 +133,13 @@ class WeakDirections(Generator):
         """Return a clearly better minimum; the candidate is doubted if another explains the scan
         as well.
         """
-        minima, at = screened(found), case.at
-        if not self._complete:
-            return None, replace(at, missing=NOT_COMPARED)
+        minima, at = [each.at for each in found if each.at is not None], case.at
         best, width = self._screen.least(minima), 3.0 * min(each.noise_m for each in minima)
-        width = max(SCREEN_STOP_OF_EXTENT * self._extent, width)
+        width = max(LEAST_GATE_OF_EXTENT * self._extent, width)
         others = (e for e in minima if not self._poses.same(best.T_ca, e.T_ca, ONE_MINIMUM))
         aligned = at.found.status is AlignStatus.ALIGNED
         beside = aligned and any(
             as_good(best.costs(width), each.costs(width), 0.0, BESIDE_SIGMAS) for each in others
         )
-        chosen = None if best is minima[0] else Hypothesis(best.T_ca, at=best)
+        chosen = None if best is minima[0] else Hypothesis.of(best)
         return chosen, replace(at, beside=beside)
