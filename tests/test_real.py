@@ -46,7 +46,7 @@ def test_48_degree_steps_are_kept_also_from_the_last_pose(dragon, cli):
 
 
 def test_72_degree_steps_are_kept(dragon, cli):
-    """The search that follows failed restarts finds the second scan, also where the pipeline does
+    """The search that follows a failed registration finds the second scan, also where the pipeline does
     not acquire anew.
     """
     for setting in ((), ("--set", "reacquire=false")):

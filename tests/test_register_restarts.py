@@ -1,4 +1,4 @@
-"""Local minima: a far guess does not leave a wrong pose that a restart could replace."""
+"""Local minima: a far guess does not leave a wrong pose."""
 
 import itertools
 from dataclasses import replace
@@ -92,28 +92,24 @@ def near(T_ac: Pose, degrees: float, shift_m: float) -> Pose:
 
 
 @pytest.mark.parametrize("noise", [0.008, 0.015])
-def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
+def test_noise_is_no_reason_for_a_search(noise, monkeypatch):
     """A poor fit whose misfit neighbouring points do not share is registered once more, with a
     wider rejection.
     """
     surface, T_ac = boxes(), example_pose()
-    registrar, calls, restarts = Registrar(surface), [], []
+    registrar, calls, searches = Registrar(surface), [], []
     scan = seen(surface, T_ac, noise, np.random.default_rng(3))
-    graded, graduated = registrar.loop.grader.graded, registrar.loop.screen.graduated
+    graded, search = registrar.loop.grader.graded, GlobalSearch.search
     monkeypatch.setattr(
         registrar.loop.grader,
         "graded",
         lambda *args, **named: calls.append(1) or graded(*args, **named),
     )
-    monkeypatch.setattr(
-        registrar.loop.screen,
-        "graduated",
-        lambda *args: restarts.append(1) or graduated(*args),
-    )
+    monkeypatch.setattr(GlobalSearch, "search", lambda *args: searches.append(1) or search(*args))
     found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
     assert found.status is AlignStatus.ALIGNED
     assert found.inlier_ratio > 0.93
-    assert (len(calls), len(restarts)) == (2, 0)
+    assert (len(calls), len(searches)) == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -297,9 +293,7 @@ def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
 def test_where_the_guess_is_only_tested_nothing_is_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Between the due scans of a run without an accepted pose: no restart, no search, no
-    steps along the valley.
-    """
+    """Between the due scans of a run without an accepted pose: no search."""
     rng = np.random.default_rng(8)
     sphere = rng.standard_normal((600, 3))
     scan = 1.2 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
@@ -425,7 +419,7 @@ def test_a_plane_face_without_an_edge_near_the_points_has_no_bias():
     assert first.covariance.tobytes() == second.covariance.tobytes()
 
 
-def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
+def test_a_wrong_minimum_of_a_target_with_small_parts_is_left(shared_data):
     """The distances at this minimum change their sign within a twentieth of the extent;
     nearly all are inliers.
     """
