@@ -189,7 +189,7 @@ class Loop:
             self._recover(case)
         if not case.at.reason and not case.at.searched:
             if self._far(case):
-                self._verify(case)
+                self._searched(case, MOST_ATTEMPTS, always=True)
             else:
                 self._compare(case)
         return self._decided(case)
@@ -210,9 +210,7 @@ class Loop:
         overlap = case.at.found.status is not AlignStatus.NO_OVERLAP  # without: another object
         self._draw_both(case)
         self._examine(case)
-        if not self._open(case):
-            return
-        if overlap:
+        if overlap and self._open(case):
             self._searched(case, 1)
 
     def _draw_both(self, case: Case) -> None:
@@ -252,10 +250,6 @@ class Loop:
             return found.measured and angle > FAR_RAD
         degenerate = found.status is AlignStatus.DEGENERATE
         return not degenerate and len(self.symmetry.search.symmetries) > 0
-
-    def _verify(self, case: Case) -> None:
-        """Replace a far candidate by the result of a search."""
-        self._searched(case, MOST_ATTEMPTS, always=True)
 
     def _compare(self, case: Case) -> None:
         """Compare the candidate with the minima near it and with the poses turned by a
