@@ -145,7 +145,7 @@ def compare_sizes(
     if 2 * len(located) >= len(clouds):
         why = f"the model was found in {len(located)} of {len(clouds)} examined scans"
         among = Advice("ok", "size", f"{said}; {why}, among other points")
-        region = _region_advice(located, len(clouds), why, follow_back)
+        region = _region_advice(located, why, follow_back)
         return [region or _crop_advice(clouds, [each.points for each in located], why) or among]
     return (
         _background_advice(clouds, model_m, ratio, said, located, follow_back)
@@ -182,7 +182,7 @@ def _background_advice(
     grouped = len(inside) * 2 > len(clouds)
     if grouped:
         why = f"a group of points has the size of the model in {len(inside)} of {len(clouds)} scans"
-        if region := _region_advice(inside, len(clouds), why, follow_back, located):
+        if region := _region_advice(inside, why, follow_back, located):
             return [region]
         points = [each.points for each in inside]
         if crop := _crop_advice(clouds, points, _of_size(model_m)):
@@ -244,7 +244,8 @@ def find_model(
     one, any_pose = _counts(poses)
     mirrored = _mirror_advice(few, poses, registrar, model, options)
     text = f"the model is found in {any_pose} of {len(few)} searched scans"
-    if any_pose < len(few):
+    background = any(each.option.startswith("--crop") for each in found)
+    if any_pose < len(few) and not background:  # without the other points it can be found
         anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[1]
         if anywhere > any_pose + 1:  # one scan more may be chance
             text += (
@@ -465,13 +466,11 @@ def _located(
 
 def _region_advice(
     found: Sequence[Sighting],
-    examined: int,
     why: str,
     follow_back: FollowBack | None,
     located: Sequence[Sighting] = (),
 ) -> Advice | None:
-    """The region that follows a target that moves farther than its size, and is not found in all
-    examined scans; None where it does not.
+    """The region that follows a target that moves farther than its size; None where it does not.
 
     The position at the first scan is that of the first ``located`` or else found target that can be
     followed back to it.
@@ -479,7 +478,7 @@ def _region_advice(
     size_m = max(diameter(each.points, trimmed=False) for each in found)
     centres = np.array([each.points.mean(axis=0) for each in found])
     moved_m = float(np.ptp(centres, axis=0).max())
-    if len(found) == examined or moved_m <= size_m:
+    if moved_m <= size_m:
         return None
     text = f"{why}, and moves by {_metres(moved_m)}: no fixed crop keeps it"
     for each in (*located, *found):
