@@ -343,8 +343,9 @@ class Replanning:
         """What is known of errors after a scan."""
         row = self.saved.rows[index]
         torque, force = row.torque_noise_radps15, row.force_noise_mps15
-        known = torque is not None and force is not None
-        return ScanErrors(disturbances=(torque, force) if known else None)
+        if torque is None or force is None:
+            return ScanErrors()
+        return ScanErrors(disturbances=(torque, force))
 
     def _setup(self, flights: int, seed: int) -> Setup:
         surface = self.saved.surface
