@@ -51,6 +51,8 @@ from avsreplay.plan.flights import (
     closed_loop,
     closed_miss,
     flown_positions,
+    relative_path,
+    true_scene,
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry, axis_blocked
@@ -631,12 +633,12 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
     return setup.contact.touched(_flown_past(setup, setup.contact, log, end_ns, z))
 
 
-def _flown(log: FlightLog, end_ns: int) -> Iterator[tuple[Leg, NDArray[np.int64], Array]]:
-    """Legs that were flown until an instant, each with instants (n,) [ns] and positions (n, 3)."""
+def _flown(log: FlightLog, end_ns: int) -> Iterator[tuple[Leg, int, int]]:
+    """Legs that were flown until an instant, each with its begin and its end [ns]."""
     stamps = [leg.belief.t_ns for leg in log.legs]
     for leg, (begin_ns, next_ns) in zip(log.legs, pairwise([*stamps, end_ns]), strict=True):
         if (stop_ns := min(next_ns, end_ns)) > begin_ns:
-            yield leg, *flown_positions(leg.segment, begin_ns, stop_ns)
+            yield leg, begin_ns, stop_ns
 
 
 def _flown_past(setup: Setup, contact: Contact, log: FlightLog, end_ns: int, z: Array) -> Array:
@@ -648,7 +650,8 @@ def _flown_past(setup: Setup, contact: Contact, log: FlightLog, end_ns: int, z: 
     """
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
     parts: list[Array] = [np.zeros((len(z), 0, 3))]
-    for leg, instants, r in _flown(log, end_ns):
+    for leg, begin_ns, stop_ns in _flown(log, end_ns):
+        instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
         times: Array = np.asarray((instants - leg.belief.t_ns) * 1e-9, np.float64)
         rho = setup.estimator.motion(leg.belief)(times)[0] if len(times) else r
         if not len(r) or float(np.linalg.norm(r - rho, axis=1).min()) > 1.5 * reach:
@@ -696,12 +699,11 @@ def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -
     """Whether the flown path touched the true target; None where this is not known."""
     if setup.contact is None:
         return None
-    parts: list[Array] = []
-    for _, instants, r in _flown(log, end_ns):
-        rho, _, q = truth(np.asarray((instants - setup.since_ns) * 1e-9, np.float64))
-        known = np.isfinite(rho).all(axis=1)
-        turned = np.einsum("nji,nj->ni", geometry.matrix(q[known]), (r - rho)[known])
-        parts.append(turned)
+    target = true_scene(truth)
+    parts = [
+        relative_path(target, leg.segment, setup.since_ns, begin_ns, stop_ns)
+        for leg, begin_ns, stop_ns in _flown(log, end_ns)
+    ]
     y = np.concatenate([np.zeros((0, 3)), *parts])
     return bool(setup.contact.touched(y[None])[0])
 

@@ -31,7 +31,7 @@ from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
 from avsreplay.plan.constrained import constrained, linearised_s, with_safety
-from avsreplay.plan.flights import Ended, Miss, closed_loop, miss
+from avsreplay.plan.flights import Ended, Miss, closed_loop, miss, true_scene
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
@@ -386,7 +386,7 @@ class Replanning:
 
     def execute(self) -> Ended | None:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
-        if (truth := self.truth) is None:
+        if self.truth is None:
             return None
-        target = Scene(lambda times: truth(times)[:2], lambda times: truth(times)[2])
+        target = true_scene(self.truth)
         return closed_loop(self._guidance(), self._inputs(), target, self.saved.since_ns)

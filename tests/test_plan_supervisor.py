@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import IDENTITY_QUAT, Pose, exp
-from avsreplay.plan.flights import closed_loop, interpolated, miss
+from avsreplay.plan.flights import closed_loop, interpolated, miss, true_scene
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import CostatePath
@@ -171,11 +171,7 @@ def inputs(
 
 def fly(truth, **kwargs):
     guidance = Guidance(PlanParams(), Supervisor(PARAMS))
-    return closed_loop(guidance, inputs(truth, **kwargs), target_of(truth), 0)
-
-
-def target_of(truth):
-    return Scene(lambda times: truth(times)[:2], lambda times: truth(times)[2])
+    return closed_loop(guidance, inputs(truth, **kwargs), true_scene(truth), 0)
 
 
 def rules_of(execution):
@@ -245,7 +241,7 @@ def test_latency_is_flown_on_the_current_segment():
     )  # the first plan's thrust begins 0.7 s later
     jumps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert jumps.max() < 0.05 * 0.2 * 25  # no faster than thrust allows: the path is continuous
-    execution = closed_loop(guidance, inputs(truth), target_of(truth), 0)
+    execution = closed_loop(guidance, inputs(truth), true_scene(truth), 0)
     assert execution.miss.distance_m < 1e-6
 
 

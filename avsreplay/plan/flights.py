@@ -106,6 +106,15 @@ def closed_miss(
     return _miss_at((end_ns - since_ns) * 1e-9, (end_ns - made_ns) * 1e-9, r, v, truth, attitude)
 
 
+def true_scene(truth: Motion) -> Scene:
+    """Return the target of a true motion.
+
+    Args:
+        truth: True motion of the fixture.
+    """
+    return Scene(lambda times: truth(times)[:2], lambda times: truth(times)[2])
+
+
 def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     """Interpolate recorded poses: cubic spline for the position, constant angular rate between
     attitudes.
@@ -298,7 +307,8 @@ def flown_positions(
 def relative_path(
     scene: Scene, segment: Segment, start_ns: int, begin_ns: int, end_ns: int
 ) -> Array:
-    """Return the positions (n, 3) of the robot from the grasp point in {C} between two scans.
+    """Return the positions (n, 3) of the robot from the grasp point in {C} between two scans, where
+    the target is known.
 
     Args:
         scene: The target.
@@ -311,4 +321,5 @@ def relative_path(
     if not len(r) or scene.attitude is None:
         return np.zeros((0, 3))
     times = np.asarray((instants - start_ns) * 1e-9, dtype=np.float64)
-    return in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
+    y = in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
+    return y[np.isfinite(y).all(axis=1)]
