@@ -268,7 +268,8 @@ def test_a_scene_without_the_model_suggests_no_unit(surface, size):
     )
     directions = rng.normal(size=(6, 400, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    cloud = (centres[:, None] + 0.12 * extent * directions).reshape(-1, 3) + [0, 0, 2 * extent]
+    cloud = (centres[:, None] + 0.12 * extent * directions).reshape(-1, 3)
+    cloud[:, 2] += 2 * extent  # in front of the sensor
     found = [a for a in preflight(Log([cloud] * 3), surface) if a.about in ("unit", "size")]
     assert [a.grade for a in found] == ["fail"]
     assert "unit" not in found[0].option
