@@ -51,6 +51,8 @@ from avsreplay.plan.flights import (
     closed_loop,
     closed_miss,
     flown_positions,
+    relative_path,
+    true_scene,
 )
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry, axis_blocked
@@ -95,6 +97,24 @@ class Leg:
     rule: str
 
 
+@value_class
+class ScanErrors:
+    """What is known of errors after a scan.
+
+    Attributes:
+        noise: (6, 6) covariance of d = [theta; v], the error of the measured pose in {C} [rad, m];
+            None where nothing was measured.
+        disturbances: root densities of the random torque [rad/s^1.5] and force [m/s^1.5]; None
+            where the estimator gives none.
+        lasting: 1 sigma of the position [m] and attitude [rad] of the grasp point that no further
+            pose reduces.
+    """
+
+    noise: Array | None = None
+    disturbances: tuple[float, float] | None = None
+    lasting: tuple[float, float] = (0.0, 0.0)
+
+
 class FlightLog:
     """The flight of guidance over a log, as far as the assessment needs it.
 
@@ -108,6 +128,7 @@ class FlightLog:
         stamps: instant of every scan [ns].
         failing_ns: instant since which no capture is planned [ns]; None where one is.
         noises: (6, 6) covariances of the last measured poses, as ``noise`` gives them.
+        errors: after the last scan.
     """
 
     def __init__(self) -> None:
@@ -119,6 +140,7 @@ class FlightLog:
         self.stamps: list[int] = []
         self.noises: list[Array] = []
         self.failing_ns: int | None = None
+        self.errors = ScanErrors()
 
     def take(
         self,
@@ -126,7 +148,7 @@ class FlightLog:
         guidance: GuidanceState | None,
         gamma: int,
         converged: bool,
-        noise: Array | None = None,
+        errors: ScanErrors | None = None,
     ) -> None:
         """Take one scan.
 
@@ -135,13 +157,13 @@ class FlightLog:
             guidance: the state of guidance after the scan; it does not change after the capture.
             gamma: 1 for a healthy scan, else 0.
             converged: whether the belief may be used for planning.
-            noise: (6, 6) covariance of d = [theta; v], the error of the measured pose in {C} [rad,
-                m]; None where nothing was measured.
+            errors: what is known of errors after the scan.
         """
+        self.errors = errors or ScanErrors()
         self.gammas.append(gamma)
         self.stamps.append(belief.t_ns)
-        if noise is not None and gamma:
-            self.noises = [*self.noises[-NOISE_SCANS + 1 :], noise]
+        if self.errors.noise is not None and gamma:
+            self.noises = [*self.noises[-NOISE_SCANS + 1 :], self.errors.noise]
         if self.ended or guidance is None:
             return
         self.state, self.belief, self.converged = guidance, belief, converged
@@ -370,21 +392,38 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
             "known_s": setup.at_s(log.failing_ns or plan.t_ns),
             "change": change,
         }
-    after = _planned_s(setup, belief)
-    worst, size, cause = _predicted(setup, belief, after)
-    allowed = setup.limits[worst]
-    unit, scale = (("mm", 1e3), ("mm/s", 1e3), ("deg", 1.0))[worst]
     lost = " any more" if any(leg.action is not Action.STAND_STILL for leg in log.legs) else ""
+    limit, change = _insufficient(setup, log, belief)
     return {
         **found,
-        "limit": (
-            f"the estimate does not suffice{lost}: predicted {_QUANTITIES[worst]} error"
-            f" {scale * size:.3g} of {scale * allowed:.3g} {unit} at a capture in {after:.0f} s,"
-            f" from {cause}"
-        ),
+        "limit": f"the estimate does not suffice{lost}: {limit}",
         "known_s": setup.at_s(belief.t_ns),
-        "change": _change(setup, cause),
+        "change": change,
     }
+
+
+def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> tuple[str, str]:
+    """Why an estimate does not suffice for an approach, and what would change it."""
+    sigmas, (position, turn) = setup.guidance.supervisor.params.sigmas, log.errors.lasting
+    lasting = sigmas * np.array([position, 0.0, math.degrees(turn)])
+    if (lasting > setup.limits).any():
+        worst = int(np.argmax(lasting / setup.limits))
+        limit = f"{sigmas:g} sigma of the {_QUANTITIES[worst]} error that all poses have in common"
+        change = "a larger tolerance or a more exact model would help"
+        return f"{limit} are {_of_tolerance(setup, worst, lasting[worst])}", change
+    after = _planned_s(setup, belief)
+    worst, size, cause = _predicted(setup, belief, after)
+    if size <= setup.limits[worst]:
+        limit = "it has to be consistent and within the tolerances for convergence.dwell_s"
+        return limit, _change(setup, cause)
+    limit = f"predicted {_QUANTITIES[worst]} error {_of_tolerance(setup, worst, size)}"
+    return f"{limit} at a capture in {after:.0f} s, from {cause}", _change(setup, cause)
+
+
+def _of_tolerance(setup: Setup, which: int, size: float) -> str:
+    """An error and its tolerance in words."""
+    unit, scale = (("mm", 1e3), ("mm/s", 1e3), ("deg", 1.0))[which]
+    return f"{scale * size:.3g} of {scale * setup.limits[which]:.3g} {unit}"
 
 
 def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
@@ -485,7 +524,7 @@ def simulated(
     for each in drawn:
         forecast = partial(setup.estimator.forecast, each)
         target = planner_input(setup.estimator, each, setup.target, 1, True, forecast).scene
-        inputs = _measured(setup, log, belief, each, rng)
+        inputs = measured(setup, log, belief, each, rng)
         out.append(
             closed_loop(
                 setup.guidance,
@@ -502,11 +541,19 @@ def simulated(
     return out
 
 
-def _measured(
+def measured(
     setup: Setup, log: FlightLog, belief: Belief, drawn: Belief, rng: np.random.Generator
 ) -> Iterator[PlannerInput]:
     """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
-    noise of the log, and no pose where the log had a blackout.
+    noise of the log, and no pose where the log had a blackout. Its disturbances are those of the
+    log.
+
+    Args:
+        setup: task, estimator, guidance and target.
+        log: the flight so far.
+        belief: the belief from which the filter goes on.
+        drawn: the target.
+        rng: random generator.
     """
     # The noise is known here, and a fit to the poses of the flight would have none of the log.
     params = replace(
@@ -515,6 +562,9 @@ def _measured(
         adapt=Adaptation.OFF,
         audit_poses=0,
     )
+    if log.errors.disturbances is not None:
+        torque, force = log.errors.disturbances
+        params = replace(params, torque_noise_radps15=torque, force_noise_mps15=force)
     estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)
     motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
     track, C = estimator.resumed(belief), setup.noise
@@ -583,12 +633,12 @@ def _touched_by_draws(setup: Setup, log: FlightLog, end_ns: int) -> Flags | None
     return setup.contact.touched(_flown_past(setup, setup.contact, log, end_ns, z))
 
 
-def _flown(log: FlightLog, end_ns: int) -> Iterator[tuple[Leg, NDArray[np.int64], Array]]:
-    """Legs that were flown until an instant, each with instants (n,) [ns] and positions (n, 3)."""
+def _flown(log: FlightLog, end_ns: int) -> Iterator[tuple[Leg, int, int]]:
+    """Legs that were flown until an instant, each with its begin and its end [ns]."""
     stamps = [leg.belief.t_ns for leg in log.legs]
     for leg, (begin_ns, next_ns) in zip(log.legs, pairwise([*stamps, end_ns]), strict=True):
         if (stop_ns := min(next_ns, end_ns)) > begin_ns:
-            yield leg, *flown_positions(leg.segment, begin_ns, stop_ns)
+            yield leg, begin_ns, stop_ns
 
 
 def _flown_past(setup: Setup, contact: Contact, log: FlightLog, end_ns: int, z: Array) -> Array:
@@ -600,7 +650,8 @@ def _flown_past(setup: Setup, contact: Contact, log: FlightLog, end_ns: int, z: 
     """
     reach = float(np.linalg.norm(setup.target.hull_c, axis=1).max()) + contact.radius_m
     parts: list[Array] = [np.zeros((len(z), 0, 3))]
-    for leg, instants, r in _flown(log, end_ns):
+    for leg, begin_ns, stop_ns in _flown(log, end_ns):
+        instants, r = flown_positions(leg.segment, begin_ns, stop_ns)
         times: Array = np.asarray((instants - leg.belief.t_ns) * 1e-9, np.float64)
         rho = setup.estimator.motion(leg.belief)(times)[0] if len(times) else r
         if not len(r) or float(np.linalg.norm(r - rho, axis=1).min()) > 1.5 * reach:
@@ -648,12 +699,11 @@ def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -
     """Whether the flown path touched the true target; None where this is not known."""
     if setup.contact is None:
         return None
-    parts: list[Array] = []
-    for _, instants, r in _flown(log, end_ns):
-        rho, _, q = truth(np.asarray((instants - setup.since_ns) * 1e-9, np.float64))
-        known = np.isfinite(rho).all(axis=1)
-        turned = np.einsum("nji,nj->ni", geometry.matrix(q[known]), (r - rho)[known])
-        parts.append(turned)
+    target = true_scene(truth)
+    parts = [
+        relative_path(target, leg.segment, setup.since_ns, begin_ns, stop_ns)
+        for leg, begin_ns, stop_ns in _flown(log, end_ns)
+    ]
     y = np.concatenate([np.zeros((0, 3)), *parts])
     return bool(setup.contact.touched(y[None])[0])
 

@@ -70,7 +70,7 @@ def stages(
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
             Consistency(config.consistency),
-            Convergence(config.convergence, surface.extent, _tolerance(task)),
+            Convergence(config.convergence, surface.extent, _tolerance(task), supervision.sigmas),
         ),
         guidance=Guidance(
             robot.applied(config.plan),

@@ -497,13 +497,15 @@ class Forecast:
     covariance.
 
     ``times_s`` [s after now]; ``pos_1s_m``, ``vel_1s_mps``, ``rot_1s_rad``: position, velocity,
-    attitude (full angle).
+    attitude (full angle); ``lasting``: 1 sigma of the part of position [m] and attitude [rad] that
+    no further pose reduces.
     """
 
     times_s: Array
     pos_1s_m: Array
     vel_1s_mps: Array
     rot_1s_rad: Array
+    lasting: tuple[float, float] = (0.0, 0.0)
 
 
 @value_class

@@ -12,7 +12,15 @@ from functools import partial
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.assess import SIMULATED_FLIGHTS, FlightLog, Setup, assess, drawn_beliefs, simulated
+from avsreplay.assess import (
+    SIMULATED_FLIGHTS,
+    FlightLog,
+    ScanErrors,
+    Setup,
+    assess,
+    drawn_beliefs,
+    simulated,
+)
 from avsreplay.assessment import Assessment
 from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
@@ -23,8 +31,7 @@ from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
 from avsreplay.plan.constrained import constrained, linearised_s, with_safety
-from avsreplay.plan.flights import Ended, Execution, Miss, miss
-from avsreplay.plan.flights import execute as plan_execute
+from avsreplay.plan.flights import Ended, Miss, closed_loop, miss, true_scene
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
@@ -314,6 +321,7 @@ class Replanning:
         """
         log = FlightLog()
         log.stamps, log.gammas = (column_of(self.saved.rows, name) for name in ("t_ns", "gamma"))
+        log.errors = self._errors(index)
         return simulated(self._setup(count, seed), log, None, self.belief(index))
 
     def assess(self, index: int, flights: int = SIMULATED_FLIGHTS, seed: int = 0) -> Assessment:
@@ -328,8 +336,16 @@ class Replanning:
         for k, known in enumerate(self._inputs()):
             if k >= index and not log.ended:
                 state = guidance.step(state or guidance.initial(known.t_ns), known)
-            log.take(self.belief(k), state, known.gamma, known.converged)
+            log.take(self.belief(k), state, known.gamma, known.converged, self._errors(k))
         return assess(self._setup(flights, seed), log, self.truth)
+
+    def _errors(self, index: int) -> ScanErrors:
+        """What is known of errors after a scan."""
+        row = self.saved.rows[index]
+        torque, force = row.torque_noise_radps15, row.force_noise_mps15
+        if torque is None or force is None:
+            return ScanErrors()
+        return ScanErrors(disturbances=(torque, force))
 
     def _setup(self, flights: int, seed: int) -> Setup:
         surface = self.saved.surface
@@ -368,15 +384,9 @@ class Replanning:
             self.params, supervisor, self.limits, extent_m, self.robot.gripper, self.arm
         )
 
-    def execute(self) -> Execution | None:
+    def execute(self) -> Ended | None:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
         if self.truth is None:
             return None
-        places = {t_ns: k for k, t_ns in enumerate(column_of(self.saved.rows, "t_ns"))}
-
-        def turned(known: PlannerInput, after_s: float) -> Array:
-            return self.attitude(self.belief(places[known.t_ns]), after_s)
-
-        return plan_execute(
-            self._guidance(), self._inputs(), self.truth, turned, self.saved.since_ns
-        )
+        target = true_scene(self.truth)
+        return closed_loop(self._guidance(), self._inputs(), target, self.saved.since_ns)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from avsreplay import arithmetic, geometry, pipeline, settings
-from avsreplay.assess import FlightLog, Setup, assess
+from avsreplay.assess import FlightLog, ScanErrors, Setup, assess
 from avsreplay.assessment import Assessment
 from avsreplay.build import first_state, grasp_advice, stages, task_and_target
 from avsreplay.checkpoint import pack, unpack
@@ -276,7 +276,9 @@ class Run:
             state.guidance,
             outcome.verdict.gamma,
             outcome.monitors.converged,
-            self._noise_of(outcome),
+            ScanErrors(
+                self._noise_of(outcome), outcome.disturbances, outcome.monitors.forecast.lasting
+            ),
         )
         self.taken.append(row)
         self._state, self.done = state, self.done + 1

@@ -11,7 +11,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from avsreplay.assess import FlightLog, Setup, assess, drawn_beliefs, simulated
+from avsreplay.assess import (
+    FlightLog,
+    ScanErrors,
+    Setup,
+    assess,
+    drawn_beliefs,
+    measured,
+    simulated,
+)
 from avsreplay.assessment import Assessment, Chance, InFact, chance_of
 from avsreplay.build import target_geometry
 from avsreplay.estimate.chart import to_chart, to_errors, to_state
@@ -247,8 +255,8 @@ def test_the_noise_of_flights_has_the_mean_information_of_the_last_poses():
     for free in (3, 4):
         C = 1e-6 * np.eye(6)
         C[free, free] = 1.0
-        log.take(given, None, 1, True, C)
-    log.take(given, None, 0, True, np.eye(6))  # a faulty scan measures nothing
+        log.take(given, None, 1, True, ScanErrors(C))
+    log.take(given, None, 0, True, ScanErrors(np.eye(6)))  # a faulty scan measures nothing
     assert np.diag(log.noise) == pytest.approx([1e-6, 1e-6, 1e-6, 2e-6, 2e-6, 1e-6], rel=1e-3)
 
 
@@ -278,6 +286,38 @@ def test_a_log_that_ends_blind_at_its_first_plan_is_assessed():
     log.take(given, state, 1, True)
     log.gammas = [1, 0]
     assert assess(setup, log).probability is not None
+
+
+@pytest.mark.parametrize(
+    ("lasting", "words"),
+    [
+        ((0.002, 0.0), "3 sigma of the position error that all poses have in common are 6 of 4.33"),
+        ((0.0, 0.02), "3 sigma of the attitude error that all poses have in common are 3.44 of 2"),
+        ((0.0, 0.0), "it has to be consistent and within the tolerances for convergence.dwell_s"),
+    ],
+)
+def test_a_robot_that_waits_says_which_condition_its_estimate_misses(lasting, words):
+    setup, x = setup_of(), belief()[0].x
+    given, log = Belief(0, x, 1e-16 * np.eye(20)), FlightLog()
+    forecast = partial(setup.estimator.forecast, given)
+    known = planner_input(setup.estimator, given, setup.target, 1, False, forecast)
+    state = setup.guidance.step(setup.guidance.initial(0), known)
+    log.take(given, state, 1, False, ScanErrors(lasting=lasting))
+    assert words in assess(setup, log).limit
+
+
+def test_simulated_flights_have_the_random_torques_of_the_log():
+    """The 1 sigma that guidance is told grows with them."""
+    setup, (given, _) = setup_of(np.diag([1e-8] * 6)), belief()
+    told = []
+    for torque in (0.0, 1e-3):
+        log, rng = FlightLog(), np.random.default_rng(1)
+        for k in range(2):
+            errors = ScanErrors(disturbances=(torque, 0.0))
+            log.take(replace(given, t_ns=k * 400_000_000), None, 1, True, errors)
+        known = next(measured(setup, log, given, given, rng))
+        told.append(float(known.forecast(np.array([10.0])).rot_1s_rad[-1]))
+    assert told[1] > told[0] + 1e-3
 
 
 def test_an_assessment_reads_back_from_its_record_and_says_the_same():

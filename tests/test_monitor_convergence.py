@@ -5,6 +5,7 @@ converge.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,6 +85,18 @@ def test_predictive_test_counts_each_of_three(wide: dict[str, float]) -> None:
         Convergence(ConvergenceParams(), 8.0, TOLERANCE),
         [(belief(t), ahead(**wide)) for t in range(9)],
     ).converged
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_an_error_that_no_scan_reduces_is_compared_as_when_the_gripper_closes(which: int) -> None:
+    convergence = Convergence(ConvergenceParams(), 8.0, TOLERANCE, closing_sigmas=3.0)
+    for share, expected in ((0.3, True), (0.4, False)):
+        lasting = [0.0, 0.0]
+        lasting[which] = share * (TOLERANCE[0], TOLERANCE[2])[which]
+        found = replace(ahead(*lasting[:1], rot=lasting[1]), lasting=(lasting[0], lasting[1]))
+        steps = [(belief(t), found) for t in range(9)]
+        assert fold(convergence, steps).converged is expected
+        assert fold(convergence, [(*step, True, None, True) for step in steps]).converged
 
 
 def test_an_inconsistent_filter_is_not_converged() -> None:

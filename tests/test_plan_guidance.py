@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avsreplay.build import target_geometry
 from avsreplay.geometry import angle, conjugate, exp, multiply
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.flights import closed_loop, pushed, relative_path, with_thrust_error
@@ -17,7 +18,9 @@ from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Action, Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Tolerance
+from avsreplay.plan.withdrawal import COAST_S
 from avsreplay.records import Forecast
+from avsreplay.simulate.target import Shape, builtin_surface
 
 RADIUS = 1.5
 CENTRE = np.array([0.0, 0.0, 6.0])
@@ -122,6 +125,55 @@ def test_limits_hold_in_every_plan_of_a_flight():
             or margin(known.scene, limits, *state.segment.at(known.t_ns)) < limits.mouth_m
         )
     assert constrained > 3
+
+
+def recorded(known, asked):
+    """The input of guidance, with the times for which it is asked added to a list."""
+    target, one_sigma = known.scene, 1e-3
+
+    def noted(found):
+        def at(times):
+            asked.extend(np.asarray(times).tolist())
+            return found(times)
+
+        return at
+
+    sigma = noted(lambda times: (one_sigma + 0.0 * times, one_sigma + 0.0 * times))
+    watched = {"goal": noted(target.goal), "attitude": noted(target.attitude), "sigma": sigma}
+    target = replace(target, **watched, surface=BRACKET.surface)
+    return replace(known, scene=target, forecast=noted(known.forecast))
+
+
+BRACKET = target_geometry(builtin_surface(Shape.BRACKET), (1.0, 0.0, 0.0))
+BODY = Limits(final_deg=15.0, clearance_m=0.02)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.4])
+@pytest.mark.parametrize(
+    ("horizon_s", "limits", "gripper"),
+    [
+        (60.0, None, None),
+        (25.0, None, None),
+        (22.0, Limits(cone_deg=30.0, final_deg=12.0, speed_max_mps=0.5), None),
+        (60.0, BODY, None),
+        (30.0, replace(BODY, abort=False), None),
+        (30.0, None, (np.array([0.0, 0.0, 0.0, 1.0]), 0.002)),
+    ],
+)
+def test_no_flight_asks_for_the_target_beyond_the_horizon(latency_s, horizon_s, limits, gripper):
+    """A robot near a body may coast for ``COAST_S`` after the latest capture; a robot that is sure
+    of its target does not withdraw.
+    """
+    params, asked = replace(ROBOT, latency_s=latency_s, horizon_s=horizon_s), []
+    guidance = Guidance(params, Supervisor(PARAMS), limits, 1.0, gripper)
+    known = [*inputs(np.random.default_rng(5), 24.0, 1.0)]
+    if limits is not BODY:
+        known = [replace(each, gamma=1, converged=True) for each in known]
+    for _ in guidance.fly(recorded(each, asked) for each in known):
+        pass
+    more_s = 0.0 if limits is None or limits.clearance_m is None else COAST_S
+    assert min(asked) >= 0.0
+    assert max(asked) <= horizon_s + more_s + 1e-9
 
 
 def exactly(target, t, gamma=1, one_sigma=1e-5):

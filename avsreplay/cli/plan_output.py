@@ -9,7 +9,7 @@ from avsreplay.errors import value_class
 if TYPE_CHECKING:
     from avsreplay.assessment import Assessment
     from avsreplay.outcome import Plan
-    from avsreplay.plan.flights import Execution, Miss
+    from avsreplay.plan.flights import Ended, Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread
     from avsreplay.replan import Replanning
@@ -61,7 +61,7 @@ class Answer:
     spread: Spread | None
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
-    execution: Execution | None
+    execution: Ended | None
     changes: list[PossibleChange]
 
 
@@ -286,7 +286,7 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     )
 
 
-def _execution_table(execution: Execution) -> Table:
+def _execution_table(execution: Ended) -> Table:
     from avsreplay.report.table import Table
 
     rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
@@ -295,7 +295,7 @@ def _execution_table(execution: Execution) -> Table:
     )
 
 
-def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
+def _outcome_lines(execution: Ended, planning: Replanning) -> list[str]:
     outcome = execution.outcome(planning.tolerance)
     lines = [
         (

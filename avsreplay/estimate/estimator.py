@@ -8,6 +8,7 @@ used again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -257,13 +258,17 @@ class Estimator:
             found = mixture_forecast(
                 track.batch.components, track.belief.t_ns, times_s, *noise, (x, y, z)
             )
-        turn, position = found.rot_1s_rad, np.hypot(found.pos_1s_m, float(np.linalg.norm(b)))
+        move, turn = float(np.linalg.norm(b)), 0.0
         if (motions := self._common_motions(track)).size:
             turns, moves = map(np.linalg.norm, np.split(self.frame.motions_out(motions), 2))
-            moves = np.hypot(moves, float(np.linalg.norm(grasp_c)) * turns)
-            turn, position = np.hypot(turn, turns), np.hypot(position, moves)
+            move = math.hypot(move, float(moves), float(np.linalg.norm(grasp_c)) * float(turns))
+            turn = float(turns)
         return Forecast(
-            found.times_s, position, found.vel_1s_mps, np.minimum(turn, 2.0 * ANY_HALF_RAD)
+            found.times_s,
+            np.hypot(found.pos_1s_m, move),
+            found.vel_1s_mps,
+            np.minimum(np.hypot(found.rot_1s_rad, turn), 2.0 * ANY_HALF_RAD),
+            (move, turn),
         )
 
     def refitted_rows(self, track: Track) -> tuple[FittedMotion, tuple[Array, Array, Array]] | None:

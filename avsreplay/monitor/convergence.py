@@ -5,7 +5,8 @@ Consistency: NIS of the innovations inside its chi-square band, and checks that 
 correct estimate. They need no ground truth. Convergence: ``covariance`` is the paper's test, every
 parameter and motion block below its limit. ``predictive`` compares position, velocity and attitude
 of the grasp point at the planned capture with the tolerances of the task; a body with unobservable
-parameters may pass it. Either must hold for the dwell time, with a consistent estimate.
+parameters may pass it. An error that no further scan reduces is compared as it will be when the
+gripper closes. Either must hold for the dwell time, with a consistent estimate.
 """
 
 from __future__ import annotations
@@ -303,12 +304,18 @@ class Convergence:
         params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal
             [m].
         tolerance: largest errors of a capture: position [m], speed [m/s] and angle [rad].
+        closing_sigmas: with this factor the predicted 1 sigma must be within the tolerances when
+            the gripper closes.
     """
 
     def __init__(
-        self, params: ConvergenceParams, extent_m: float, tolerance: tuple[float, float, float]
+        self,
+        params: ConvergenceParams,
+        extent_m: float,
+        tolerance: tuple[float, float, float],
+        closing_sigmas: float = 1.0,
     ) -> None:
-        self.params = params.resolved(extent_m)
+        self.params, self._closing_sigmas = params.resolved(extent_m), closing_sigmas
         self._limits, self._tolerance = self.params.block_limits, tolerance
 
     def initial(self) -> ConvergenceTrack:
@@ -383,10 +390,13 @@ class Convergence:
             forecast: predicted 1 sigma of the grasp point.
         """
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return self.params.sigmas * max(
+        now = max(
             float(values.max()) / limit
             for values, limit in zip(predicted, self._tolerance, strict=True)
         )
+        position, _, angle = self._tolerance
+        lasting = max(forecast.lasting[0] / position, forecast.lasting[1] / angle)
+        return max(self.params.sigmas * now, self._closing_sigmas * lasting)
 
 
 def _beyond(one_sigma: float) -> float:

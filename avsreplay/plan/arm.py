@@ -134,7 +134,7 @@ class Arm:
             limits: Resolved limits: the pose of the base.
             horizon_s: Latest capture [s after the instant of planning].
         """
-        times = np.arange(0.0, horizon_s + REACH_GRID_S, REACH_GRID_S)
+        times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / REACH_GRID_S) + 1)
         missing = np.array(
             [
                 self.missing_m(pose)

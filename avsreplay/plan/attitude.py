@@ -209,7 +209,7 @@ def next_turn(
     begin_ns = t_ns + round(wait_s * 1e9)
     since_s = (begin_ns - before.t_ns) * 1e-9
     q0, rate0 = before.at(np.array([since_s]))[0], before.rate(since_s)
-    late = replace(params, latency_s=0.0)
+    late = replace(params, latency_s=0.0, horizon_s=params.horizon_s - wait_s)
     return turn_to(lambda t: target(t + wait_s), q0, rate0, accel_radps2, late, begin_ns)
 
 
@@ -250,7 +250,8 @@ def without_turn(
         params: Largest acceleration of the end-effector, latency and horizon.
         t_ns: Instant of planning.
     """
-    times = np.arange(DIFFERENCE_S, params.horizon_s + ATTITUDE_GRID_S, ATTITUDE_GRID_S)
+    count, end_s = math.ceil(params.horizon_s / ATTITUDE_GRID_S), params.horizon_s - DIFFERENCE_S
+    times = np.linspace(DIFFERENCE_S, end_s, count + 1)
     rates = np.linalg.norm(_rates(target, times), axis=1)
     begun = float(np.linalg.norm(before.rate((t_ns - before.t_ns) * 1e-9 + params.latency_s)))
     missing = rates - begun - accel_radps2 * np.maximum(times - params.latency_s, 0.0)

@@ -18,86 +18,14 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan import _cone
-from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn, without_turn
-from avsreplay.plan.constrained import constrained
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import (
-    CONSTRAINTS,
-    Scene,
-    TargetGeometry,
-    hull_vertices,
-    in_fixture_axes,
-    margins,
-)
-from avsreplay.plan.path import BurnPath, CostatePath, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
-from avsreplay.plan.robot import Limits, RobotParams
-from avsreplay.plan.supervisor import (
-    RULES,
-    Action,
-    Decision,
-    Facts,
-    Supervisor,
-    SupervisorMemory,
-    SupervisorParams,
-)
-from avsreplay.plan.uncertainty import (
-    Disturbance,
-    Spread,
-    Tolerance,
-    draws,
-    spread,
-)
+from avsreplay.plan.limits import Scene, in_fixture_axes
+from avsreplay.plan.path import BurnPath, CostatePath, RobotPath, StepPath
+from avsreplay.plan.supervisor import Action
+from avsreplay.plan.uncertainty import Tolerance
 
 PATH_INSTANTS = 10  # instants between two scans at which contact is checked
-
-__all__ = [
-    "CONSTRAINTS",
-    "RULES",
-    "Action",
-    "CostatePath",
-    "Decision",
-    "Disturbance",
-    "Ended",
-    "Execution",
-    "Facts",
-    "Guidance",
-    "GuidanceState",
-    "Limits",
-    "Miss",
-    "Motion",
-    "PlanParams",
-    "PlannerInput",
-    "RobotParams",
-    "RobotPath",
-    "Scene",
-    "Segment",
-    "Spread",
-    "StepPath",
-    "Supervisor",
-    "SupervisorMemory",
-    "SupervisorParams",
-    "TargetGeometry",
-    "Tolerance",
-    "Turn",
-    "closed_loop",
-    "constrained",
-    "draws",
-    "execute",
-    "hull_vertices",
-    "in_fixture_axes",
-    "interpolated",
-    "margins",
-    "miss",
-    "path_of",
-    "rendezvous",
-    "spread",
-    "turn_time",
-    "turn_to",
-    "with_turn",
-    "without_turn",
-]
 
 Motion = Callable[[Array], tuple[Array, Array, Array]]
 """Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4)
@@ -134,33 +62,6 @@ class Miss:
             and self.speed_mps <= tolerance.speed_mps
             and angle
         )
-
-
-@value_class
-class Execution:
-    """Result of a simulated approach.
-
-    Attributes:
-        captured: Whether the gripper closed.
-        miss: Error against ground truth when it closed.
-        actions: (t_s, action, rule) at every change.
-        ended: Last action.
-    """
-
-    captured: bool
-    miss: Miss | None
-    actions: tuple[tuple[float, str, str], ...]
-    ended: Action
-
-    def outcome(self, tolerance: Tolerance) -> str:
-        """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action.
-
-        Args:
-            tolerance: Largest errors of a successful capture.
-        """
-        if self.captured and self.miss is not None:
-            return "captured" if self.miss.inside(tolerance) else "outside"
-        return self.ended.value
 
 
 def miss(path: RobotPath, t_s: float, truth: Motion, attitude: Array | None = None) -> Miss:
@@ -205,47 +106,13 @@ def closed_miss(
     return _miss_at((end_ns - since_ns) * 1e-9, (end_ns - made_ns) * 1e-9, r, v, truth, attitude)
 
 
-def execute(
-    guidance: Guidance,
-    inputs: Iterable[PlannerInput],
-    truth: Motion,
-    attitude: Callable[[PlannerInput, float], Array] | None = None,
-    since_ns: int = 0,
-) -> Execution:
-    """Simulate an approach: guidance receives one input after the other, ground truth decides the
-    result.
+def true_scene(truth: Motion) -> Scene:
+    """Return the target of a true motion.
 
     Args:
-        guidance: Guidance of the robot.
-        inputs: What was known after each scan.
         truth: True motion of the fixture.
-        attitude: Returns the q_ac (4,) that an input predicts for a time after it [s], the attitude
-            of the gripper.
-        since_ns: Instant from which ``truth`` counts its seconds.
-
-    Raises:
-        ValueError: There is no input.
     """
-    changes: list[tuple[float, str, str]] = []
-    state: GuidanceState | None = None
-    committed: PlannerInput | None = None
-    for known, state in guidance.fly(inputs):
-        decided = (state.decision.action.value, state.decision.rule)
-        if not changes or changes[-1][1:] != decided:
-            changes.append(((known.t_ns - since_ns) * 1e-9, *decided))
-        if state.decision.action is Action.CAPTURE and committed is None:
-            committed = known
-        if state.captured_ns is not None:
-            break
-    if state is None:
-        raise ValueError("the log contains no scan")
-    action = state.decision.action
-    if committed is None or action is not Action.CAPTURE:
-        return Execution(False, None, tuple(changes), action)
-    turned = (
-        attitude(committed, (state.segment.end_ns - committed.t_ns) * 1e-9) if attitude else None
-    )
-    return Execution(True, closed_miss(state, since_ns, truth, turned), tuple(changes), action)
+    return Scene(lambda times: truth(times)[:2], lambda times: truth(times)[2])
 
 
 def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
@@ -290,17 +157,21 @@ class Ended:
     """End of one simulated approach.
 
     Attributes:
-        action, rule: last decision of the supervisor.
+        actions: (t_s, action, rule) at every change of the supervisor's decision.
         at_s: instant at which the gripper closed, else that of the last decision.
         miss: errors when the gripper closed; None where it did not.
         touched: whether the end-effector touched the body outside the grasp.
     """
 
-    action: Action
-    rule: str
+    actions: tuple[tuple[float, str, str], ...]
     at_s: float
     miss: Miss | None
     touched: bool
+
+    @property
+    def rule(self) -> str:
+        """The rule of the last decision."""
+        return self.actions[-1][2]
 
     def outcome(self, tolerance: Tolerance) -> str:
         """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action.
@@ -309,7 +180,7 @@ class Ended:
             tolerance: Largest errors of a capture.
         """
         if self.miss is None:
-            return self.action.value
+            return self.actions[-1][1]
         return "captured" if self.miss.inside(tolerance) else "outside"
 
 
@@ -333,7 +204,7 @@ def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
 
 
 def with_thrust_error(
-    segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator
+    segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator | None
 ) -> Segment:
     """Return the segment of a robot whose thrust was wrong since the last scan; a coasting robot
     has no error.
@@ -343,9 +214,9 @@ def with_thrust_error(
         t_ns: Instant of the present scan.
         span_s: Time since the last one [s], during which the error was constant.
         sigma_mps2: 1 sigma of the error of each axis, as its mean over 1 s [m/s2].
-        rng: Random generator.
+        rng: Random generator; None: no error.
     """
-    if segment.path is None or sigma_mps2 == 0.0 or span_s <= 0.0:
+    if segment.path is None or rng is None or sigma_mps2 == 0.0 or span_s <= 0.0:
         return segment
     u = sigma_mps2 / math.sqrt(span_s) * rng.standard_normal(3)
     return pushed(segment, t_ns, 0.5 * span_s * span_s * u, span_s * u)
@@ -378,9 +249,10 @@ def closed_loop(
             how it came to the grasp decides whether it touches the body there.
 
     Raises:
-        ValueError: There is no scan.
+        ValueError: There is no input.
     """
     aimed: Array | None = None
+    actions: list[tuple[float, str, str]] = []
     last_ns, known = start_ns, None
     flown = [np.zeros((0, 3)) if before is None else before]
     for known in inputs:
@@ -389,33 +261,29 @@ def closed_loop(
         span = (known.t_ns - last_ns) * 1e-9
         if contact is not None:
             flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
-        if rng is not None:
-            state = replace(
-                state, segment=with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
-            )
-        state, last_ns = guidance.step(state, known), known.t_ns
-        if (
-            state.decision.action is Action.CAPTURE
-            and aimed is None
-            and known.scene.attitude is not None
-        ):
-            aimed = known.scene.attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
+        segment = with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
+        state, last_ns = guidance.step(replace(state, segment=segment), known), known.t_ns
+        decided = state.decision.action.value, state.decision.rule
+        if not actions or actions[-1][1:] != decided:
+            actions.append(((known.t_ns - start_ns) * 1e-9, *decided))
+        closing, attitude = state.decision.action is Action.CAPTURE, known.scene.attitude
+        if closing and aimed is None and attitude is not None:
+            aimed = attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
         if state.captured_ns is not None or state.decision.action is Action.ABORT:
             break
     if state is None or known is None:
-        raise ValueError("there is no scan")
+        raise ValueError("the log contains no scan")
     y = np.concatenate(flown)
     touched = contact is not None and bool(contact.touched(y[None])[0])
-    decided = state.decision.action, state.decision.rule
-    if state.captured_ns is None:
-        return Ended(*decided, (known.t_ns - start_ns) * 1e-9, None, touched)
-    end_s = (state.segment.end_ns - start_ns) * 1e-9
-    r, v = state.segment.at(state.segment.end_ns)
-    attitude = target.attitude
-    if attitude is None:
-        attitude, aimed = (lambda times: np.full((len(times), 4), np.nan)), None
-    found = _miss_at(end_s, 0.0, r, v, lambda times: (*target.goal(times), attitude(times)), aimed)
-    return Ended(*decided, end_s, found, touched)
+    if state.decision.action is not Action.CAPTURE:
+        return Ended(tuple(actions), (known.t_ns - start_ns) * 1e-9, None, touched)
+
+    def truth(times: Array) -> tuple[Array, Array, Array]:
+        turned = np.full((len(times), 4), np.nan)
+        return *target.goal(times), turned if target.attitude is None else target.attitude(times)
+
+    found = closed_miss(state, start_ns, truth, aimed)
+    return Ended(tuple(actions), found.at_s, found, touched)
 
 
 def flown_positions(
@@ -439,7 +307,8 @@ def flown_positions(
 def relative_path(
     scene: Scene, segment: Segment, start_ns: int, begin_ns: int, end_ns: int
 ) -> Array:
-    """Return the positions (n, 3) of the robot from the grasp point in {C} between two scans.
+    """Return the positions (n, 3) of the robot from the grasp point in {C} between two scans, where
+    the target is known.
 
     Args:
         scene: The target.
@@ -452,4 +321,5 @@ def relative_path(
     if not len(r) or scene.attitude is None:
         return np.zeros((0, 3))
     times = np.asarray((instants - start_ns) * 1e-9, dtype=np.float64)
-    return in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
+    y = in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
+    return y[np.isfinite(y).all(axis=1)]

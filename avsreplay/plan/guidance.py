@@ -365,10 +365,10 @@ class Guidance:
         r0, v0 = segment.at(begin_ns)
         # the robot flies the current segment during the latency, so the planner starts at its end
         # without latency
-        late = replace(self.params, latency_s=0.0)
+        late = replace(self.params, latency_s=0.0, horizon_s=self.params.horizon_s - wait_s)
         plan = planner(scene.after(wait_s) if wait_s else scene, r0, v0, late, t_ns)
         if not plan.found:
-            return plan, None
+            return replace(plan, lower_bound_s=plan.lower_bound_s + wait_s), None
         previous = segment if t_ns < segment.t_ns else replace(segment, previous=None)
         made = Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous, turn=segment.turn)
         return _counted_from_planning(plan, wait_s), made

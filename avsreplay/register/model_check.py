@@ -70,6 +70,7 @@ from avsreplay.register.size import (
     spread_of,
 )
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.work import LEAST_RATIO
 
 __all__ = [
     "POSES",

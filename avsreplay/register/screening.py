@@ -23,7 +23,7 @@ from avsreplay.register.surface_index import IcpParams
 
 POINTS = PART  # points of the scan by which hypotheses are screened
 HOPEFUL_POINTS = 150  # points that show whether a guess is hopeful
-# first and last rejection distance over the extent
+# first rejection distance over the extent
 SCREEN_START_OF_EXTENT = 0.05
 # factor on the rejection distance per stage, and passes per stage
 SCREEN_FALL = 0.6

@@ -23,7 +23,7 @@ import numpy as np
 from finished_runs import continued
 
 from avsreplay import geometry
-from avsreplay.assess import FlightLog, Setup, assess
+from avsreplay.assess import FlightLog, ScanErrors, Setup, assess
 from avsreplay.build import target_geometry
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.dynamics import propagate_state
@@ -173,7 +173,7 @@ def flown(seed: int, flights: int) -> dict[str, object]:
             partial(estimator.track_forecast, track),
         )  # fmt: skip
         state = guidance.step(state, known)
-        log.take(belief, state, gamma, held.converged, C)
+        log.take(belief, state, gamma, held.converged, ScanErrors(C))
         if state.decision.action is Action.CAPTURE and aimed is None:
             aimed = known.scene.attitude(np.array([(state.segment.end_ns - t_ns) * 1e-9]))[0]
         if predicted is None and held.converged and state.plan is not None and state.plan.found:

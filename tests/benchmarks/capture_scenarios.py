@@ -19,6 +19,7 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+from bodies import body
 from finished_runs import continued
 
 SCENARIO = """name = "attitude-{k}"
@@ -27,7 +28,7 @@ duration_s = {span_s}
 rate_hz = 2.5
 
 [target]
-shape = "satellite"
+{target}
 
 [motion]
 attitude_xyzw = {q}
@@ -38,11 +39,17 @@ LIMITS = """
 final_deg = 15.0
 clearance_m = 0.1
 """
-OCCLUSION = """
+FAULT = """
 [[fault]]
-kind = "occlusion"
+kind = "{kind}"
 start_s = {start_s}
-duration_s = 6.0
+duration_s = {span_s}
+"""
+FAULTS = {"occlusion": 6.0, "dropped": 4.0, "frozen": 3.0, "outliers": 30.0}  # durations [s]
+PLACE = "position_m = [0.0, 0.0, {z}]\n"  # of the mass centre in {{A}}
+PATCH = """
+[run.task]
+patch = "flat-1"
 """
 FREE = """
 [run.task]
@@ -60,20 +67,37 @@ def command(*words: str) -> str:
     return done.stdout
 
 
-def written(k: int, seed: int, folder: Path, kind: str = "", span_s: float = 60.0) -> Path:
-    """The log of one scenario, in a folder."""
+def target(name: str, folder: Path) -> tuple[str, str, str]:
+    """The lines of a target, those of its place and those of its task: a built-in shape, or
+    ``KIND:SEED`` of ``bodies.py`` at one and a half extents, grasped at its largest patch.
+    """
+    kind, _, number = name.partition(":")
+    if not number:
+        return f'shape = "{kind}"', "", ""
+    mesh = body(kind, int(number))
+    mesh.export(folder / "model.obj")
+    distance_m = 1.5 * float(np.linalg.norm(mesh.extents))
+    return 'model = "model.obj"', PLACE.format(z=round(distance_m, 2)), PATCH
+
+
+def written(
+    k: int, seed: int, folder: Path, kind: str = "", span_s: float = 60.0, name: str = "satellite"
+) -> Path:
+    """The log of one scenario with the target ``name``, in a folder."""
     rng = np.random.default_rng([seed, k])
     q, w = rng.normal(size=4), rng.normal(size=3)
     q /= np.linalg.norm(q)
     w *= rng.uniform(0.04, 0.1) / np.linalg.norm(w)
-    more = ""
+    lines, more, task = target(name, folder)
     if "torques" in kind:  # over the trace of the inertia, drawn anew every second
         more += f"torque_std_radps2 = {10.0 ** rng.uniform(-6.0, -4.0):.3g}\n"
-    if "occlusion" in kind:
-        more += OCCLUSION.format(start_s=round(rng.uniform(20.0, 40.0), 1))
-    more += LIMITS * ("limits" in kind) + FREE * ("free" in kind)
+    for fault, fault_s in FAULTS.items():
+        if fault in kind:
+            start_s = round(rng.uniform(20.0, 40.0), 1)
+            more += FAULT.format(kind=fault, start_s=start_s, span_s=fault_s)
+    more += LIMITS * ("limits" in kind) + FREE * ("free" in kind) + task
     scenario, log = folder / "scenario.toml", folder / "log.mcap"
-    text = SCENARIO.format(k=k, q=q.tolist(), w=w.tolist(), span_s=span_s, more=more)
+    text = SCENARIO.format(k=k, target=lines, q=q.tolist(), w=w.tolist(), span_s=span_s, more=more)
     scenario.write_text(text)
     command("record", str(scenario), "-o", str(log))
     return log

@@ -11,7 +11,7 @@ namespace {
 
 constexpr double PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
 
-constexpr double MOST = 600;  // log of a likelihood ratio, larger ones are cut
+constexpr double MOST_LOG_ODDS = 600;  // log of a likelihood ratio, larger ones are cut
 
 // One change: the log of its likelihood ratio, and the second moments of the estimate's error, effect effect'.
 struct Candidate {
@@ -101,7 +101,7 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
   }
   double top = found[0].log_ratio, total = 0;
   for (const Candidate& one : found) top = std::max(top, one.log_ratio);
-  top = std::min(top, MOST);
+  top = std::min(top, MOST_LOG_ODDS);
   const double none = exp_of(-top);
   for (Candidate& one : found) total += one.log_ratio = exp_of(std::min(one.log_ratio - top, 0.0));
   std::memset(P, 0, DIM * DIM * sizeof(double));

@@ -8,7 +8,7 @@
 namespace avs {
 namespace {
 
-constexpr int ARM = 14, MISALIGNED = 17;  // error states: fixture in {B}, attitude of {C} in {B}
+constexpr int FIXTURE = 14, MISALIGNED = 17;  // error states: fixture in {B}, attitude of {C} in {B}
 
 // Entries of geometry.matrix, for the same bits.
 M3 rotation(const double q[4]) {
@@ -32,7 +32,7 @@ void pose_jacobian(const State& x, double H[SEEN][DIM]) {
   for (int r = 0; r < 3; ++r) {
     for (int c = 0; c < 3; ++c) {
       H[r][c] = arm.x[r][c];
-      H[r][ARM + c] = A.x[r][c];
+      H[r][FIXTURE + c] = A.x[r][c];
     }
     H[r][6 + r] = H[3 + r][r] = H[3 + r][MISALIGNED + r] = 1;
   }
@@ -110,12 +110,12 @@ void shift(State& x, Square P, const double s[3]) {
   const M3 J = skew(2.0 * (was - vector(x.c_b)));  // A(dmu mu) = (1 + 2 [dmu x]) A(mu)
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c < DIM; ++c)
-      P[ARM + r][c] += J.x[r][0] * P[MISALIGNED][c] + J.x[r][1] * P[MISALIGNED + 1][c] + J.x[r][2] * P[MISALIGNED + 2][c];
+      P[FIXTURE + r][c] += J.x[r][0] * P[MISALIGNED][c] + J.x[r][1] * P[MISALIGNED + 1][c] + J.x[r][2] * P[MISALIGNED + 2][c];
   for (int r = 0; r < DIM; ++r) {
     double* row = P[r];
     double by[3];
     for (int c = 0; c < 3; ++c) by[c] = row[MISALIGNED] * J.x[c][0] + row[MISALIGNED + 1] * J.x[c][1] + row[MISALIGNED + 2] * J.x[c][2];
-    for (int c = 0; c < 3; ++c) row[ARM + c] += by[c];
+    for (int c = 0; c < 3; ++c) row[FIXTURE + c] += by[c];
   }
 }
 

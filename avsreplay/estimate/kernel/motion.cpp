@@ -14,7 +14,7 @@ namespace avs {
 namespace {
 
 constexpr double POLE = 1.5;
-constexpr double MOST = 1e6;  // rad in one advance: some seconds of work
+constexpr double MOST_TURN = 1e6;  // rad in one advance: some seconds of work
 constexpr int MOST_ORDER = 16;  // enough for a piece of SUBSTEP
 
 double size(const double* w) { return std::sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]); }
@@ -247,7 +247,7 @@ template <class Rate, class One>
 void cut(double h, Rate rate, One one) {
   while (h != 0) {
     const double turn = rate() * std::fabs(h);
-    if (!(turn <= MOST)) throw std::invalid_argument("a step must be finite and turn less than a million radians");
+    if (!(turn <= MOST_TURN)) throw std::invalid_argument("a step must be finite and turn less than a million radians");
     const double pieces = std::ceil(turn / SUBSTEP - 1e-9);
     const double length = pieces <= 1 ? h : h / pieces;
     one(length);
@@ -287,7 +287,7 @@ Path::Path(const Turn& start, const Body& body) : body_(body), spacing_(SUBSTEP 
 
 Turn Path::at(double t) {
   const double place = std::max(0.0, std::floor(t / spacing_));
-  if (!(place * SUBSTEP <= MOST)) throw std::invalid_argument("a time must be finite and within a million radians of turn");
+  if (!(place * SUBSTEP <= MOST_TURN)) throw std::invalid_argument("a time must be finite and within a million radians of turn");
   const size_t k = (size_t)place;
   while (knots_.size() <= k) {
     knots_.push_back(knots_.back());

@@ -11,15 +11,15 @@ namespace {
 
 constexpr int BLOCK_START[BLOCK_COUNT] = {0, 3, 6, 9, 12, 14, 17}, BLOCK_SIZE[BLOCK_COUNT] = {3, 3, 3, 3, 2, 3, 3};
 
-void put(const Quad& q, double* half_angle) {
+void put_half_angle(const Quad& q, double* half_angle) {
   const double sign = q.w >= 0 ? 1 : -1;
   half_angle[0] = sign * q.x, half_angle[1] = sign * q.y, half_angle[2] = sign * q.z;
 }
 
 // The error states of the truth, its principal axes turned by R_nb = R_bn', from the estimate.
 void difference(const State& truth, const State& x, const M3& R_nb, const Quad& q_bn, double d[DIM]) {
-  put(conjugate(quad(x.q_ab)) * quad(truth.q_ab) * q_bn, d);
-  put(conjugate(q_bn) * (quad(truth.q_bc) * conjugate(quad(x.q_bc))), d + 17);
+  put_half_angle(conjugate(quad(x.q_ab)) * quad(truth.q_ab) * q_bn, d);
+  put_half_angle(conjugate(q_bn) * (quad(truth.q_bc) * conjugate(quad(x.q_bc))), d + 17);
   const V3 w = R_nb * vector(truth.w_b), c = R_nb * vector(truth.c_b);
   const double s1 = truth.sigma[0], s2 = truth.sigma[1], ratio[3] = {s1, s2, -(s1 + s2) / (1 + s1 * s2)};
   const M3& R = R_nb;

@@ -9,7 +9,6 @@ namespace avs {
 namespace {
 
 constexpr double PI = 3.14159265358979323846;
-constexpr double INFINITE = std::numeric_limits<double>::infinity();
 constexpr uint32_t LEAF = 4;      // faces of a group that is not divided further
 constexpr double FAR_RADII = 3;   // from this many radii on a group is a dipole: an error below 0.01 of one turn
 constexpr double INSIDE = 0.52;   // winding number above which a point is inside: one half and twice that error

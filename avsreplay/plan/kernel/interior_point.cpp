@@ -6,6 +6,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "vector.hpp"
+
 namespace avs {
 namespace {
 
@@ -15,7 +17,6 @@ constexpr double ACCEPTED_GAP = 1e-5;   // the same where rounding ends the iter
 constexpr double RESIDUAL = 1e-8;
 constexpr double ACCEPTED_RESIDUAL = 1e-6;
 constexpr double STEP = 0.99;  // of the way to the boundary
-using Vector = std::vector<double>;
 
 struct Cone {
   size_t first;
@@ -27,14 +28,6 @@ double tail(const double* v, int size) {
   for (int i = 1; i < size; ++i) s += v[i] * v[i];
   return s;
 }
-
-double dot(const Vector& a, const Vector& b) {
-  double s = 0;
-  for (size_t i = 0; i < a.size(); ++i) s += a[i] * b[i];
-  return s;
-}
-
-double norm(const Vector& a) { return std::sqrt(dot(a, a)); }
 
 // v[0]^2 - |v[1:]|^2, without cancellation of squares.
 double determinant(const double* v, int size) {

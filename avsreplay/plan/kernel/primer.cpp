@@ -4,10 +4,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "vector.hpp"
+
 namespace avs {
 namespace {
 
-double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 void by_nodes(const double* P0, const double* D, const double (*nodes)[8], double* first, double* second) {
   for (int i = 0; i < 3; ++i) first[i] = second[i] = 0.0;

@@ -7,7 +7,6 @@
 namespace avs {
 namespace {
 
-constexpr double INFINITE = std::numeric_limits<double>::infinity();
 constexpr double RADIAN = 3.14159265358979323846 / 180;
 constexpr int COMPARED = 32;    // instants at which the directions of an escape are compared
 constexpr double DENSER = 1.3;  // power of the share of its duration: they are denser at the begin

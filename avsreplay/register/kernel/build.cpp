@@ -9,9 +9,6 @@
 namespace avs {
 namespace {
 
-Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-Vec3 operator*(double s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
-double dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 Vec3 unit(const Vec3& a) { return (1.0 / std::sqrt(dot(a, a))) * a; }
 double axis_of(const Vec3& a, int k) { return k == 0 ? a.x : k == 1 ? a.y : a.z; }
 

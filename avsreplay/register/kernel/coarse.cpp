@@ -6,6 +6,7 @@
 #include <limits>
 
 #include "step.hpp"
+#include "symmetric.hpp"
 
 namespace avs {
 namespace {
@@ -13,8 +14,6 @@ namespace {
 constexpr double MARGIN = 0.15;     // of the diagonal, around the box; a place beyond it is in the nearest cell of the border
 constexpr double DAMPING = 1e-4;    // of the mean information: what is not observable is not moved
 constexpr int64_t LEAST_MATCHED = 6;
-
-double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 // b = (H + damping)^-1 b by Cholesky's decomposition.
 bool solve(double (&H)[6][6], double* b) {

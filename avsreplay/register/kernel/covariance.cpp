@@ -150,7 +150,7 @@ double diluted(const Six& part, const Six& sum) {
 }
 
 // The patches of one half, or all of them.
-struct Part {
+struct PatchPart {
   std::vector<double> normals, gradients;  // (m, 6, 6), and (m, 6) without what pose and amplitudes explain
   double sum[6] = {};                      // of the gradients as they are
   std::array<std::array<double, AMPLITUDES>, 6> coupling{};
@@ -158,7 +158,7 @@ struct Part {
 };
 
 // `left`: of `unexplained`.
-void add(const PatchTable& t, const std::vector<double>& left, int64_t p, Part& to) {
+void add(const PatchTable& t, const std::vector<double>& left, int64_t p, PatchPart& to) {
   const Coupling& A = t.coupling[(size_t)p];
   const double *N = t.normals + 36 * p, *g = t.gradients + 6 * p;
   to.normals.insert(to.normals.end(), N, N + 36);
@@ -175,7 +175,7 @@ struct Effect {
   std::vector<std::array<double, 18>> blocks;  // (6, 3) of each block
   double smooth[6][AMPLITUDES] = {};
 
-  void add(const Part& part, const Six& inverse, double sign) {
+  void add(const PatchPart& part, const Six& inverse, double sign) {
     blocks.resize(part.blocks.size());
     for (int i = 0; i < 6; ++i)
       for (int k = 0; k < 6; ++k) {
@@ -225,14 +225,14 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
   std::vector<double> sorted = along;
   std::sort(sorted.begin(), sorted.end());
   const double middle = 0.5 * (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]);
-  Part parts[2];
-  for (Part& part : parts) part.blocks.resize((size_t)t.blocks);
+  PatchPart parts[2];
+  for (PatchPart& part : parts) part.blocks.resize((size_t)t.blocks);
   for (int64_t p = 0; p < t.m; ++p) add(t, left, p, parts[along[(size_t)p] < middle ? 0 : 1]);
   double d[6] = {}, value = 0;
   Six C;
   Effect effect;
   for (int half = 0; half < 2; ++half) {
-    const Part& part = parts[half];
+    const PatchPart& part = parts[half];
     const int64_t m = (int64_t)part.gradients.size() / 6;
     const Six N = total(part.normals.data(), m);
     if (m < LEAST_HALF) return std::numeric_limits<double>::quiet_NaN();
@@ -330,7 +330,7 @@ std::vector<double> unexplained(const PatchTable& t, const Systematic& errors) {
 }
 
 Estimated covariance(const PatchTable& t, const Systematic& errors, const std::vector<double>& left) {
-  Part all;
+  PatchPart all;
   all.blocks.resize((size_t)t.blocks);
   for (int64_t p = 0; p < t.m; ++p) add(t, left, p, all);
   Estimated out = sandwich(t.normals, left.data(), t.m, t.total.root);

@@ -7,7 +7,6 @@
 namespace avs {
 namespace {
 
-constexpr double SIGMA_PER_MEDIAN = 1.4826;  // standard deviation over median |e| for a normal e
 constexpr double BEYOND = 9.0 * 6;           // squared step in standard deviations: three of each of six
 
 // The mean of J'J with rotations about the centre, in units of the rms radius.

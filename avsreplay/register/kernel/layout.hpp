@@ -20,6 +20,10 @@ struct Vec3 {
   double x, y, z;
 };
 
+inline Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec3 operator*(double s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
+inline double dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
 // A triangle in its own plane: corner a, unit u along the longest side ab, unit w towards c, unit n = u x w (winding).
 // There a = (0, 0), b = (length, 0), c = (cx, cy) with cy > 0; both angles at the longest side are acute.
 struct Triangle {

@@ -7,7 +7,6 @@ namespace avs {
 namespace {
 
 constexpr size_t LEAST_SAMPLES = 30;
-constexpr double SIGMA_PER_MEDIAN = 1.4826;  // standard deviation over median magnitude for normal noise
 constexpr double LEAST_COSINE = 0.2;         // of incidence, where the noise along the ray is measured
 constexpr double CREDIBLE = 3.0;             // standard deviations beyond which a point is not one of the model with noise
 constexpr double CLEAR = 3.0;                // standard deviations by which noise moves a point
@@ -18,8 +17,6 @@ constexpr size_t PILOT = 5;                  // one of so many samples decides w
 constexpr double LEAST_BIAS = 3.0, BY_CHANCE = 1.6;  // chi-square of a bias that is worth while; most of one by chance, over its mean
 constexpr double LEAST_SPREAD = 3000.0;      // of the contributions of all points, with which a bias is likely whatever the part shows
 constexpr double SECOND_ROUND = 0.3;         // square of its chi-square over the points: change by a second round, about
-
-double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 void cross(const double* a, const double* b, double* out) {
   out[0] = a[1] * b[2] - a[2] * b[1], out[1] = a[2] * b[0] - a[0] * b[2], out[2] = a[0] * b[1] - a[1] * b[0];

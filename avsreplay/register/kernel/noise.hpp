@@ -5,6 +5,8 @@
 
 namespace avs {
 
+constexpr double SIGMA_PER_MEDIAN = 1.4826;  // standard deviation over median |e| for a normal e
+
 struct NoiseRule {
   std::vector<double> numbers;  // of a standard normal distribution
   int64_t many;                 // points that are simulated, about

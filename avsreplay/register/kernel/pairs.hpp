@@ -10,8 +10,6 @@
 
 namespace avs {
 
-inline double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
 // Least principal direction of points, the sum of their squared distances from the plane, and their number.
 struct Plane {
   double normal[3] = {0, 0, 0};

@@ -1,9 +1,11 @@
-// Eigenvalues of small symmetric matrices by Jacobi's rotations.
+// Products of vectors in space, and eigenvalues of small symmetric matrices by Jacobi's rotations.
 #pragma once
 #include <algorithm>
 #include <cmath>
 
 namespace avs {
+
+inline double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 inline void turn(double& u, double& v, double c, double s) {
   const double x = c * u - s * v;

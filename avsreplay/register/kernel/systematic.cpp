@@ -12,16 +12,16 @@ namespace {
 
 constexpr double BLOCK = 4;                // patches along a side of a block
 constexpr int64_t LEAST_PATCHES = 24;      // with fewer nothing is estimated
-constexpr double OBSERVABLE = 1e-4;        // an amplitude whose mean squared residual per unit is less is not fitted
+constexpr double OBSERVABLE_MODE = 1e-4;        // an amplitude whose mean squared residual per unit is less is not fitted
 constexpr double SIGNIFICANT = 4.0;        // twice the log likelihood ratio: 2 % of scans without such errors exceed it
-constexpr double LEAST_DETERMINED = 0.05;  // with less of the displacements of blocks left by the fit they are not estimated
+constexpr double LEAST_UNEXPLAINED = 0.05;  // with less of the displacements of blocks left by the fit they are not estimated
 constexpr int ROUNDS = 8;                  // of the maximum likelihood estimate; the last ones change nothing
 constexpr int PAIRS[6][2] = {{0, 0}, {1, 1}, {2, 2}, {0, 1}, {0, 2}, {1, 2}};  // of a strain
 constexpr int JOINED = 6 + SURFACE;        // pose and amplitudes of the surface
 // Over the rms radius of the image: the lengths over which an error of the ranges may vary, as likely before the scan, and
 // that of the modes. A length of 0.7 radii makes the error too small whose constant and linear terms no residual shows.
 constexpr double MODES = 1.4142135623730951, LENGTHS[3] = {1, MODES, 2};
-constexpr double OBSERVABLE_RANGES = 3e-4;  // as OBSERVABLE, for the modes of the ranges
+constexpr double OBSERVABLE_RANGES = 3e-4;  // as OBSERVABLE_MODE, for the modes of the ranges
 using Joined = Square<JOINED>;
 using Row = std::array<double, JOINED>;
 
@@ -44,7 +44,7 @@ void observable(const PatchTable& t, const Joined& all, Equations& out) {
       for (int i = 0; i < 6; ++i)
         for (int j = 0; j < 6; ++j) free[r][c] -= all.v[i][6 + r] * inverse.v[i][j] * all.v[j][6 + c];
     }
-  const double least = OBSERVABLE * points, offset = free[6][6];
+  const double least = OBSERVABLE_MODE * points, offset = free[6][6];
   Six alone, V;
   for (int r = 0; r < 6; ++r)
     for (int c = 0; c < 6; ++c)
@@ -217,7 +217,7 @@ double block_variance(const PatchTable& t, const Equations& q, const std::vector
   }
   const Joined square = about(inverse, sums.square);
   const double expected = sums.expected + inner(square, M) - 2 * sum(sums.moved);
-  if (!(expected > LEAST_DETERMINED * moved)) return 0;
+  if (!(expected > LEAST_UNEXPLAINED * moved)) return 0;
   return std::max(0.0, (sums.found - inner(square, all) + 2 * inner(sums.spread, inverse)) / expected);
 }
 
