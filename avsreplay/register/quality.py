@@ -48,12 +48,9 @@ AS_NEAR = 1.02
 # error of size from sums of patches: over the least reported one, sigmas
 SUGGESTED = 0.4
 SUGGESTED_SIGMAS = 2.5
-<<<<<<< HEAD
 # share of the points on the model, from which a fit is close and little is left to explain; with a
 # smaller one the sums of the inliers alone do not show the size
 LEAST_RATIO = 0.9
-=======
->>>>>>> main
 # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
 UNCHANGED = 0.06
 NUMBERS = 1024  # normal numbers of the simulated noise

@@ -15,10 +15,6 @@ from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.screening import Screen
-<<<<<<< HEAD
-=======
-from avsreplay.register.work import LAST_WORK, LEAST_RATIO, TEST_WORK
->>>>>>> main
 
 HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise over the extent no pose is registered further
 
@@ -89,9 +85,5 @@ class SearchRound(Generator):
     def explained(self, at: Candidate) -> bool:
         """Return whether little of the scan is left to explain by a further round."""
         alone = at.alone or at.covered
-<<<<<<< HEAD
         sure = self.result.inlier_ratio >= quality.LEAST_RATIO or (alone and not self.result.rivals)
-=======
-        sure = self.result.inlier_ratio >= LEAST_RATIO or (alone and not self.result.rivals)
->>>>>>> main
         return sure and self.result.width_m <= self._tools.target.limits.gate_m

@@ -27,10 +27,6 @@ from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
 from avsreplay.register.screening import Screen, Screened
-<<<<<<< HEAD
-=======
-from avsreplay.register.work import FAR_WORK, LAST_WORK, NOT_COMPARED
->>>>>>> main
 
 DISPLACED_POINTS = 300  # points that are registered from displaced poses
 DIRECTIONS = 3  # weak directions, each both ways
