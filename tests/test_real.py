@@ -46,8 +46,8 @@ def test_48_degree_steps_are_kept_also_from_the_last_pose(dragon, cli):
 
 
 def test_72_degree_steps_are_kept(dragon, cli):
-    """The search that follows a failed registration finds the second scan, also where the pipeline does
-    not acquire anew.
+    """The search that follows a failed registration finds the second scan, also where the pipeline
+    does not acquire anew.
     """
     for setting in ((), ("--set", "reacquire=false")):
         rows = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3, *setting))

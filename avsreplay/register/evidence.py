@@ -31,7 +31,6 @@ from avsreplay.register.backend import Target
 from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.sampling import Rays, sample_evenly
 from avsreplay.register.surface_index import kernel_module
-from avsreplay.register.work import LEAST_RATIO
 
 RAYS = 2000  # of a scan, with which poses are compared
 OBSERVATION_OF_EXTENT = 0.03  # side of the cubes of the model whose rays are one observation

@@ -70,7 +70,6 @@ from avsreplay.register.size import (
     spread_of,
 )
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.work import LEAST_RATIO
 
 __all__ = [
     "POSES",

@@ -33,7 +33,6 @@ from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, GradeRule, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
-from avsreplay.register.work import LEAST_RATIO
 
 # gates from which a point is well off; points per which those are counted
 WELL_OFF = 2.0

@@ -22,8 +22,8 @@ import scenes
 from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.register.evidence import EvidenceModel, Observed
+from avsreplay.register.quality import LEAST_RATIO
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.work import LEAST_RATIO
 
 LIMITS = (0.4, 0.6, 0.8, 0.9, 1.0, 1.2)
 TURNS = 6  # wrong starts of each scan
