@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.log import SourceOptions
+from avsreplay.log.canonical import inside_crop
 from avsreplay.log.header import scaled
 from avsreplay.log.options import Unit
 from avsreplay.records import Alignment, AlignStatus, Surface
@@ -239,7 +240,7 @@ def find_model(
     Args:
         clouds: as for ``compare_sizes``.
         surface: model of the target.
-        found: findings of ``compare_sizes``; the unit that they suggest is used.
+        found: findings of ``compare_sizes``; the unit and the crop that they suggest are used.
         options: how the log is read.
 
     Returns:
@@ -249,15 +250,18 @@ def find_model(
     model = in_found_unit(surface, found, options)
     if (metres := _named_unit(found, "--scan-unit")) is not None:
         clouds = [metres * cloud for cloud in clouds]
+    by_range, by_box = _named(found, "--crop-range"), _named(found, "--crop-box")
+    range_m = None if by_range is None else [float(v) for v in by_range.split(",")]
+    box_m = None if by_box is None else [float(v) for v in by_box.split(",")]
+    clouds = [cloud[inside_crop(cloud, range_m, box_m)] for cloud in clouds]
     few, registrar = _few(clouds), Registrar(model)
     poses = [registrar.acquire(cloud) for cloud in few]
     one, any_pose = _counts(poses)
     mirrored = _mirror_advice(few, poses, registrar, model, options)
     text = f"the model is found in {any_pose} of {len(few)} searched scans"
-    background = any(each.option.startswith("--crop") for each in found)
-    if any_pose < len(few) and not background:  # without the other points it can be found
-        anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[1]
-        if anywhere > any_pose + 1:  # one scan more may be chance
+    if one < len(few):
+        anywhere = _fitting(few, Registrar(model, RegisterParams(camera=Camera.NONE)))[0]
+        if anywhere > one + 1:  # one scan more may be chance
             text += (
                 f", and in {anywhere} if the sensor may be anywhere: are the points in its frame?"
                 " If its position in their frame is known, give --sensor-at X,Y,Z instead"
@@ -286,8 +290,14 @@ def in_found_unit(surface: Surface, found: Sequence[Advice], options: SourceOpti
 
 def _named_unit(found: Sequence[Advice], option: str) -> float | None:
     """The unit [m] that a finding names as the value of an option, None if none does."""
+    value = _named(found, option)
+    return None if value is None else Unit(value).metres
+
+
+def _named(found: Sequence[Advice], option: str) -> str | None:
+    """The value of an option that a finding names, None if none does."""
     words = next((a.option.split() for a in found if option in a.option.split()), [])
-    return Unit(words[words.index(option) + 1]).metres if words else None
+    return words[words.index(option) + 1] if words else None
 
 
 def _mirror_advice(
@@ -303,7 +313,7 @@ def _mirror_advice(
     seen = [
         SeenScan(np.asarray(cloud, dtype=np.float32), pose.T_ac.inverse())
         for cloud, pose in zip(clouds, poses, strict=True)
-        if pose.measured
+        if pose.status is AlignStatus.ALIGNED
     ]
     if seen:
         if not mirror_image_fits(registrar, model, seen):

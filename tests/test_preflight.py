@@ -30,6 +30,7 @@ from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.sampling import diameter
+from avsreplay.simulate.target import builtin_surface
 from avsreplay.task import TaskParams
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
@@ -588,10 +589,11 @@ def test_points_far_from_the_origin_of_their_frame_are_named(surface):
     assert "1e+06 m" in advice.text
 
 
-def test_a_sensor_that_is_not_at_the_origin_is_named(surface):
+def test_a_sensor_that_is_not_at_the_origin_is_named():
     """Ray-cast views by a sensor at the origin, and the same points in a frame whose origin is 60 m
     away.
     """
+    surface = builtin_surface()
     caster, rays = (
         RayMeshIntersector(trimesh.Trimesh(surface.vertices, surface.faces)),
         ray_grid(8.0, 50),

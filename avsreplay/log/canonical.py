@@ -407,18 +407,31 @@ def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
         cloud: a canonical cloud.
         options: how the log is read.
     """
-    if options.crop_box is not None:
-        low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
-        cloud = cloud.keep(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
-    if options.crop_range is not None:
-        distance, (least, most) = (
-            np.linalg.norm(cloud.points.astype(np.float64), axis=1),
-            options.crop_range,
-        )
-        cloud = cloud.keep((distance >= least) & (distance <= most))
+    if options.crop_box is not None or options.crop_range is not None:
+        cloud = cloud.keep(inside_crop(cloud.points, options.crop_range, options.crop_box))
     if options.scan_duration_s is None or cloud.places is None:
         return cloud
     return replace(cloud, times_s=np.float32(options.scan_duration_s) * cloud.places, places=None)
+
+
+def inside_crop(
+    points: NDArray[Any], crop_range: Sequence[float] | None, crop_box: Sequence[float] | None
+) -> NDArray[np.bool_]:
+    """Return which points are inside a crop.
+
+    Args:
+        points: (n, 3) points in the frame of the cloud [m].
+        crop_range: least and largest distance from the origin [m]; None: any.
+        crop_box: least x, y, z and largest x, y, z [m]; None: any.
+    """
+    inside = np.ones(len(points), dtype=np.bool_)
+    if crop_box is not None:
+        low, high = np.array(crop_box[:3]), np.array(crop_box[3:])
+        inside &= np.all((points >= low) & (points <= high), axis=1)
+    if crop_range is not None:
+        distance = np.linalg.norm(points.astype(np.float64), axis=1)
+        inside &= (distance >= crop_range[0]) & (distance <= crop_range[1])
+    return inside
 
 
 def at_stamp(cloud: Cloud, sensor_at: Callable[[int], Pose]) -> Cloud:
