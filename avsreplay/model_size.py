@@ -137,7 +137,7 @@ def compare_sizes(
         return [Advice("check", "unit", text, "--model-unit mm --scan-unit mm")]
     if _LEAST_SIZE_RATIO <= ratio <= _MAX_TARGET_RATIO:
         groups = _grouped_units(clouds, model_m, ratio, unit, most=_SCENE_FACTOR)
-        other = groups and _unit_advice({unit: [], **groups}, clouds, surface, options, said)
+        other = groups and _unit_advice({unit: [], **groups}, clouds, surface, options, ratio, said)
         return other or [_agreeing(said, ratio)]
     whole = _units(ratio, unit)
     left = ratio > MOST_OF_MODEL and (ratio < _BACKGROUND_RATIO or not whole)  # not a wrong unit
@@ -154,6 +154,7 @@ def compare_sizes(
             clouds,
             surface,
             options,
+            ratio,
             said,
         )
         or [_unexplained(said, ratio)]
@@ -208,6 +209,15 @@ def _unexplained(said: str, ratio: float) -> Advice:
         ratio > MOST_OF_MODEL
     )
     return Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")
+
+
+def _not_found(said: str) -> Advice:
+    """Scans that are larger than the model, which is found in them in no unit."""
+    text = (
+        f"{said}; the model is not found in them in any unit: if other objects are in view, keep"
+        " the target by --crop-box or --crop-range"
+    )
+    return Advice("fail", "size", text)
 
 
 def _no_points(options: SourceOptions) -> Advice:
@@ -398,6 +408,7 @@ def _unit_advice(
     clouds: Sequence[NDArray[Any]],
     surface: Surface,
     options: SourceOptions,
+    ratio: float,
     said: str,
 ) -> list[Advice]:
     """The unit, and the crop around its groups of points; empty if it is the given one.
@@ -414,6 +425,8 @@ def _unit_advice(
     scale, groups = max(units.items(), key=lambda item: fits[item[0]][0])
     if scale == given:
         return []
+    if not fits[scale][1] and MOST_OF_MODEL < ratio <= _MAX_SCENE_RATIO:
+        return [_not_found(said)]  # surroundings explain the size of the scans as well
     doubt = "" if fits[scale][1] else ", or it is another object: it is not found in the scans"
     model_m = diameter(surface.vertices, trimmed=False)
     scans = None if options.scan_unit else _scan_unit(scale / given, model_m)

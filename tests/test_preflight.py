@@ -256,6 +256,25 @@ def test_a_model_that_no_scan_shows_is_doubtful_though_the_sizes_agree(surface):
     assert "is it the right model" in _found(found, "pose").text
 
 
+@pytest.mark.parametrize("size", [18.0, 37.0, 95.0])
+def test_a_scene_without_the_model_suggests_no_unit(surface, size):
+    """Six spheres in a cube that is ``size`` times the model, which inches or
+    centimetres would explain as well.
+    """
+    rng = np.random.default_rng(5)
+    extent = size * np.linalg.norm(np.ptp(surface.vertices, axis=0)) / np.sqrt(3.0)
+    centres = extent * np.array(
+        [[0, 0, 0], [1, 1, 1], [1, 0, 0], [0, 1, 0], [0.5, 0.5, 1], [0, 1, 1]]
+    )
+    directions = rng.normal(size=(6, 400, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    cloud = (centres[:, None] + 0.12 * extent * directions).reshape(-1, 3)
+    cloud[:, 2] += 2 * extent  # in front of the sensor
+    found = [a for a in preflight(Log([cloud] * 3), surface) if a.about in ("unit", "size")]
+    assert [a.grade for a in found] == ["fail"]
+    assert "unit" not in found[0].option
+
+
 def test_a_unit_in_which_no_scan_shows_the_model_may_be_another_object(surface):
     cloud = np.random.default_rng(1).normal([0.0, 0.0, 12.0], 1.0, (2000, 3))
     unit = _found(preflight(Log([cloud]), scaled(surface, 1000.0)), "unit")

@@ -25,7 +25,7 @@ from avsreplay.register.evidence import robust_noise
 # accepts more poses that have a rival.
 CHANCE_SIGMAS = 5.0
 OFF = 2.0  # a point farther from the model than this many widths is off it
-CONTRADICTING_RAYS = 0.1  # share of the rays that contradict the true pose, at least
+CONTRADICTING_SHARE = 0.1  # of the rays that contradict the true pose, at least
 DECIDING_LOG_RATIO = 20.0  # log likelihood ratio that decides
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 
@@ -75,7 +75,7 @@ def decides(better: Measured, other: Measured, width_m: float, complete: bool) -
             count.
     """
     a, b, off = better.distance, other.distance, OFF * width_m
-    share = max(CONTRADICTING_RAYS, float(np.mean((a > width_m) & (b > width_m))))
+    share = max(CONTRADICTING_SHARE, float(np.mean((a > width_m) & (b > width_m))))
     if share >= 0.5:
         return False
     rays_for = (

@@ -30,6 +30,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.backend import Target
 from avsreplay.register.sampling import Rays, sample_evenly
 from avsreplay.register.surface_index import kernel_module
+from avsreplay.register.work import LEAST_RATIO
 
 RAYS = 2000  # of a scan, with which poses are compared
 OBSERVATION_OF_EXTENT = 0.03  # side of the cubes of the model whose rays are one observation
@@ -73,7 +74,6 @@ IMAGE_POINTS = 800  # of the model, which bound its image
 LEAST_MEAN = 0.8
 LEAST_SURE = 1.0
 MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
-LEAST_ALONE = 0.9  # share of the points on the model from which the sensor may be elsewhere
 # Log likelihood ratio of the edges of the model below which another surface was measured. The
 # right poses of held-out bodies have 18 or more; a box that is 5 % larger has -61 or less.
 LEAST_OF_EDGES = 0.0
@@ -183,7 +183,7 @@ class Evidence:
             predicted: the pose is the predicted one, so that surface which is hidden or outside of
                 the scan says nothing, unless it may be where points off the model are.
         """
-        if self.away and self.share < LEAST_ALONE:
+        if self.away and self.share < LEAST_RATIO:
             return TURNED_AWAY
         if self.silhouettes < LEAST_OF_EDGES:
             return CONTRADICTED + GOES_ON

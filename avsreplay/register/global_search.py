@@ -24,6 +24,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.comparison import Measured, as_good, least_noise
+from avsreplay.register.evidence import MEASURED_OF_EXTENT
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT
 from avsreplay.register.poses import Sameness
@@ -51,10 +52,9 @@ FINE_STARTS = 10
 # sampled from the model; cells of the grid along its diagonal
 MODEL_POINTS = 3000
 CELLS = 40
-# distances of unexplained points; the largest
+# distances of unexplained points
 COARSE_OF_EXTENT = 0.03
 MIDDLE_OF_EXTENT = 0.02
-MOST_OF_EXTENT = 0.05
 # rejection distance of the first pass, and its factor from pass to pass
 FIRST_GATE_OF_EXTENT = 0.3
 GATE_FALL = 0.7
@@ -387,7 +387,7 @@ class GlobalSearch:
         off = self._target.index.closest(moved).d2 > (CARRIED_OF_EXTENT * self._extent) ** 2
         return bool(np.count_nonzero(off) <= MOST_UNCARRIED * len(points))
 
-    def measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Measured:
+    def measured(self, points: Array, T_ca: Pose, most: float = MEASURED_OF_EXTENT) -> Measured:
         """Return the distances of points (n, 3) in {A} at a pose, at most ``most`` extents."""
         distance, work = self._target.visibility.distances(
             self._target.index, points, T_ca, most * self._extent

@@ -31,10 +31,14 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.evidence import robust_noise
+from avsreplay.register.comparison import CONTRADICTING_SHARE, MOST_AGAINST
+from avsreplay.register.evidence import MEASURED_OF_EXTENT, robust_noise
+from avsreplay.register.quality import PATCH_OF_EXTENT
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import directions, sample_evenly
+from avsreplay.register.size import OFF_PLANES
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
+from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS
 
 S = np.diag([-1.0, 1.0, 1.0, 1.0])  # the reflection in the frame of the sensor
 # scans that are compared, from directions so far apart
@@ -64,24 +68,16 @@ TO_SCAN = ((0.03, 4), (0.015, 4), (0.008, 6))  # and of a scan
 # reflections of which a scan is refined, and truncation to choose them
 REFINED_REFLECTIONS = 2
 TRIED_OF_EXTENT = 0.02
-# truncation: noise, least; largest distance measured
+# truncation: noise, least
 NOISE = 3.0
 LEAST_OF_EXTENT = 0.003
-MOST_OF_EXTENT = 0.05
-# side of a patch, its offset, and fewest points
-PATCH_OF_EXTENT = 0.05
-OFF_PLANES = 0.381966
+# fewest points of a patch
 PATCH_POINTS = 4
-CONTRADICTING_SHAPE = 0.1  # share of the patches that contradict the true shape
-# log likelihood ratio that decides; patches against over those for it
+# log likelihood ratio that decides
 MIRROR_LOG_RATIO = 6.0
-MOST_AGAINST = 0.25
 ENOUGH = 3  # scans that decide for the model, after which no more are compared
 # share of the points off the model, above which the mirror image of one scan is searched
 MOST_OFF = 0.1
-# points of which so many must be on faces towards the sensor
-TESTED_POINTS = 200
-LEAST_FACING = 0.4
 
 
 @value_class
@@ -179,7 +175,7 @@ def _searched(registrar: Registrar, scan: SeenScan, before: _Compared) -> _Compa
 
 def _decide(compared: Sequence[_Compared], extent_m: float, sign: float = 1.0) -> bool:
     """Whether scans decide for the mirror image, or with a ``sign`` of -1 for the model."""
-    most = float(np.log((1.0 - CONTRADICTING_SHAPE) / CONTRADICTING_SHAPE))
+    most = float(np.log((1.0 - CONTRADICTING_SHARE) / CONTRADICTING_SHARE))
     ratio = sign * np.clip(0.5 * NOISE**2 * _by_patch(compared, extent_m), -most, most)
     gain, against = float(ratio[ratio > 0.0].sum()), -float(ratio[ratio < 0.0].sum())
     return gain - against > MIRROR_LOG_RATIO and against < MOST_AGAINST * gain
@@ -280,11 +276,11 @@ def _compared(registrar: Registrar, scan: SeenScan, starts: Sequence[Array]) -> 
         _refined(index, some, scan.T_cs, TO_SCAN, sided),
         min(ended, key=of_image, default=None),
     )
-    by_model = distance(points, own, MOST_OF_EXTENT)
+    by_model = distance(points, own, MEASURED_OF_EXTENT)
     by_image = (
         np.full_like(by_model, np.inf)
         if mirrored is None
-        else distance(image, mirrored, MOST_OF_EXTENT)
+        else distance(image, mirrored, MEASURED_OF_EXTENT)
     )
     width = max(
         NOISE * min(map(robust_noise, (by_model, by_image))), LEAST_OF_EXTENT * index.extent_m

@@ -42,6 +42,7 @@ from avsreplay.register.backend import (
 from avsreplay.register.duration import (
     BIAS_SCANS,
     JACKKNIFE_BLOCKS,
+    LEAST_SCANS,
     MOST_WEIGHT,
     Duration,
     Durations,
@@ -68,6 +69,7 @@ from avsreplay.register.size import (
     spread_of,
 )
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.work import LEAST_RATIO
 
 __all__ = [
     "POSES",
@@ -88,9 +90,7 @@ CHECKED_POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = 0.001
 CHECKED_EVERY = 3
 MOST_CHECKED = 60
-LEAST_SCANS = 8
 ENOUGH_SCANS = 16  # the check ends here if the scans exclude an error that would be reported
-LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 _MIRRORED = (
     "so that an axis of the model or of the points is inverted: add --model-mirror (if it is given,"
     " remove it)"
@@ -106,7 +106,6 @@ _PLACE_POINTS = 500  # points of each
 _LEAST_EXPLAINED = 0.5
 _NOTED = 0.5  # least share of systematic errors that is reported
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
-LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
 
 @value_class
@@ -172,7 +171,7 @@ class ModelCheck:
         """
         if found is None or not len(scan.points):
             return
-        on_model = found.inlier_ratio >= LEAST_ON_MODEL
+        on_model = found.inlier_ratio >= LEAST_RATIO
         if found.measured and on_model:
             self._matched = True  # the scan is on the model, although the pose is not accepted
         aligned = found.status is AlignStatus.ALIGNED
@@ -415,7 +414,7 @@ class ModelCheck:
         found = self._registrar.acquire(reflected(seen))
         return (
             found.status is AlignStatus.ALIGNED
-            and found.inlier_ratio >= LEAST_OF_MIRRORED
+            and found.inlier_ratio >= LEAST_RATIO
             and not found.message
         )
 

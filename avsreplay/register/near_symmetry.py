@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
 from avsreplay.register import index_cache
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, Target
 from avsreplay.register.comparison import OFF, Measured, decided, least_noise
 from avsreplay.register.global_search import FINE_PASSES, GlobalSearch
 from avsreplay.register.params import AcquireParams
@@ -38,8 +38,6 @@ SAMPLES_WORK = 40_000
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TRIED_MOTIONS = 16  # motions of a kind by which the marks are found
 MARK_SPACINGS = 2.0  # more points are sampled within so many spacings of a point on a mark
-# a point within this (over the extent), or within three sigma of the noise, is on the model
-ON_MODEL_OF_EXTENT = 0.004
 MARK_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
 SCREEN_SIGMAS = 2.0  # standard errors of the cost of a turned pose by few points
 # an exact symmetry carries all but this share of the surface to within this of it, over the extent
@@ -217,7 +215,7 @@ class NearSymmetry:
         return max(self._gate, self._near(least_noise(found)))
 
     def _near(self, noise_m: float) -> float:
-        return max(ON_MODEL_OF_EXTENT * self._target.index.extent_m, 3.0 * noise_m)
+        return max(LEAST_GATE_OF_EXTENT * self._target.index.extent_m, 3.0 * noise_m)
 
     def images(self, T_ca: Pose) -> list[Pose]:
         """Return the poses onto which the exact symmetries of the model carry a pose, where they

@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit
-from avsreplay.register.backend import Backend, Target
+from avsreplay.register.backend import TIGHTEN, Backend, Target
 from avsreplay.register.sampling import sample
 from avsreplay.settings import Settings, setting
 
-TIGHTEN = 3.0  # the gate of the reference in units of the rms of the last pass
 MIN_INLIERS = 6
 SETTLED_GATE = 0.01  # the gate has settled once a pass changes it by less than this share
 STEP_EPS = 10.0  # steps end at this many eps, because the covariances are not smooth in the pose

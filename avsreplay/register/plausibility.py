@@ -17,6 +17,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
 from avsreplay.register.evidence import (
+    MEASURED_OF_EXTENT,
     REGION_OF_EXTENT,
     TOO_FEW,
     Evidence,
@@ -36,8 +37,7 @@ LEAST_SCAN_OF_EXTENT = 0.05
 SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
 # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
 PREDICTED = 1.0
-# where fewer points are nearer, the noise at a predicted pose is theirs
-HIDDEN_NEAR_OF_EXTENT = 0.05
+# where a smaller share of the points is near, the noise at a predicted pose is theirs
 MOST_HIDDEN = 0.5
 # a scan narrower than so much of the model, in one of four directions of the image, shows a part of
 # it
@@ -108,7 +108,7 @@ class PlausibilityTest:
         The latter only at the predicted pose ``guess``: elsewhere the points near the model may be
         so by chance.
         """
-        near = distance[distance < HIDDEN_NEAR_OF_EXTENT * self._extent]
+        near = distance[distance < MEASURED_OF_EXTENT * self._extent]
         few = LEAST_COMPARED <= len(near) < MOST_HIDDEN * len(distance)
         return robust_noise(near if few and self.predicted(T_ca, guess) else distance)
 

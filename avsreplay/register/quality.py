@@ -33,6 +33,7 @@ from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, normal_jacobian, size_remark
 from avsreplay.register.surface_index import Closest, GradeRule, SurfaceIndex
 from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
+from avsreplay.register.work import LEAST_RATIO
 
 # gates from which a point is well off; points per which those are counted
 WELL_OFF = 2.0
@@ -47,7 +48,6 @@ AS_NEAR = 1.02
 # error of size from sums of patches: over the least reported one, sigmas
 SUGGESTED = 0.4
 SUGGESTED_SIGMAS = 2.5
-MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
 # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
 UNCHANGED = 0.06
 NUMBERS = 1024  # normal numbers of the simulated noise
@@ -333,7 +333,7 @@ def _other_size(found: PoseQuality) -> bool:
     not on the model.
     """
     suggested = abs(found.size) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
-    return found.inliers < MANY_INLIERS * found.points or suggested
+    return found.inliers < LEAST_RATIO * found.points or suggested
 
 
 def _message(settled: bool, size_1s: float) -> str:
@@ -374,7 +374,7 @@ def _rule(
         move_m=accuracy[1] * extent,
         across=np.ascontiguousarray(across),
         beyond_m=WELL_OFF * gate_m,
-        least_close=MANY_INLIERS,
+        least_close=LEAST_RATIO,
         part=PART,
         numbers=normal_numbers(NUMBERS) if simulated else np.empty(0),
         many=SIMULATED,

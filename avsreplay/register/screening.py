@@ -1,7 +1,7 @@
 """Poses measured and registered by part of a scan, cheaply enough for many hypotheses.
 
 A graduated registration takes point-to-plane passes while the rejection distance falls
-geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``SCREEN_STOP_OF_EXTENT`` of the
+geometrically from ``SCREEN_START_OF_EXTENT`` (or the reach) to ``LEAST_GATE_OF_EXTENT`` of the
 extent. The falling distance rejects outliers, which the rms rule of the normal alignment cannot do
 if they are the majority. Poses are compared by truncated squared distances at a common width.
 """
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, Target
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.quality import PART
 from avsreplay.register.surface_index import IcpParams
@@ -24,18 +24,16 @@ from avsreplay.register.work import CALL_WORK, LEAST_RATIO, STAGE_WORK
 
 POINTS = PART  # points of the scan by which hypotheses are screened
 HOPEFUL_POINTS = 150  # points that show whether a guess is hopeful
-# first and last rejection distance over the extent
+# first rejection distance over the extent
 SCREEN_START_OF_EXTENT = 0.05
-SCREEN_STOP_OF_EXTENT = 0.004
 # factor on the rejection distance per stage, and passes per stage
 SCREEN_FALL = 0.6
 PASSES = 4
 # A pose replaces the first of several with a cost below this share of its cost. Nearer to 1, poses
 # are exchanged by the chance of noise.
 BETTER_THAN = 0.9
-# points nearer than so many widths are near; a rest is another object if most of these are on
+# points nearer than so many widths are near; a rest is another object if nearly all of these are on
 NEAR_WIDTHS = 5.0
-MOSTLY = 0.9
 
 
 @value_class
@@ -64,7 +62,7 @@ class Screened:
         on, near = (
             int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR_WIDTHS)
         )
-        return on >= MOSTLY * near
+        return on >= LEAST_RATIO * near
 
 
 class Screen:
@@ -86,7 +84,7 @@ class Screen:
         test.
         """
         gates, gate = [], start_m
-        while gate > SCREEN_STOP_OF_EXTENT * self._extent:
+        while gate > LEAST_GATE_OF_EXTENT * self._extent:
             gates.append(gate)
             gate *= SCREEN_FALL
         rule = IcpParams(
@@ -148,7 +146,7 @@ class Screen:
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(
-            min(self._target.limits.gate_m, SCREEN_STOP_OF_EXTENT * self._extent), 3.0 * noise
+            min(self._target.limits.gate_m, LEAST_GATE_OF_EXTENT * self._extent), 3.0 * noise
         )
 
     def least(self, found: list[Screened]) -> Screened:

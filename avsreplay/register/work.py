@@ -26,7 +26,8 @@ SIMULATED_WORK = (
     2,
 )  # cost of the simulation of the noise: point searches in all, and of each point
 MOST_SIMULATED = 3000  # points that are simulated, at most
-LEAST_RATIO = 0.9  # with fewer inliers a fit is not close
+# share of the points on the model, from which a fit is close and little is left to explain
+LEAST_RATIO = 0.9
 # searches per point of a pass while less than this share of the points is on the model
 FAR_WORK = 2
 LEAST_NEAR = 0.5

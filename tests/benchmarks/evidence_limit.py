@@ -21,8 +21,9 @@ import scenes
 
 from avsreplay import geometry
 from avsreplay.geometry import Pose
-from avsreplay.register.evidence import LEAST_ALONE, EvidenceModel, Observed
+from avsreplay.register.evidence import EvidenceModel, Observed
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.work import LEAST_RATIO
 
 LIMITS = (0.4, 0.6, 0.8, 0.9, 1.0, 1.2)
 TURNS = 6  # wrong starts of each scan
@@ -90,7 +91,7 @@ def _poses(registrar, model, case, seed):
         step = case.truth.inverse() @ found.T_ca.inverse()
         angle = float(np.degrees(geometry.angle(step.q)))
         moved = float(np.linalg.norm(step.apply(middle) - middle)) / extent
-        accepted = at is not None and not (at.away and at.share < LEAST_ALONE)
+        accepted = at is not None and not (at.away and at.share < LEAST_RATIO)
         if angle < 2.0 and moved < 0.02:
             yield True, at.mean if accepted else -np.inf
         elif angle > 10.0 or moved > 0.1:

@@ -19,10 +19,9 @@ from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.screening import Screen
-from avsreplay.register.work import LAST_WORK, TEST_WORK
+from avsreplay.register.work import LAST_WORK, LEAST_RATIO, TEST_WORK
 
 HOPELESS = 1.5 * NOISE_OF_EXTENT  # with more noise over the extent no pose is registered further
-SURE_RATIO = 0.9  # share of the points on the model, from which little is left to explain
 
 
 @value_class
@@ -106,5 +105,5 @@ class SearchRound(Generator):
     def explained(self, at: Candidate) -> bool:
         """Return whether little of the scan is left to explain by a further round."""
         alone = at.alone or at.covered
-        sure = self.result.inlier_ratio >= SURE_RATIO or (alone and not self.result.rivals)
+        sure = self.result.inlier_ratio >= LEAST_RATIO or (alone and not self.result.rivals)
         return sure and self.result.width_m <= self._tools.target.limits.gate_m

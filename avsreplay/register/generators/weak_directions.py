@@ -20,14 +20,14 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import LEAST_GATE_OF_EXTENT, RADIUS_OF_EXTENT, Target
 from avsreplay.register.comparison import as_good
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.generators.restarts import screened
 from avsreplay.register.hypotheses import Candidate, Case, Generator, Hypothesis
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.poses import ONE_MINIMUM, Sameness
-from avsreplay.register.screening import SCREEN_STOP_OF_EXTENT, Screen, Screened
+from avsreplay.register.screening import Screen, Screened
 from avsreplay.register.work import FAR_WORK, LAST_WORK, NOT_COMPARED
 
 DISPLACED_POINTS = 300  # points that are registered from displaced poses
@@ -38,7 +38,6 @@ DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 BESIDE_SIGMAS = 4.0
 LEAST_INLIERS = 6  # which determine a pose
 UNMOVED = 0.25  # a pose nearer to its guess, in gates, is not compared
-RADIUS_OF_EXTENT = 0.25  # usual rms radius of a scan over the extent
 
 
 @value_class
@@ -172,7 +171,7 @@ class WeakDirections(Generator):
         if not self._complete:
             return None, replace(at, missing=NOT_COMPARED)
         best, width = self._screen.least(minima), 3.0 * min(each.noise_m for each in minima)
-        width = max(SCREEN_STOP_OF_EXTENT * self._extent, width)
+        width = max(LEAST_GATE_OF_EXTENT * self._extent, width)
         others = (e for e in minima if not self._poses.same(best.T_ca, e.T_ca, ONE_MINIMUM))
         aligned = at.found.status is AlignStatus.ALIGNED
         beside = aligned and any(
