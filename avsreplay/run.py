@@ -258,6 +258,7 @@ class Run:
             self._healthy.store,
             self.estimator.params,
             outcome.start_ns,
+            outcome.scan.t_ns,
         )
         outcome = replace(outcome, cause=self._cause.words)
         assert self._scored is not None
@@ -294,6 +295,15 @@ class Run:
             except UsageError:
                 self._smoothed = self.done, None
         return self._smoothed[1]
+
+    def cause_names(self, kind: str, t_ns: int) -> bool:
+        """Return whether the column ``cause`` names an event of a kind.
+
+        Args:
+            kind: name of the kind of events.
+            t_ns: instant of the scan [ns].
+        """
+        return self._cause.names(kind, t_ns)
 
     def rescore(self) -> list[int]:
         """Score the plans of a log that grew with all its true poses; replace the rows that change

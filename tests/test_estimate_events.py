@@ -25,6 +25,7 @@ from avsreplay.estimate.chart import (
     to_chart,
     to_errors,
 )
+from avsreplay.estimate.events.kinds import KINDS
 from avsreplay.estimate.events.linear import LinearModel, passed, shock_gain
 from avsreplay.estimate.events.naming import Cause
 from avsreplay.estimate.events.smoothing import PoseStore, smoothed
@@ -249,24 +250,29 @@ def test_an_event_is_named_with_its_size_and_onset(case, kinds, seed):
 @pytest.mark.parametrize(
     ("torque", "said"),
     [
-        (lambda t, w: np.array([3e-4 * np.sin(2.0 * np.pi * t / 20.0), 0.0, 0.0]), "periodic"),
-        (lambda t, w: -0.01 * w, "drag of"),
+        (
+            lambda t, w: np.array([3e-4 * np.sin(2.0 * np.pi * t / 20.0), 0.0, 0.0]),
+            "periodic_torque",
+        ),
+        (lambda t, w: -0.01 * w, "drag"),
     ],
 )
 def test_rows_name_a_cause_once_the_poses_show_it(torque, said):
     """Free bodies are not searched; the first cause that is named is the true one, and remains."""
     fixes, _, _, _ = _scene(341, seconds=100.0, torque_at=torque)
-    store, known, free, told = PoseStore(), Cause(), Cause(), []
+    store, known, free, told, kinds = PoseStore(), Cause(), Cause(), [], []
     for fix in fixes:
         store.append(fix)
-        free = free.after(False, store, PARAMS, 0)
-        known = known.after(True, store, PARAMS, 0)
+        free = free.after(False, store, PARAMS, 0, fix.t_ns)
+        known = known.after(True, store, PARAMS, 0, fix.t_ns)
+        kinds.append([kind.name for kind in KINDS if known.names(kind.name, fix.t_ns)])
         told.append(known.words)
     assert (free.words, free.searched) == ("", 0)
     named = [words for words in told if words]
     assert len(named) > 40
-    assert all(said in words for words in named)
-    assert said in told[-1]
+    assert [bool(found) for found in kinds] == [bool(words) for words in told]
+    assert all(said in found for found in kinds if found)
+    assert said in kinds[-1]
 
 
 def test_a_covariance_that_is_not_positive_is_an_error_of_arithmetic():

@@ -566,11 +566,13 @@ def _smoothed_record(run: Run, rows: Sequence[Row], summary: Summary) -> dict[st
         return None
     record = motion.smoothed.record(run.taken[0].t_ns)
     for event in record["events"]:
-        event["first_known_s"] = _first_known_s(event, rows, summary)
+        event["first_known_s"] = _first_known_s(run, event, rows, summary)
     return record
 
 
-def _first_known_s(event: Mapping[str, Any], rows: Sequence[Row], summary: Summary) -> float | None:
+def _first_known_s(
+    run: Run, event: Mapping[str, Any], rows: Sequence[Row], summary: Summary
+) -> float | None:
     """Time of the first row that contains an event of the whole log; None where none does."""
     from avsreplay.report.summary_parts import SAME_EVENT_S
     from avsreplay.tables import column_of
@@ -578,9 +580,8 @@ def _first_known_s(event: Mapping[str, Any], rows: Sequence[Row], summary: Summa
     kind, onset_s = event["kind"], event["onset_s"]
     away = 3.0 * event["onset_1s_s"] + SAME_EVENT_S
     times = column_of(rows, "t_s")
-    begin = event["words"].partition(" of ")[0].partition(" by ")[0]
-    causes = zip(times, column_of(rows, "cause"), strict=True)
-    known = [t for t, cause in causes if cause and begin in cause]
+    instants = zip(times, column_of(rows, "t_ns"), strict=True)
+    known = [t for t, t_ns in instants if run.cause_names(kind, t_ns)]
     if kind in ("torque", "force"):
         stated = zip(times, column_of(rows, "drift_s"), strict=True)
         known += [t for t, since in stated if since is not None]

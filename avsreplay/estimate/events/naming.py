@@ -32,12 +32,17 @@ class Cause:
     Attributes:
         words: the events with sizes, onsets and 1 sigma, in words; "" where none is known.
         searched: number of healthy poses at the last search, 0 before the first.
+        kinds: instant of the scan [ns] of each search, and the names of the kinds of events that
+            are named from then on.
     """
 
     words: str = ""
     searched: int = 0
+    kinds: tuple[tuple[int, tuple[str, ...]], ...] = ()
 
-    def after(self, shown: bool, poses: PoseStore, params: EstimatorParams, start_ns: int) -> Cause:
+    def after(
+        self, shown: bool, poses: PoseStore, params: EstimatorParams, start_ns: int, t_ns: int
+    ) -> Cause:
         """Return what is known after a scan.
 
         Args:
@@ -45,16 +50,28 @@ class Cause:
             poses: the healthy ones so far.
             params: of the estimator, auto values filled in.
             start_ns: instant of the first scan, from which onsets are stated [ns].
+            t_ns: instant of the scan [ns].
         """
         count = len(poses)
         if not shown or count < max(_FIRST_SEARCH, _GROWTH * self.searched):
             return self
-        return Cause(_named(poses, params, start_ns), count)
+        words, kinds = _named(poses, params, start_ns)
+        return Cause(words, count, (*self.kinds, (t_ns, kinds)))
+
+    def names(self, kind: str, t_ns: int) -> bool:
+        """Return whether an event of a kind was named at an instant.
+
+        Args:
+            kind: name of the kind.
+            t_ns: the instant [ns].
+        """
+        known = [kinds for since_ns, kinds in self.kinds if since_ns <= t_ns]
+        return bool(known) and kind in known[-1]
 
 
-def _named(store: PoseStore, params: EstimatorParams, start_ns: int) -> str:
-    """The most likely set of events and those that are nearly as likely, in words; "" where one of
-    them is empty.
+def _named(store: PoseStore, params: EstimatorParams, start_ns: int) -> tuple[str, tuple[str, ...]]:
+    """The most likely set of events and those that are nearly as likely, in words, and the names of
+    their kinds; none where one of the sets is empty.
     """
     fixes = store.fixes(spread(len(store), _MOST_POSES))
     poses = poses_of(tuple(fixes))
@@ -62,17 +79,19 @@ def _named(store: PoseStore, params: EstimatorParams, start_ns: int) -> str:
     try:
         sets = search(problem, first_fit(problem))
     except ArithmeticError:  # no motion of a rigid body explains the poses
-        return ""
+        return "", ()
     least = total(problem, sets[0]) - SURE_EVENT_LOG_ODDS
     kinds: dict[tuple[str, ...], Fit] = {}
     for fit in sets:
         if total(problem, fit) > least:
             kinds.setdefault(tuple(sorted(e.kind.name for e in fit.events)), fit)
     if () in kinds:
-        return ""
+        return "", ()
     likely = [fit for names, fit in kinds.items() if not any(_within(k, names) for k in kinds)]
+    likely = likely[:_MOST_STATED]
     late_s = (fixes[0].t_ns - start_ns) * 1e-9
-    return " or ".join(_words(problem, fit, late_s) for fit in likely[:_MOST_STATED])
+    named = dict.fromkeys(e.kind.name for fit in likely for e in fit.events)
+    return " or ".join(_words(problem, fit, late_s) for fit in likely), tuple(named)
 
 
 def _within(some: tuple[str, ...], names: tuple[str, ...]) -> bool:
