@@ -130,20 +130,16 @@ class WeakDirections(Generator):
     def compared(
         self, case: Case, found: list[Hypothesis]
     ) -> tuple[Hypothesis | None, Candidate | None]:
-        """Return a clearly better minimum; the candidate near a guess is doubted if another
-        explains the scan as well.
+        """Return a clearly better minimum; the candidate is doubted if another explains the scan
+        as well.
         """
         minima, at = [each.at for each in found if each.at is not None], case.at
         best, width = self._screen.least(minima), 3.0 * min(each.noise_m for each in minima)
         width = max(LEAST_GATE_OF_EXTENT * self._extent, width)
         others = (e for e in minima if not self._poses.same(best.T_ca, e.T_ca, ONE_MINIMUM))
         aligned = at.found.status is AlignStatus.ALIGNED
-        beside = (
-            case.guess is not None
-            and aligned
-            and any(
-                as_good(best.costs(width), each.costs(width), 0.0, BESIDE_SIGMAS) for each in others
-            )
+        beside = aligned and any(
+            as_good(best.costs(width), each.costs(width), 0.0, BESIDE_SIGMAS) for each in others
         )
         chosen = None if best is minima[0] else Hypothesis.of(best)
         return chosen, replace(at, beside=beside)
