@@ -204,21 +204,14 @@ def _background_advice(
     return []
 
 
-def _unexplained(said: str, ratio: float) -> Advice:
+def _unexplained(
+    said: str, ratio: float, why: str = "no common unit explains the difference"
+) -> Advice:
     """Sizes that no unit explains."""
     hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (
         ratio > MOST_OF_MODEL
     )
-    return Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")
-
-
-def _not_found(said: str) -> Advice:
-    """Scans that are larger than the model, which is found in them in no unit."""
-    text = (
-        f"{said}; the model is not found in them in any unit: if other objects are in view, keep"
-        " the target by --crop-box or --crop-range"
-    )
-    return Advice("fail", "size", text)
+    return Advice("fail", "size", f"{said}; {why}{hint}")
 
 
 def _no_points(options: SourceOptions) -> Advice:
@@ -437,7 +430,8 @@ def _unit_advice(
     if scale == given:
         return []
     if not fits[scale][1] and MOST_OF_MODEL < ratio <= _MAX_SCENE_RATIO:
-        return [_not_found(said)]  # surroundings explain the size of the scans as well
+        # surroundings explain the size of the scans as well
+        return [_unexplained(said, ratio, "the model is not found in them in any unit")]
     doubt = "" if fits[scale][1] else ", or it is another object: it is not found in the scans"
     model_m = diameter(surface.vertices, trimmed=False)
     scans = None if options.scan_unit else _scan_unit(scale / given, model_m)

@@ -336,7 +336,8 @@ class Replanning:
         for k, known in enumerate(self._inputs()):
             if k >= index and not log.ended:
                 state = guidance.step(state or guidance.initial(known.t_ns), known)
-            log.take(self.belief(k), state, known.gamma, known.converged, self._errors(k))
+            log.take(self.belief(k), state, known.gamma, known.converged)
+        log.errors = self._errors(len(log.stamps) - 1)
         return assess(self._setup(flights, seed), log, self.truth)
 
     def _errors(self, index: int) -> ScanErrors:

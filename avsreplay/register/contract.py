@@ -37,7 +37,6 @@ STOPPED_RAD = np.radians(0.01)
 STOPPED_OF_EXTENT = 5e-5
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20
-DETAIL = 200  # characters of a detail
 # step in shares of the extent; relative error, mostly of points at edges
 HESSIAN_STEP = 1e-4
 HESSIAN_WITHIN = 0.03

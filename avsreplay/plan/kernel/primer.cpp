@@ -9,7 +9,6 @@
 namespace avs {
 namespace {
 
-
 void by_nodes(const double* P0, const double* D, const double (*nodes)[8], double* first, double* second) {
   for (int i = 0; i < 3; ++i) first[i] = second[i] = 0.0;
   for (int k = 0; k < 8; ++k) {
