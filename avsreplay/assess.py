@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import field, replace
 from functools import partial
 from itertools import pairwise
@@ -40,8 +40,9 @@ from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import Adaptation, NoiseSource
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
 from avsreplay.outcome import CaptureError, Plan, PlanStatus
-from avsreplay.pipeline import planner_input
+from avsreplay.pipeline import planned_time, planner_input
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.flights import (
@@ -123,7 +124,7 @@ class FlightLog:
         state: the state of guidance after the last scan of the flight; None before the first
             approach.
         belief: the belief after the last scan.
-        converged: whether this belief may be used for planning.
+        convergence: whether this belief may be used for planning, and since when its test holds.
         gammas: gamma of every scan.
         stamps: instant of every scan [ns].
         failing_ns: instant since which no capture is planned [ns]; None where one is.
@@ -135,7 +136,7 @@ class FlightLog:
         self.legs: list[Leg] = []
         self.state: GuidanceState | None = None
         self.belief: Belief | None = None
-        self.converged = False
+        self.convergence = ConvergenceTrack()
         self.gammas: list[int] = []
         self.stamps: list[int] = []
         self.noises: list[Array] = []
@@ -147,7 +148,7 @@ class FlightLog:
         belief: Belief,
         guidance: GuidanceState | None,
         gamma: int,
-        converged: bool,
+        convergence: ConvergenceTrack,
         errors: ScanErrors | None = None,
     ) -> None:
         """Take one scan.
@@ -156,7 +157,7 @@ class FlightLog:
             belief: the belief after the scan.
             guidance: the state of guidance after the scan; it does not change after the capture.
             gamma: 1 for a healthy scan, else 0.
-            converged: whether the belief may be used for planning.
+            convergence: whether the belief may be used for planning.
             errors: what is known of errors after the scan.
         """
         self.errors = errors or ScanErrors()
@@ -166,7 +167,8 @@ class FlightLog:
             self.noises = [*self.noises[-NOISE_SCANS + 1 :], self.errors.noise]
         if self.ended or guidance is None:
             return
-        self.state, self.belief, self.converged = guidance, belief, converged
+        self.state, self.belief, self.convergence = guidance, belief, convergence
+        converged = convergence.converged
         if converged and guidance.plan is not None and guidance.plan.found:
             self.failing_ns = None
         elif self.failing_ns is None and converged:
@@ -202,6 +204,7 @@ class Setup:
     Attributes:
         task: the task of the gripper.
         estimator, guidance: estimator and guidance of the run.
+        convergence: decides in a simulated flight whether its estimate may be used for planning.
         target: geometry of the target about the grasp point, with its surface.
         solid: whether inside and outside of the surface are known.
         extent_m: extent of the target [m].
@@ -218,6 +221,7 @@ class Setup:
     task: Task
     estimator: Estimator
     guidance: Guidance
+    convergence: Convergence
     target: TargetGeometry
     solid: bool
     extent_m: float
@@ -289,7 +293,7 @@ def assess(setup: Setup, log: FlightLog, truth: Motion | None = None) -> Assessm
         found = _closed(setup, log, state)
     elif state.decision.action is Action.ABORT:
         found = _aborted(setup, log, state)
-    elif log.converged and state.plan is not None and state.plan.found:
+    elif log.convergence.converged and state.plan is not None and state.plan.found:
         found = _continued(setup, log, state, belief)
     else:
         found = _at_rest(setup, log, state, belief)
@@ -378,7 +382,7 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
         contact = float(touched.mean())
     found: dict[str, Any] = {"chance": Chance.NONE, "probability": 0.0, "contact": contact}
     params, free = setup.guidance.params, _planned(setup, belief)
-    plan = state.plan if log.converged else None
+    plan = state.plan if log.convergence.converged else None
     plan = free if plan is None and free.status is PlanStatus.INFEASIBLE else plan
     if plan is not None:
         proven = plan.status is PlanStatus.INFEASIBLE
@@ -392,32 +396,34 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
             "known_s": setup.at_s(log.failing_ns or plan.t_ns),
             "change": change,
         }
+    return {**found, **_insufficient(setup, log, belief)}
+
+
+def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> dict[str, Any]:
+    """Why an estimate does not suffice for an approach, and what would change it. Only where no
+    further scan changes this the answer is known.
+    """
     lost = " any more" if any(leg.action is not Action.STAND_STILL for leg in log.legs) else ""
-    limit, change = _insufficient(setup, log, belief)
-    return {
-        **found,
-        "limit": f"the estimate does not suffice{lost}: {limit}",
-        "known_s": setup.at_s(belief.t_ns),
-        "change": change,
-    }
-
-
-def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> tuple[str, str]:
-    """Why an estimate does not suffice for an approach, and what would change it."""
+    words = f"the estimate does not suffice{lost}"
     sigmas, (position, turn) = setup.guidance.supervisor.params.sigmas, log.errors.lasting
     lasting = sigmas * np.array([position, 0.0, math.degrees(turn)])
     if (lasting > setup.limits).any():
         worst = int(np.argmax(lasting / setup.limits))
         limit = f"{sigmas:g} sigma of the {_QUANTITIES[worst]} error that all poses have in common"
-        change = "a larger tolerance or a more exact model would help"
-        return f"{limit} are {_of_tolerance(setup, worst, lasting[worst])}", change
+        return {
+            "limit": f"{words}: {limit} are {_of_tolerance(setup, worst, lasting[worst])}",
+            "known_s": setup.at_s(belief.t_ns),
+            "change": "a larger tolerance or a more exact model would help",
+        }
+    open_: dict[str, Any] = {"chance": Chance.UNDECIDED, "probability": None}
     after = _planned_s(setup, belief)
     worst, size, cause = _predicted(setup, belief, after)
     if size <= setup.limits[worst]:
         limit = "it has to be consistent and within the tolerances for convergence.dwell_s"
-        return limit, _change(setup, cause)
-    limit = f"predicted {_QUANTITIES[worst]} error {_of_tolerance(setup, worst, size)}"
-    return f"{limit} at a capture in {after:.0f} s, from {cause}", _change(setup, cause)
+    else:
+        limit = f"predicted {_QUANTITIES[worst]} error {_of_tolerance(setup, worst, size)}"
+        limit += f" at a capture in {after:.0f} s, from {cause}"
+    return {**open_, "limit": f"{words}: {limit}", "change": _change(setup, cause)}
 
 
 def _of_tolerance(setup: Setup, which: int, size: float) -> str:
@@ -522,14 +528,12 @@ def simulated(
         before = _flown_past(setup, setup.contact, log, belief.t_ns, estimated)[0]
     out: list[Ended] = []
     for each in drawn:
-        forecast = partial(setup.estimator.forecast, each)
-        target = planner_input(setup.estimator, each, setup.target, 1, True, forecast).scene
-        inputs = measured(setup, log, belief, each, rng)
+        target = DrawnTarget(simulating(setup, log, belief), each, rng)
         out.append(
             closed_loop(
                 setup.guidance,
-                inputs,
-                target,
+                measured(setup, log, belief, target, state, rng),
+                target.scene,
                 belief.t_ns,
                 setup.thrust_noise_mps2,
                 rng,
@@ -541,21 +545,81 @@ def simulated(
     return out
 
 
-def measured(
-    setup: Setup, log: FlightLog, belief: Belief, drawn: Belief, rng: np.random.Generator
-) -> Iterator[PlannerInput]:
-    """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
-    noise of the log, and no pose where the log had a blackout. Its disturbances are those of the
-    log.
+class DrawnTarget:
+    """A target that begins with the mean of a belief and moves under the random torque and force
+    of an estimator, which are drawn for one interval after the other.
+
+    Attributes:
+        estimator: predicts the motion, with its process noise.
+        scene: the target, by the time after its begin [s]; after the last interval it moves freely.
+    """
+
+    def __init__(self, estimator: Estimator, drawn: Belief, rng: np.random.Generator) -> None:
+        """Begin at an instant.
+
+        Args:
+            estimator: predicts the motion.
+            drawn: mean at the begin, about the grasp point in {A}.
+            rng: random generator.
+        """
+        self.estimator, self._rng = estimator, rng
+        self._begins = [_exact(drawn)]
+        self.scene = Scene(self._goal, self._attitude)
+
+    def advance(self, t_ns: int) -> tuple[Array, Array]:
+        """Move to the end of an interval.
+
+        Args:
+            t_ns: end of the interval [ns].
+
+        Returns:
+            Position (3,) of the grasp point in {A} [m] and attitude q_ac (4,) then.
+        """
+        last, estimator = self._begins[-1], self.estimator
+        predicted = estimator.predict(estimator.resumed(last), t_ns).belief
+        there = estimator.frame.belief_out(predicted)
+        self._begins.append(_exact(drawn_beliefs(there, 1, self._rng)[1][0]))
+        at = np.array([(t_ns - self._begins[0].t_ns) * 1e-9])
+        return self._goal(at)[0][0], self._attitude(at)[0]
+
+    def _goal(self, times: Array) -> tuple[Array, Array]:
+        position, velocity = np.empty((2, len(times), 3))
+        for belief, which, after in self._parts(times):
+            position[which], velocity[which] = self.estimator.motion(belief)(after)
+        return position, velocity
+
+    def _attitude(self, times: Array) -> Array:
+        out = np.empty((len(times), 4))
+        for belief, which, after in self._parts(times):
+            out[which] = self.estimator.attitude(belief)(after)
+        return out
+
+    def _parts(self, times: Array) -> Iterator[tuple[Belief, Flags, Array]]:
+        """Intervals with the instants in them and the times of these after their begin [s]."""
+        begins = np.array([(b.t_ns - self._begins[0].t_ns) * 1e-9 for b in self._begins])
+        intervals = np.maximum(np.searchsorted(begins, times, "right") - 1, 0)
+        for k in np.unique(intervals):
+            which = intervals == k
+            yield self._begins[k], which, times[which] - begins[k]
+
+
+def _exact(belief: Belief) -> Belief:
+    """A belief without errors."""
+    if isinstance(belief, DrivenBelief):
+        belief = replace(belief, cross=0.0 * belief.cross, P_u=0.0 * belief.P_u)
+    return replace(belief, P=0.0 * belief.P)
+
+
+def simulating(setup: Setup, log: FlightLog, belief: Belief) -> Estimator:
+    """Return the estimator of simulated flights, with the disturbances of the log.
+
+    The noise is known here, and a fit to the poses of the flight would have none of the log.
 
     Args:
         setup: task, estimator, guidance and target.
         log: the flight so far.
-        belief: the belief from which the filter goes on.
-        drawn: the target.
-        rng: random generator.
+        belief: the belief from which it goes on.
     """
-    # The noise is known here, and a fit to the poses of the flight would have none of the log.
     params = replace(
         setup.estimator.params,
         noise=NoiseSource.REGISTRATION,
@@ -565,8 +629,30 @@ def measured(
     if log.errors.disturbances is not None:
         torque, force = log.errors.disturbances
         params = replace(params, torque_noise_radps15=torque, force_noise_mps15=force)
-    estimator = Estimator(params, belief, setup.extent_m, setup.since_ns)
-    motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
+    return Estimator(params, belief, setup.extent_m, setup.since_ns)
+
+
+def measured(
+    setup: Setup,
+    log: FlightLog,
+    belief: Belief,
+    target: DrawnTarget,
+    state: GuidanceState | None,
+    rng: np.random.Generator,
+) -> Generator[PlannerInput, GuidanceState, None]:
+    """Inputs of guidance for a drawn target after each scan: the filter with poses that have the
+    noise of the log, no pose where the log had a blackout, and the test of convergence. The state
+    of guidance after the input is sent to the generator.
+
+    Args:
+        setup: task, estimator, guidance and target.
+        log: the flight so far.
+        belief: the belief from which the filter goes on.
+        target: the target.
+        state: the state of guidance at the belief; None if the robot is at its start.
+        rng: random generator.
+    """
+    estimator, held = target.estimator, log.convergence
     track, C = estimator.resumed(belief), setup.noise
     if C is None:
         position, half = np.split(np.diag(estimator.params.R0), 2)
@@ -577,14 +663,13 @@ def measured(
     offset = int(rng.integers(len(log.gammas)))
     last_ns = round(setup.guidance.params.horizon_s * 2e9)
     for k, since_ns in enumerate(range(step_ns, last_ns, step_ns)):
-        t_ns, dt = belief.t_ns + since_ns, np.array([since_ns * 1e-9])
+        t_ns = belief.t_ns + since_ns
         prior, gamma = estimator.predict(track, t_ns), log.gammas[(offset + k) % len(log.gammas)]
         turn, move = np.split(root @ rng.standard_normal(6), 2)
+        position, q = target.advance(t_ns)
         if gamma:
-            q = attitude(dt)[0]
             pose = Pose(
-                geometry.multiply(q, geometry.exp(turn)),
-                motion(dt)[0][0] + geometry.matrix(q) @ move,
+                geometry.multiply(q, geometry.exp(turn)), position + geometry.matrix(q) @ move
             )
             quality = 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED
             innovation = estimator.innovate(prior, Alignment(pose, *quality, covariance=C))
@@ -592,7 +677,12 @@ def measured(
         else:
             track = estimator.update(track, prior, None, 0)
         forecast = partial(estimator.forecast, track.belief)
-        yield planner_input(estimator, track.belief, setup.target, gamma, True, forecast)
+        planned = planned_time(estimator, setup.guidance, state, track.belief)
+        at_capture = setup.convergence.at_capture(forecast, planned.after_s)
+        held = setup.convergence.judge(held, track.belief, at_capture, flown=planned.flown)
+        state = yield planner_input(
+            estimator, track.belief, setup.target, gamma, held.converged, forecast
+        )
 
 
 def drawn_beliefs(

@@ -26,6 +26,7 @@ class Chance(Enum):
     POSSIBLE = "possible"
     UNLIKELY = "unlikely"
     NONE = "none"  # the robot does not close its gripper: no plan, no estimate, or an abort
+    UNDECIDED = "not yet decided"  # the log ends while the estimate does not suffice for a plan
     NOT_ASSESSED = "not assessed"
 
 
@@ -106,12 +107,12 @@ class Assessment:
         if self.chance is Chance.NOT_ASSESSED:
             advice = f"; {self.change}" if self.change else ""
             return f"CAPTURE not assessed: {self.limit}{advice}"
-        parts = [self._head, self._contact]
-        if self.limit:
-            parts.append(self.limit if self.chance is Chance.NONE else f"limited by {self.limit}")
-        if self.chance is Chance.NONE:
+        if self.chance in (Chance.NONE, Chance.UNDECIDED):
             since = "" if self.known_s is None else f", known at {self.known_s:.1f} s"
-            parts = [f"CAPTURE no: {self.limit}{since}", self._contact if self.contact else ""]
+            word = "no" if self.chance is Chance.NONE else self.chance.value
+            parts = [f"CAPTURE {word}: {self.limit}{since}", self._contact if self.contact else ""]
+        else:
+            parts = [self._head, self._contact, f"limited by {self.limit}" if self.limit else ""]
         if not self.ok and self.change:
             parts.append(self.change)
         if self.in_fact is not None:

@@ -70,7 +70,9 @@ def stages(
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(
             Consistency(config.consistency),
-            Convergence(config.convergence, surface.extent, _tolerance(task), supervision.sigmas),
+            Convergence(
+                config.convergence, surface.extent, task.tolerance.in_si, supervision.sigmas
+            ),
         ),
         guidance=Guidance(
             robot.applied(config.plan),
@@ -95,11 +97,6 @@ def _tracker(config: RunConfig, middle: Array, extent_m: float) -> Tracker | Non
     """The tracker of a model; None with the method of the paper and with a plug-in."""
     own = config.estimator.method == OWN and config.estimator.start is not Start.PAPER
     return Tracker(middle, extent_m) if own and config.estimator.robust else None
-
-
-def _tolerance(task: Task) -> tuple[float, float, float]:
-    allowed = task.tolerance
-    return allowed.position_m, allowed.speed_mps, float(np.radians(allowed.angle_deg))
 
 
 def task_and_target(config: RunConfig, surface: Surface) -> tuple[Task, TargetGeometry]:

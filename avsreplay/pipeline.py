@@ -177,10 +177,8 @@ class Monitors:
         consistent = window.consistent and not (
             track.window.many_outliers or in_doubt(track) or failed
         )
-        forecast = estimator.track_forecast(track, np.zeros(1), seen.grasp_c)
-        if self.convergence.ratio(forecast) <= 1.0:  # else no later error is within the tolerance
-            after_s = np.array([planned.after_s()])
-            forecast = estimator.track_forecast(track, after_s, seen.grasp_c)
+        predicted = partial(estimator.track_forecast, track, grasp_c=seen.grasp_c)
+        forecast = self.convergence.at_capture(predicted, planned.after_s)
         possible = after_change(belief, forecast.times_s, track.change_probability, track.change_P)
         turns = state.turns
         if seen.alignment.measured:
@@ -362,7 +360,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         track = following.shown
         prior, innovation = _seen(stages, state, scan, measurement) or (prior, innovation)
     belief = stages.estimator.published(track)
-    planned = _planned_time(stages, state.guidance, belief)
+    aim = at_grasp(belief, stages.grasp_c)
+    planned = planned_time(stages.estimator, stages.guidance, state.guidance, aim)
     seen = MonitorInput(
         prior=prior,
         alignment=measurement.alignment,
@@ -376,7 +375,6 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     guidance = state.guidance or stages.guidance.initial(scan.t_ns)
     if stages.guidance.params.enabled and guidance.captured_ns is None:
         forecast = partial(stages.estimator.track_forecast, track, grasp_c=stages.grasp_c)
-        aim = at_grasp(belief, stages.grasp_c)
         known = planner_input(
             stages.estimator, aim, stages.target, gamma, report.converged, forecast
         )
@@ -493,18 +491,27 @@ def _weighed(stages: Stages, state: PipelineState, measurement: Measurement) -> 
     return replace(measurement, weighed=weighed)
 
 
-def _planned_time(stages: Stages, guidance: GuidanceState | None, belief: Belief) -> PlannedTime:
-    """The time to the capture that is flown, or that a plan from the robot's start would take."""
-    params, t_ns = stages.guidance.params, belief.t_ns
-    if guidance is not None and guidance.captured_ns is not None:
+def planned_time(
+    estimator: AnyEstimator, guidance: Guidance, state: GuidanceState | None, belief: Belief
+) -> PlannedTime:
+    """Return the time to the capture that is flown, or that a plan from the robot's start would
+    take.
+
+    Args:
+        estimator: predicts the motion.
+        guidance: guidance of the robot.
+        state: its state before the scan; None before the first one.
+        belief: the estimate after the scan, about the grasp point.
+    """
+    params, t_ns = guidance.params, belief.t_ns
+    if state is not None and state.captured_ns is not None:
         return PlannedTime(True, lambda: 0.0)
-    if guidance is not None and guidance.segment.capture:
-        left_s = max((guidance.segment.end_ns - t_ns) * 1e-9, 0.0)
+    if state is not None and state.segment.capture:
+        left_s = max((state.segment.end_ns - t_ns) * 1e-9, 0.0)
         return PlannedTime(True, lambda: left_s)
 
     def planned() -> float:
-        motion = stages.estimator.motion(at_grasp(belief, stages.grasp_c))
-        made = rendezvous(motion, *params.start, params, t_ns)
+        made = rendezvous(estimator.motion(belief), *params.start, params, t_ns)
         return made.t_go_s if made.found else params.horizon_s
 
     return PlannedTime(False, planned)

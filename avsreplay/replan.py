@@ -5,9 +5,11 @@ belief, its errors against the truth, and the simulated approach.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -26,12 +28,13 @@ from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.geometry import Array
+from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
 from avsreplay.plan.constrained import constrained, linearised_s, with_safety
-from avsreplay.plan.flights import Ended, Miss, closed_loop, miss, true_scene
+from avsreplay.plan.flights import Ended, Miss, miss
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
@@ -49,11 +52,15 @@ from avsreplay.plan.supervisor import Supervisor, SupervisorParams
 from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, spread
 from avsreplay.records import Belief, Surface
 from avsreplay.report.page import Flight
+from avsreplay.rows import Row
 from avsreplay.saved_result import Saved
 from avsreplay.tables import column_of
 from avsreplay.task import target_at, task_of
 
 FLIGHT_INSTANTS = 401  # instants of the flight on its page
+Decided = tuple[float, str, str]
+"""Time after the first scan [s], action and rule of a decision of the supervisor."""
+
 _NO_MODEL = Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int32), "", "")
 
 
@@ -319,34 +326,55 @@ class Replanning:
             count: number of flights.
             seed: of draws and errors.
         """
-        log = FlightLog()
-        log.stamps, log.gammas = (column_of(self.saved.rows, name) for name in ("t_ns", "gamma"))
-        log.errors = self._errors(index)
+        log, _ = self._flown()
+        log.convergence, log.errors = self._known(self.saved.rows[index])
         return simulated(self._setup(count, seed), log, None, self.belief(index))
 
-    def assess(self, index: int, flights: int = SIMULATED_FLIGHTS, seed: int = 0) -> Assessment:
-        """Return whether the robot would capture if its approach began at a scan.
+    def recorded(self) -> tuple[Assessment | None, list[Decided]]:
+        """Return the assessment of the run, None where the result has none, and the changes of the
+        supervisor's decision.
+        """
+        rows = self.saved.rows
+        columns = (column_of(rows, name) for name in ("t_s", "action", "supervisor_rule"))
+        return self.saved.assessment, _changes(zip(*columns, strict=True))
+
+    def assess(
+        self, index: int, flights: int = SIMULATED_FLIGHTS, seed: int = 0
+    ) -> tuple[Assessment, list[Decided]]:
+        """Return whether the robot would capture if its approach began at a scan, and the changes
+        of the supervisor's decision.
 
         Args:
             index: the scan.
             flights: number of simulated flights where the result ends before the capture.
             seed: of all draws.
         """
-        log, state, guidance = FlightLog(), None, self._guidance()
-        for k, known in enumerate(self._inputs()):
-            if k >= index and not log.ended:
-                state = guidance.step(state or guidance.initial(known.t_ns), known)
-            log.take(self.belief(k), state, known.gamma, known.converged)
-        log.errors = self._errors(len(log.stamps) - 1)
-        return assess(self._setup(flights, seed), log, self.truth)
+        log, decisions = self._flown(index)
+        return assess(self._setup(flights, seed), log, self.truth), _changes(decisions)
 
-    def _errors(self, index: int) -> ScanErrors:
-        """What is known of errors after a scan."""
-        row = self.saved.rows[index]
+    def _flown(self, index: int | None = None) -> tuple[FlightLog, list[Decided]]:
+        """The flight over the result that begins at a scan, and its decisions; None: the robot
+        stays at its start.
+        """
+        log, state, guidance = FlightLog(), None, self._guidance()
+        decisions: list[Decided] = []
+        for k, (known, row) in enumerate(zip(self._inputs(), self.saved.rows, strict=True)):
+            if index is not None and k >= index and not log.ended:
+                state = guidance.step(state or guidance.initial(known.t_ns), known)
+                decisions.append((row.t_s, state.decision.action.value, state.decision.rule))
+            log.take(self.belief(k), state, known.gamma, *self._known(row))
+        return log, decisions
+
+    def _known(self, row: Row) -> tuple[ConvergenceTrack, ScanErrors]:
+        """The test of convergence and what is known of errors after a scan; where the test holds,
+        it does so since the first scan.
+        """
+        converged = bool(row.converged)
+        held = ConvergenceTrack(converged, since_ns=self.saved.since_ns if converged else None)
         torque, force = row.torque_noise_radps15, row.force_noise_mps15
         if torque is None or force is None:
-            return ScanErrors()
-        return ScanErrors(disturbances=(torque, force))
+            return held, ScanErrors()
+        return held, ScanErrors(disturbances=(torque, force))
 
     def _setup(self, flights: int, seed: int) -> Setup:
         surface = self.saved.surface
@@ -354,6 +382,12 @@ class Replanning:
             task=self.task,
             estimator=self.saved.estimator,
             guidance=self._guidance(),
+            convergence=Convergence(
+                self.saved.convergence,
+                self.saved.extent_m,
+                self.task.tolerance.in_si,
+                self.supervisor.sigmas,
+            ),
             target=self._target,
             solid=surface is not None and len(surface.faces) > 0,
             extent_m=self.saved.extent_m,
@@ -385,9 +419,7 @@ class Replanning:
             self.params, supervisor, self.limits, extent_m, self.robot.gripper, self.arm
         )
 
-    def execute(self) -> Ended | None:
-        """Simulate the approach over the whole log under the supervisor; None without truth."""
-        if self.truth is None:
-            return None
-        target = true_scene(self.truth)
-        return closed_loop(self._guidance(), self._inputs(), target, self.saved.since_ns)
+
+def _changes(decisions: Iterable[Decided]) -> list[Decided]:
+    """The first of equal decisions one after the other."""
+    return [next(alike) for _, alike in groupby(decisions, key=itemgetter(1, 2))]

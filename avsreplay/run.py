@@ -276,7 +276,7 @@ class Run:
             at_grasp(outcome.belief, self.task.grasp_c),
             state.guidance,
             outcome.verdict.gamma,
-            outcome.monitors.converged,
+            state.monitors.convergence,
             ScanErrors(
                 self._noise_of(outcome), outcome.disturbances, outcome.monitors.forecast.lasting
             ),
@@ -412,6 +412,7 @@ class Run:
             task=self.task,
             estimator=self._predictor(),
             guidance=self.stages.guidance,
+            convergence=self.stages.monitors.convergence,
             target=self._target,
             solid=len(surface.faces) > 0,
             extent_m=surface.extent,

@@ -17,6 +17,7 @@ from avsreplay.assessment import Assessment
 from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.convergence import ConvergenceParams
 from avsreplay.plan.flights import Motion, interpolated
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
@@ -53,7 +54,7 @@ class Saved:
         rows, beliefs: one of each per scan.
         times_s, poses: recorded true poses of {C} in {A} and their times after the first scan [s].
         estimator: estimator with the settings of the run.
-        plan, supervisor, limits, robot, task: settings of the run.
+        plan, supervisor, limits, robot, task, convergence: settings of the run.
         noise: (6, 6) covariance of the error of a measured pose in {C} [rad, m]; None where it is
             not known.
         assessment: the assessment of the run; None where the result has none.
@@ -73,6 +74,7 @@ class Saved:
     limits: Limits
     robot: RobotParams
     task: TaskParams
+    convergence: ConvergenceParams
     extent_m: float
     surface: Surface | None
     noise: Array | None = None
@@ -158,6 +160,7 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         limits=_table(Limits, config, "limits"),
         robot=_table(RobotParams, config, "robot"),
         task=_task(result.header),
+        convergence=_table(ConvergenceParams, config, "convergence"),
         noise=_noise(result.header),
         assessment=result.summary.assessment,
         extent_m=extent,
@@ -187,6 +190,7 @@ def of_run(run: Run, rows: Sequence[Row], beliefs: Sequence[Belief]) -> Saved:
         limits=config.limits,
         robot=config.robot,
         task=task_settings(run.task.record()),
+        convergence=config.convergence,
         noise=run.flight.noise,
         extent_m=extent_m,
         surface=run.surface,

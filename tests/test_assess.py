@@ -7,11 +7,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 import pytest
 
 from avsreplay.assess import (
+    DrawnTarget,
     FlightLog,
     ScanErrors,
     Setup,
@@ -19,6 +21,7 @@ from avsreplay.assess import (
     drawn_beliefs,
     measured,
     simulated,
+    simulating,
 )
 from avsreplay.assessment import Assessment, Chance, InFact, chance_of
 from avsreplay.build import target_geometry
@@ -26,8 +29,9 @@ from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.geometry import covariance_about, exp, matrix
+from avsreplay.geometry import angle_between, covariance_about, exp, matrix
 from avsreplay.log import SourceOptions
+from avsreplay.monitor.convergence import Convergence, ConvergenceParams, ConvergenceTrack
 from avsreplay.outcome import CaptureError
 from avsreplay.pipeline import planner_input
 from avsreplay.plan.contact import Contact
@@ -46,6 +50,7 @@ from avsreplay.simulate.target import Shape, builtin_surface
 from avsreplay.task import Approach, TaskParams, patches, task_of
 
 TOLERANCE = CaptureError(0.013, 0.0066, 2.0)
+HELD = ConvergenceTrack(True, since_ns=-10_000_000_000)
 
 
 def body(shape=Shape.CUBE, shift=(0.0, 0.0, 0.0)):
@@ -216,6 +221,7 @@ def setup_of(noise=None, flights=1):
         task=given,
         estimator=Estimator(EstimatorParams(), None, surface.extent),
         guidance=Guidance(PlanParams(), Supervisor(supervision), limits, surface.extent),
+        convergence=Convergence(ConvergenceParams(), surface.extent, given.tolerance.in_si),
         target=target,
         solid=True,
         extent_m=surface.extent,
@@ -242,7 +248,7 @@ def test_simulated_flights_keep_what_is_known_of_a_body_whose_principal_axes_are
     assert 2.0 * np.sqrt(np.trace(given.P[:3, :3])) > 1.0  # the attitude of the axes
     setup, log = setup_of(np.diag([0.01**2] * 6)), FlightLog()
     for k in range(5):
-        log.take(Belief(k * 400_000_000, x, given.P), None, 1, True)
+        log.take(Belief(k * 400_000_000, x, given.P), None, 1, HELD)
     ended = simulated(setup, log, None, given)
     assert len(ended) == 1
     assert all(flight.miss.inside(setup.task.tolerance) for flight in ended)
@@ -255,8 +261,8 @@ def test_the_noise_of_flights_has_the_mean_information_of_the_last_poses():
     for free in (3, 4):
         C = 1e-6 * np.eye(6)
         C[free, free] = 1.0
-        log.take(given, None, 1, True, ScanErrors(C))
-    log.take(given, None, 0, True, ScanErrors(np.eye(6)))  # a faulty scan measures nothing
+        log.take(given, None, 1, HELD, ScanErrors(C))
+    log.take(given, None, 0, HELD, ScanErrors(np.eye(6)))  # a faulty scan measures nothing
     assert np.diag(log.noise) == pytest.approx([1e-6, 1e-6, 1e-6, 2e-6, 2e-6, 1e-6], rel=1e-3)
 
 
@@ -283,41 +289,88 @@ def test_a_log_that_ends_blind_at_its_first_plan_is_assessed():
     state = guidance.step(guidance.initial(0), replace(known, gamma=0))
     assert state.plan.found
     assert not state.supervisor.moving
-    log.take(given, state, 1, True)
+    log.take(given, state, 1, HELD)
     log.gammas = [1, 0]
     assert assess(setup, log).probability is not None
 
 
 @pytest.mark.parametrize(
-    ("lasting", "words"),
+    ("lasting", "chance", "words"),
     [
-        ((0.002, 0.0), "3 sigma of the position error that all poses have in common are 6 of 4.33"),
-        ((0.0, 0.02), "3 sigma of the attitude error that all poses have in common are 3.44 of 2"),
-        ((0.0, 0.0), "it has to be consistent and within the tolerances for convergence.dwell_s"),
+        ((0.002, 0.0), Chance.NONE, "3 sigma of the position error that all poses have in common"),
+        ((0.0, 0.02), Chance.NONE, "error that all poses have in common are 3.44 of 2 deg"),
+        ((0.0, 0.0), Chance.UNDECIDED, "not suffice: it has to be consistent and within"),
     ],
 )
-def test_a_robot_that_waits_says_which_condition_its_estimate_misses(lasting, words):
+def test_a_robot_that_waits_says_which_condition_its_estimate_misses(lasting, chance, words):
+    """Only an error that no further scan reduces decides that it does not capture."""
     setup, x = setup_of(), belief()[0].x
     given, log = Belief(0, x, 1e-16 * np.eye(20)), FlightLog()
     forecast = partial(setup.estimator.forecast, given)
     known = planner_input(setup.estimator, given, setup.target, 1, False, forecast)
     state = setup.guidance.step(setup.guidance.initial(0), known)
-    log.take(given, state, 1, False, ScanErrors(lasting=lasting))
-    assert words in assess(setup, log).limit
+    log.take(given, state, 1, ConvergenceTrack(), ScanErrors(lasting=lasting))
+    found = assess(setup, log)
+    assert words in found.sentence
+    assert (found.chance, found.succeeds, found.lowers_grade) == (chance, False, True)
+    assert found.probability == (0.0 if chance is Chance.NONE else None)
+    again = Assessment.of_record(json.loads(json.dumps(found.record(), allow_nan=False)))
+    assert again.sentence == found.sentence
+
+
+def after_two_scans(given, torque):
+    """The begin of simulated flights from a belief, with a random torque [rad/s^1.5]."""
+    setup, log = setup_of(np.diag([1e-8] * 6)), FlightLog()
+    for k in range(2):
+        errors = ScanErrors(disturbances=(torque, 0.0))
+        log.take(replace(given, t_ns=k * 400_000_000), None, 1, HELD, errors)
+    log.convergence = HELD
+    return setup, log, replace(given, t_ns=400_000_000)
+
+
+def flown_inputs(given, torque, count):
+    """What guidance is told in a simulated flight at rest."""
+    setup, log, last = after_two_scans(given, torque)
+    rng = np.random.default_rng(1)
+    target = DrawnTarget(simulating(setup, log, last), last, rng)
+    return list(islice(measured(setup, log, last, target, None, rng), count))
 
 
 def test_simulated_flights_have_the_random_torques_of_the_log():
     """The 1 sigma that guidance is told grows with them."""
-    setup, (given, _) = setup_of(np.diag([1e-8] * 6)), belief()
-    told = []
-    for torque in (0.0, 1e-3):
-        log, rng = FlightLog(), np.random.default_rng(1)
-        for k in range(2):
-            errors = ScanErrors(disturbances=(torque, 0.0))
-            log.take(replace(given, t_ns=k * 400_000_000), None, 1, True, errors)
-        known = next(measured(setup, log, given, given, rng))
-        told.append(float(known.forecast(np.array([10.0])).rot_1s_rad[-1]))
+    given, _ = belief()
+    told = [
+        float(flown_inputs(given, torque, 1)[0].forecast(np.array([10.0])).rot_1s_rad[-1])
+        for torque in (0.0, 1e-3)
+    ]
     assert told[1] > told[0] + 1e-3
+
+
+def test_a_drawn_target_moves_under_the_random_torque_as_its_forecast_says():
+    setup, log, last = after_two_scans(replace(belief()[0], P=1e-16 * np.eye(20)), 1e-3)
+    estimator, ends = simulating(setup, log, last), np.arange(1, 26) * 400_000_000
+    expected = float(estimator.forecast(last, np.array([10.0])).rot_1s_rad[-1])
+    free = estimator.attitude(last)(np.array([10.0]))[0]
+    turns = []
+    for seed in range(60):
+        target = DrawnTarget(estimator, last, np.random.default_rng(seed))
+        for end_ns in ends.tolist():
+            position, q = target.advance(last.t_ns + end_ns)
+        turns.append(angle_between(q, free))
+    assert np.sqrt(np.mean(np.square(turns))) == pytest.approx(expected, rel=0.2)
+    times = np.array([0.1, 0.3, 4.1, 4.3, 10.0])  # within two intervals, and at the end
+    assert target.scene.goal(times)[0][-1] == pytest.approx(position)
+    assert target.scene.attitude(times)[-1] == pytest.approx(q)
+    assert target.scene.attitude(times[:2]) == pytest.approx(estimator.attitude(last)(times[:2]))
+    assert target.scene.attitude(times[2:4]) != pytest.approx(estimator.attitude(last)(times[2:4]))
+
+
+def test_convergence_is_lost_in_a_simulated_flight_as_in_that_of_a_log():
+    """A torque makes the error at the planned capture larger than the tolerance."""
+    x = replace(belief()[0].x, w_b=np.array([0.05, 0.02, 0.01]), c_b=np.zeros(3))
+    given = Belief(0, replace(x, v_a=np.zeros(3)), 1e-16 * np.eye(20))
+    assert all(known.converged for known in flown_inputs(given, 1e-6, 20))
+    assert not any(known.converged for known in flown_inputs(given, 1e-2, 20)[1:])
 
 
 def test_an_assessment_reads_back_from_its_record_and_says_the_same():

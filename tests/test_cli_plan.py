@@ -122,8 +122,10 @@ def test_plan_spread_hindsight_and_flight(result):
     assert (
         max(m["distance_m"] for m in seen) < 1e-4
     )  # the estimate is the truth; the truth is a spline through poses
-    assert document["execution"]["outcome"] == "captured"
-    assert document["execution"]["miss"]["speed_mps"] < 1e-3
+    assert document["capture"]["in_fact"]["captured"]
+    assert document["capture"]["in_fact"]["errors"]["speed_mps"] < 1e-3
+    rules = [each["rule"] for each in document["actions"]]
+    assert (rules[0], rules[-2:]) == ("healthy", ["arrived_sure", "captured"])
 
 
 def test_the_assessment_is_that_of_the_run_unless_an_option_asks_for_another_flight(result):
@@ -160,7 +162,8 @@ def test_tables_name_what_they_show(result):
         "passive safety",
         "not checked: no clearance",
         "Plans against ground truth",
-        "outcome: captured",
+        "in fact captured",
+        "arrived_sure",
     ):
         assert words in text
 
@@ -242,7 +245,8 @@ def test_settings_of_supervisor_and_robot_can_be_changed(result):
     assert "100 kg, at most 0.03 m/s2" in run(*args[:1], *args[2:], *robot).stdout
     strict = json.loads(run(*args, "--set", "supervisor.capture_pos_m=0.0001").stdout)
     assert strict["tolerance"]["position_m"] == 0.0001
-    assert strict["execution"]["outcome"] != "captured"
+    assert strict["capture"]["in_fact"] is None
+    assert strict["actions"][-1]["action"] != "capture"
 
 
 def test_errors_of_the_thrust_lower_the_probability_of_the_capture(result):

@@ -236,7 +236,7 @@ def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flig
     known = [exactly(target, t) for t in np.arange(0.0, 60.0, 0.2)]
     guidance = Guidance(ROBOT, Supervisor(PARAMS), Limits(final_deg=12.0).resolved(8.0))
     grip = Contact(pin, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
-    whole = closed_loop(guidance, known, target, 0, contact=grip)
+    whole = closed_loop(guidance, (each for each in known), target, 0, contact=grip)
     assert (whole.touched, whole.miss is not None) == (False, True)
     state, path, inside = guidance.initial(0), [np.zeros((0, 3))], 0
     for last, each, rest in zip(known, known[1:], range(2, len(known)), strict=False):
@@ -249,7 +249,7 @@ def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flig
             inside += np.linalg.norm(before[-1]) < 0.075
             flown = closed_loop(
                 guidance,
-                known[rest:],
+                (each for each in known[rest:]),
                 each.scene,
                 each.t_ns,
                 contact=grip,
@@ -379,7 +379,8 @@ def test_errors_of_the_thrust_belong_to_the_generator_of_the_flight():
 
     def missed_m(seed, noise_mps2=0.01):
         rng = None if seed is None else np.random.default_rng(seed)
-        return closed_loop(guidance, known, target, 0, noise_mps2, rng).miss.distance_m
+        inputs = (each for each in known)
+        return closed_loop(guidance, inputs, target, 0, noise_mps2, rng).miss.distance_m
 
     assert missed_m(None) == missed_m(5, 0.0) < 1e-9
     assert missed_m(5) == missed_m(5) > 1e-4

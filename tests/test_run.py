@@ -429,7 +429,9 @@ def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     assert cli("run", log, "--require", "pass", *grasp).code == 0  # also after the occlusion
     done = cli("run", log, "--n-scans", 5, "--require", "pass")  # too short to converge
     assert done.code == 1
-    assert "CAPTURE no" in done.err
+    assert "CAPTURE not yet decided" in done.err
+    done = cli("run", log, "--n-scans", 5, "--require", "capture=0.0001")
+    assert (done.code, "CAPTURE not yet decided" in done.err) == (1, True)
     assert cli("run", log, "--n-scans", 5, "--require", "check").code == 0
 
 

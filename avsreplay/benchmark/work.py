@@ -246,7 +246,7 @@ def capture_of(found: Assessment | None) -> dict[str, Any]:
     fact = found.in_fact
     captured = fact is not None and fact.captured
     known = fact is not None or found.chance is Chance.NONE
-    probability = found.probability or 0.0
-    brier = (probability - captured) ** 2 if known else None
+    probability = found.probability
+    brier = (probability - captured) ** 2 if known and probability is not None else None
     touched = None if fact is None else fact.touched
     return {"captured": captured, "touched": touched, "probability": probability, "brier": brier}

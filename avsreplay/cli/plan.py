@@ -155,8 +155,8 @@ def plan_command(
     """Plan the capture from RESULT, a directory written by 'avsreplay run -o'.
 
     The saved beliefs are used and nothing is replayed. The output contains the plan, its
-    distribution over the belief and, if the log has ground truth, the errors of plans made at
-    regular intervals and a simulated approach. \f Raises:
+    distribution over the belief, the decisions of the supervisor and, if the log has ground truth,
+    the errors of plans made at regular intervals. \f Raises:
         UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput:
             RESULT cannot be read.
     """  # noqa: D301
@@ -188,17 +188,16 @@ def plan_command(
     made = _usable(lambda: planning.stated(index, planning.plan_at(index)))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    flown = None if _asked() else saved.assessment
+    flown, actions = (None, []) if _asked() else planning.recorded()
     if flown is None:
-        flown = _usable(lambda: planning.assess(index, flights, seed))
+        flown, actions = _usable(lambda: planning.assess(index, flights, seed))
     joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
-    execution = _usable(planning.execute)
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    answer = Answer(planning, at_s, made, flown, spread, joints, hindsight, execution, changes)
+    answer = Answer(planning, at_s, made, flown, spread, joints, hindsight, actions, changes)
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:

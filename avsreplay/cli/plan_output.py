@@ -9,10 +9,10 @@ from avsreplay.errors import value_class
 if TYPE_CHECKING:
     from avsreplay.assessment import Assessment
     from avsreplay.outcome import Plan
-    from avsreplay.plan.flights import Ended, Miss
+    from avsreplay.plan.flights import Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread
-    from avsreplay.replan import Replanning
+    from avsreplay.replan import Decided, Replanning
     from avsreplay.report.table import Table
 
 
@@ -50,7 +50,7 @@ class Answer:
         spread: the plan flown without replanning, over draws from the belief; None without a plan.
         joints: joints of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
-        execution: the simulated approach; None without ground truth.
+        actions: the changes of the supervisor's decision during the flight.
         changes: single changes with which a plan is found, where there is none.
     """
 
@@ -61,7 +61,7 @@ class Answer:
     spread: Spread | None
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
-    execution: Ended | None
+    actions: list[Decided]
     changes: list[PossibleChange]
 
 
@@ -71,9 +71,7 @@ def document(answer: Answer) -> str:
 
     from avsreplay import settings
 
-    planning, execution = answer.planning, answer.execution
-    spread, joints = answer.spread, answer.joints
-    outcome = None if execution is None else execution.outcome(planning.tolerance)
+    planning, spread, joints = answer.planning, answer.spread, answer.joints
     document = {
         "capture": answer.assessment.record(),
         "made_at_s": answer.at_s,
@@ -90,15 +88,7 @@ def document(answer: Answer) -> str:
             {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
             for at_s, p, m in answer.hindsight
         ],
-        "execution": (
-            None
-            if execution is None
-            else {
-                "outcome": outcome,
-                "miss": settings.dump(execution.miss) if execution.miss else None,
-                "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
-            }
-        ),
+        "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in answer.actions],
     }
     return json.dumps(_without_nan(document), indent=1, allow_nan=False) + "\n"
 
@@ -161,10 +151,7 @@ def print_answer(answer: Answer) -> None:
         facts.append(("spread over belief", "not computed, because there is no plan"))
     print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
     print_table(console, _hindsight_table(answer.hindsight))
-    if answer.execution is not None:
-        print_table(console, _execution_table(answer.execution))
-        for line in _outcome_lines(answer.execution, answer.planning):
-            print_line(console, line)
+    print_table(console, _actions_table(answer.actions))
 
 
 def prevented(changes: list[PossibleChange]) -> str:
@@ -286,29 +273,10 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     )
 
 
-def _execution_table(execution: Ended) -> Table:
+def _actions_table(actions: list[Decided]) -> Table:
     from avsreplay.report.table import Table
 
-    rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
+    rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in actions)
     return Table(
-        "Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl"
+        "The approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl"
     )
-
-
-def _outcome_lines(execution: Ended, planning: Replanning) -> list[str]:
-    outcome = execution.outcome(planning.tolerance)
-    lines = [
-        (
-            f"outcome: {outcome}"
-            if execution.miss is not None
-            else f"action at the end of the log: {outcome}"
-        )
-    ]
-    if execution.miss is not None:
-        m = execution.miss
-        error = (
-            f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s,"
-            f" {m.angle_deg:.3f} deg"
-        )
-        lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
-    return lines

@@ -12,6 +12,7 @@ gripper closes. Either must hold for the dwell time, with a consistent estimate.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -321,6 +322,19 @@ class Convergence:
     def initial(self) -> ConvergenceTrack:
         """Return the state before the first scan."""
         return ConvergenceTrack()
+
+    def at_capture(
+        self, forecast: Callable[[Array], Forecast], after_s: Callable[[], float]
+    ) -> Forecast:
+        """Return what is predicted for the planned capture, or for now where the error is already
+        above the tolerance: then no later one is below it.
+
+        Args:
+            forecast: times (n,) [s after now] -> predicted 1 sigma of the grasp point.
+            after_s: returns the time to the planned capture [s].
+        """
+        now = forecast(np.zeros(1))
+        return forecast(np.array([after_s()])) if self.ratio(now) <= 1.0 else now
 
     def judge(
         self,

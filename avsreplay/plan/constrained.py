@@ -386,9 +386,10 @@ def _unhurried(
     """Refine the rest of a path for a capture not before ``earliest_s``, then with time to spare,
     with which margins can be kept that the earliest path misses.
     """
+    reference, away = _rest(case, path, since_s)
     for spare in SPARE:
         later = replace(case, earliest_s=max(case.earliest_s, (1.0 + spare) * earliest_s))
-        yield _refined(later, path, since_s, first=True)
+        yield _converged(later, reference, away=away, first=True)
 
 
 def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
@@ -468,21 +469,18 @@ def _moved(case: Case, path: StepPath) -> StepPath:
 
 
 def _refined(
-    case: Case,
-    path: RobotPath,
-    since_s: float = 0.0,
-    latest_s: float = math.inf,
-    trust: float = TRUST,
-    first: bool = False,
+    case: Case, path: RobotPath, latest_s: float = math.inf, trust: float = TRUST
 ) -> StepPath | None:
-    """Iterate from the rest of an earlier path, whose withdrawals the first iteration
-    requires.
-    """
+    """Iterate from an earlier path, whose withdrawals the first iteration requires."""
+    reference, away = _rest(case, path, 0.0)
+    return _converged(case, reference, latest_s, trust, away)
+
+
+def _rest(case: Case, path: RobotPath, since_s: float) -> tuple[ReferencePath, Withdrawn]:
+    """The rest of an earlier path as a reference, and its withdrawals."""
     known = path.escapes if isinstance(path, StepPath) else None
     tried = Tried.near(known, since_s + case.wait_s, path.t_go_s, case.reserve_m)
-    away = withdrawn(case, path, tried, since_s)
-    reference = warm_reference(case, path, since_s)
-    return _converged(case, reference, latest_s, trust, away, first)
+    return warm_reference(case, path, since_s), withdrawn(case, path, tried, since_s)
 
 
 @dataclass

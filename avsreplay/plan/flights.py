@@ -8,7 +8,7 @@ time. Guidance has no access to it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -224,7 +224,7 @@ def with_thrust_error(
 
 def closed_loop(
     guidance: Guidance,
-    inputs: Iterable[PlannerInput],
+    inputs: Generator[PlannerInput, GuidanceState, None],
     target: Scene,
     start_ns: int,
     noise_mps2: float = 0.0,
@@ -237,14 +237,15 @@ def closed_loop(
 
     Args:
         guidance: Guidance of the robot.
-        inputs: What is known after each scan, in the order of the scans.
+        inputs: What is known after each scan, in the order of the scans; the state after each is
+            sent to it.
         target: The true target.
         start_ns: Instant from which its times count.
         noise_mps2: 1 sigma of the acceleration error of each axis, as its mean over 1 s [m/s2]; it
             is constant between two scans and independent from one interval to the next.
         rng: Random generator of these errors; needed where they are not zero.
         contact: Contact with the body; None: it is not checked.
-        state: State of the robot before the first scan; None: at its configured start.
+        state: State of the robot at ``start_ns``; None: at its configured start.
         before: Path (n, 3) that the robot has flown to that state, from the grasp point in {C} [m]:
             how it came to the grasp decides whether it touches the body there.
 
@@ -253,11 +254,9 @@ def closed_loop(
     """
     aimed: Array | None = None
     actions: list[tuple[float, str, str]] = []
-    last_ns, known = start_ns, None
+    last_ns, known, state = start_ns, next(inputs, None), state or guidance.initial(start_ns)
     flown = [np.zeros((0, 3)) if before is None else before]
-    for known in inputs:
-        if state is None:
-            state, last_ns = guidance.initial(known.t_ns), known.t_ns
+    while known is not None:
         span = (known.t_ns - last_ns) * 1e-9
         if contact is not None:
             flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
@@ -269,14 +268,14 @@ def closed_loop(
         closing, attitude = state.decision.action is Action.CAPTURE, known.scene.attitude
         if closing and aimed is None and attitude is not None:
             aimed = attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
-        if state.captured_ns is not None or state.decision.action is Action.ABORT:
-            break
-    if state is None or known is None:
+        ended = state.captured_ns is not None or state.decision.action is Action.ABORT
+        known = None if ended else _sent(inputs, state)
+    if not actions:
         raise ValueError("the log contains no scan")
     y = np.concatenate(flown)
     touched = contact is not None and bool(contact.touched(y[None])[0])
     if state.decision.action is not Action.CAPTURE:
-        return Ended(tuple(actions), (known.t_ns - start_ns) * 1e-9, None, touched)
+        return Ended(tuple(actions), (last_ns - start_ns) * 1e-9, None, touched)
 
     def truth(times: Array) -> tuple[Array, Array, Array]:
         turned = np.full((len(times), 4), np.nan)
@@ -284,6 +283,16 @@ def closed_loop(
 
     found = closed_miss(state, start_ns, truth, aimed)
     return Ended(tuple(actions), found.at_s, found, touched)
+
+
+def _sent(
+    inputs: Generator[PlannerInput, GuidanceState, None], state: GuidanceState
+) -> PlannerInput | None:
+    """The next input after a state; None at the end."""
+    try:
+        return inputs.send(state)
+    except StopIteration:
+        return None
 
 
 def flown_positions(

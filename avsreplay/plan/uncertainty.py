@@ -37,6 +37,11 @@ class Tolerance:
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} is {value}, must be a finite number above 0")
 
+    @property
+    def in_si(self) -> tuple[float, float, float]:
+        """Position [m], speed [m/s] and angle [rad]."""
+        return self.position_m, self.speed_mps, math.radians(self.angle_deg)
+
 
 @value_class(eq=True)
 class Band:

@@ -106,16 +106,13 @@ def flown(seed: int, flights: int) -> dict[str, object]:
     start = Belief(0, boxplus(x, d), np.diag(sigma**2))
     start = replace(start, x=replace(start.x, sigma=np.clip(start.x.sigma, -0.95, 0.95)))
     estimator = Estimator(params, start, extent)
-    convergence = Convergence(
-        ConvergenceParams(),
-        extent,
-        (task.tolerance.position_m, task.tolerance.speed_mps, np.radians(task.tolerance.angle_deg)),
-    )
+    convergence = Convergence(ConvergenceParams(), extent, task.tolerance.in_si)
     C = np.diag([noise_rad**2] * 3 + [noise_m**2] * 3)
     setup = Setup(
         task=task,
         estimator=Estimator(params, None, extent),
         guidance=guidance,
+        convergence=convergence,
         target=geometry_c,
         solid=True,
         extent_m=extent,
@@ -173,7 +170,7 @@ def flown(seed: int, flights: int) -> dict[str, object]:
             partial(estimator.track_forecast, track),
         )  # fmt: skip
         state = guidance.step(state, known)
-        log.take(belief, state, gamma, held.converged, ScanErrors(C))
+        log.take(belief, state, gamma, held, ScanErrors(C))
         if state.decision.action is Action.CAPTURE and aimed is None:
             aimed = known.scene.attitude(np.array([(state.segment.end_ns - t_ns) * 1e-9]))[0]
         if predicted is None and held.converged and state.plan is not None and state.plan.found:

@@ -4,10 +4,10 @@ Each scenario is one of ``capture_scenarios.py``, with other targets, faults, se
 deadline. The whole log is replayed, and the capture is assessed after its last scan and at
 instants before the end of the flight (``--before``): with the same scans a shorter log has the
 same answer. Where the answer for a part is "likely", "unlikely" or "no", the flight of the whole
-log has to end so, and "contact" or "no contact" has to be what happens. A part that ends before the
-approach says only that the estimate does not suffice. A capture that is likely at an instant of
-the log has to happen in it. The arithmetic is that of the command only where its variables are
-set (``avsreplay.arithmetic``). Finished runs are appended to a file and not made again.
+log has to end so, and "contact" or "no contact" has to be what happens. A part that ends while
+the estimate does not suffice is "not yet decided". A capture that is likely at an instant of the
+log has to happen in it. The arithmetic is that of the command only where its variables are set
+(``avsreplay.arithmetic``). Finished runs are appended to a file and not made again.
 
 python tests/benchmarks/capture_cut.py FILE.jsonl [--count 4] [--seed 1] [--seconds S]
     [--bodies satellite,stage,truss:3] [--kinds ,occlusion,outliers] [--before 0.3,1.5,6]
@@ -97,8 +97,6 @@ def contradicted(row: dict[str, object], fact: dict[str, object]) -> str:
         late = row["chance"] == "likely" and row["at_s"] < fact["last_s"] - LATE_S
         return "likely, but not captured until the end of the log" if late else ""
     said = {"likely": True, "unlikely": False, "none": False}.get(row["chance"])
-    if "the estimate does not suffice:" in row["sentence"]:  # the approach has not begun
-        said = None
     if said is not None and said != fact["captured"]:
         return f"{row['chance']}, but {'' if fact['captured'] else 'not '}captured"
     if None not in (row["contact"], fact["touched"]):
