@@ -211,8 +211,6 @@ class Setup:
         since_ns: instant of the first scan [ns].
         thrust_noise_mps2: standard deviation of the thrust error of each axis, as its mean over 1 s
             [m/s2].
-        noise: (6, 6) covariance of d = [theta; v], the error of a measured pose in {C} [rad, m];
-            None takes R0 of the settings.
         flights: number of simulated flights where the log ends before the capture.
         seed: seed of all random draws.
         advice: grasp points that could be used instead, in words.
@@ -227,7 +225,6 @@ class Setup:
     extent_m: float
     since_ns: int
     thrust_noise_mps2: float = 0.0
-    noise: Array | None = None
     flights: int = SIMULATED_FLIGHTS
     seed: int = 0
     advice: str = ""
@@ -653,8 +650,8 @@ def measured(
         rng: random generator.
     """
     estimator, held = target.estimator, log.convergence
-    track, C = estimator.resumed(belief), setup.noise
-    if C is None:
+    track, C = estimator.resumed(belief), log.noise
+    if C is None:  # no pose was measured
         position, half = np.split(np.diag(estimator.params.R0), 2)
         C = np.diag(np.concatenate([4.0 * half, position]))
     C = geometry.covariance_about(C, setup.task.grasp_c)

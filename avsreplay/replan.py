@@ -372,9 +372,8 @@ class Replanning:
         converged = bool(row.converged)
         held = ConvergenceTrack(converged, since_ns=self.saved.since_ns if converged else None)
         torque, force = row.torque_noise_radps15, row.force_noise_mps15
-        if torque is None or force is None:
-            return held, ScanErrors()
-        return held, ScanErrors(disturbances=(torque, force))
+        known = None if torque is None or force is None else (torque, force)
+        return held, ScanErrors(self.saved.noise, known)
 
     def _setup(self, flights: int, seed: int) -> Setup:
         surface = self.saved.surface
@@ -393,7 +392,6 @@ class Replanning:
             extent_m=self.saved.extent_m,
             since_ns=self.saved.since_ns,
             thrust_noise_mps2=self.robot.thrust_noise * self.params.a_max_mps2,
-            noise=self.saved.noise,
             flights=flights,
             seed=seed,
         )

@@ -418,7 +418,6 @@ class Run:
             extent_m=surface.extent,
             since_ns=first_ns,
             thrust_noise_mps2=robot.thrust_noise * self.stages.guidance.params.a_max_mps2,
-            noise=self.flight.noise,
             advice=grasp_advice(self.task, surface),
         )
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)

@@ -210,7 +210,7 @@ def test_a_belief_about_another_point_has_its_position_and_covariance():
     assert at_grasp(given, np.zeros(3)) is given
 
 
-def setup_of(noise=None, flights=1):
+def setup_of():
     """An assessment of flights to a cube of 1 m without limits."""
     surface = builtin_surface(Shape.CUBE)
     target, robot, limits = target_geometry(surface, (1.0, 0.0, 0.0)), RobotParams(), Limits()
@@ -226,8 +226,7 @@ def setup_of(noise=None, flights=1):
         solid=True,
         extent_m=surface.extent,
         since_ns=0,
-        noise=noise,
-        flights=flights,
+        flights=1,
     )
 
 
@@ -246,9 +245,10 @@ def test_simulated_flights_keep_what_is_known_of_a_body_whose_principal_axes_are
     T = to_errors(to_chart(x))
     given = Belief(0, x, T @ np.diag(sizes**2) @ T.T)
     assert 2.0 * np.sqrt(np.trace(given.P[:3, :3])) > 1.0  # the attitude of the axes
-    setup, log = setup_of(np.diag([0.01**2] * 6)), FlightLog()
+    setup, log = setup_of(), FlightLog()
     for k in range(5):
-        log.take(Belief(k * 400_000_000, x, given.P), None, 1, HELD)
+        errors = ScanErrors(np.diag([0.01**2] * 6))
+        log.take(Belief(k * 400_000_000, x, given.P), None, 1, HELD, errors)
     ended = simulated(setup, log, None, given)
     assert len(ended) == 1
     assert all(flight.miss.inside(setup.task.tolerance) for flight in ended)
@@ -320,9 +320,9 @@ def test_a_robot_that_waits_says_which_condition_its_estimate_misses(lasting, ch
 
 def after_two_scans(given, torque):
     """The begin of simulated flights from a belief, with a random torque [rad/s^1.5]."""
-    setup, log = setup_of(np.diag([1e-8] * 6)), FlightLog()
+    setup, log = setup_of(), FlightLog()
     for k in range(2):
-        errors = ScanErrors(disturbances=(torque, 0.0))
+        errors = ScanErrors(np.diag([1e-8] * 6), (torque, 0.0))
         log.take(replace(given, t_ns=k * 400_000_000), None, 1, HELD, errors)
     log.convergence = HELD
     return setup, log, replace(given, t_ns=400_000_000)

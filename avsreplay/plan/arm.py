@@ -33,7 +33,7 @@ from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
 from avsreplay.plan.robot import Limits, RobotParams
 
-PATH_INSTANTS = 81  # instants of the last metres
+JOINT_INSTANTS = 81  # instants of the last metres
 STARTS = 32  # joint configurations from which the inverse kinematics of the capture begins
 JOINT_ITERATIONS = 200
 STALLED = 10  # iterations without a smaller error that end the inverse kinematics
@@ -188,7 +188,7 @@ class Arm:
         Raises:
             ValueError: The scene has no attitude.
         """
-        times = np.linspace(last_metres_s(path, scene, limits), path.t_go_s, PATH_INSTANTS)
+        times = np.linspace(last_metres_s(path, scene, limits), path.t_go_s, JOINT_INSTANTS)
         r = path.at(times)[0]
         poses = self._poses(scene, limits, times, r)
         best = self._farthest(poses, self._starts() if starts is None else starts)

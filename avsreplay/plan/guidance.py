@@ -25,7 +25,14 @@ from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import BurnPath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, finer
 from avsreplay.plan.robot import Limits, slowed
-from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
+from avsreplay.plan.supervisor import (
+    CLOSING,
+    Action,
+    Decision,
+    Facts,
+    Supervisor,
+    SupervisorMemory,
+)
 from avsreplay.plan.withdrawal import COAST_S, Space, Withdrawal, escapes_at, withdrawal
 from avsreplay.records import Forecast
 
@@ -34,8 +41,6 @@ SEARCH_AGAIN = 1.1
 # share of the capture tolerance: without a measurement, a plan whose end moved by less is not
 # renewed
 UNCHANGED_OF_TOLERANCE = 0.01
-
-_CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
 
 @value_class
@@ -212,7 +217,7 @@ class Guidance:
         supervisor, decision = self.supervisor.decide(state.supervisor, facts)
         draft = segment if segment is not None and segment is not state.segment else state.draft
         state = replace(state, supervisor=supervisor, decision=decision, plan=plan, draft=draft)
-        if decision.action not in _CLOSING:
+        if decision.action not in CLOSING:
             return self._withdraw(state, known)
         if segment is None:  # the approach resumes between two replanning instants
             plan, segment = self._capture_plan(state, known)
@@ -246,7 +251,7 @@ class Guidance:
         """Return the capture plan in force, renewed where it is due, and the segment that flies it,
         if any.
         """
-        closing = state.decision.action in _CLOSING
+        closing = state.decision.action in CLOSING
         flown = state.segment if closing else None
         if not known.converged or state.decision.action in (Action.CAPTURE, Action.ABORT):
             return state.plan, flown
@@ -397,7 +402,7 @@ class Guidance:
 
     def _withdrawal_margin(self, state: GuidanceState, known: PlannerInput) -> float:
         """Return the margin of a withdrawal from now, which matters while no scan is healthy."""
-        if known.gamma or state.decision.action not in _CLOSING:
+        if known.gamma or state.decision.action not in CLOSING:
             return math.inf
         p = self.supervisor.params
         return self._withdrawal(state, known, p.standoff_m or 0.0)[0].margin_m

@@ -183,7 +183,7 @@ _COMPARE: Mapping[str, Callable[[float, float], bool]] = MappingProxyType(
     {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq}
 )
 
-_CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
+CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)  # the robot comes nearer
 _MOVING = Condition("moving", "==", 1)
 _AT_REST = Condition("moving", "==", 0)
 _HEALTHY = Condition("gamma", "==", 1)
@@ -336,7 +336,7 @@ class Supervisor:
             else None
         )
         moving = memory.moving or rule.action is not Action.STAND_STILL
-        begins = rule.action in _CLOSING and memory.action not in _CLOSING
+        begins = rule.action in CLOSING and memory.action not in CLOSING
         since_s = memory.held_since_s  # a hold as short as a gap that is bridged ends no attempt
         if since_s is not None and facts.t_s - since_s <= self.params.patience_s:
             begins = False

@@ -118,7 +118,6 @@ def flown(seed: int, flights: int) -> dict[str, object]:
         extent_m=extent,
         since_ns=0,
         thrust_noise_mps2=thrust * a_max,
-        noise=C,
         flights=flights,
         seed=seed,
     )
