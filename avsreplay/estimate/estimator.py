@@ -228,7 +228,7 @@ class Estimator:
             track,
             epoch,
             admission,
-            lambda t: self.update(t, prediction, innovation, admitted, converged, True),
+            lambda t: self.update(t, prediction, innovation, admitted, converged),
         )
         after = after.changed(
             undetermined=undetermined(track, innovation, finding.used, self._length_m)
@@ -236,8 +236,8 @@ class Estimator:
         if not finding.used:
             return after, finding
         after = self.anomalies.with_possible_change(after)
-        due = after.mode in ("fit", "filter")
-        after = self.disturbances.advanced(after, self._robust) if due else after
+        if self._robust and after.mode in ("fit", "filter"):
+            after = self.disturbances.tested(after)
         return self.batch.resolved(after), finding
 
     def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
@@ -402,7 +402,6 @@ class Estimator:
         innovation: Innovation | None,
         gamma: int,
         converged: bool = True,
-        spread: bool = False,
     ) -> Track:
         """The posterior. With gamma 0 or no innovation it equals the prior exactly.
 
@@ -412,7 +411,6 @@ class Estimator:
             innovation: None where the scan gave no pose.
             gamma: 1 for a healthy scan, 0 for a faulty one.
             converged: t_1 was reached at the last scan. A fit hands over to the filter only then.
-            spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
             return track.changed(
@@ -420,10 +418,9 @@ class Estimator:
                 change_P=prediction.Phi @ track.change_P @ prediction.Phi.T,
             )
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
-            after = self.batch.initialised(track, prediction, innovation, converged, spread)
+            after = self.batch.initialised(track, prediction, innovation, converged)
         else:
-            after = self.batch.filtered(track, prediction, innovation)
-            after = self.batch.check_against_batch(after, spread)
+            after = self.batch.checked(self.batch.filtered(track, prediction, innovation))
         return self.batch.resolved(after)
 
     def disturbances_of(self, track: Track) -> tuple[float, float] | None:

@@ -16,7 +16,6 @@ from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Track
-from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 
@@ -143,10 +142,8 @@ def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> BatchFit:
     prior, rules = weak_prior(poses, params), FitParams(max_steps=60)
     chart = start
     for count in _windows(poses, start):
-        chart = whole(
-            fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False))
-        ).chart
-    return whole(fit(poses, chart, prior, rules))
+        chart = fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False)).chart
+    return fit(poses, chart, prior, rules)
 
 
 def _windows(poses: Poses, start: Chart) -> list[int]:
