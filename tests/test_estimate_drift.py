@@ -232,10 +232,12 @@ def test_a_random_torque_and_force_are_no_drift(density: float, seed: int) -> No
 
 
 @pytest.mark.slow
-def test_at_most_one_of_twenty_bodies_under_a_random_torque_has_a_drift() -> None:
+def test_few_bodies_under_a_random_torque_have_a_drift() -> None:
+    """1e-4 rad/s^1.5 and m/s^1.5 for 60 s: at most two of 40 bodies."""
     case = surprises.Case("random", random=(1e-4, 1e-4), seconds=60.0)
-    tracks = [surprises.run(case, seed).track for seed in range(63001, 63021)]
-    assert sum(track is not None and track.drift is not None for track in tracks) <= 1
+    tracks = [surprises.run(case, seed).track for seed in range(63001, 63041)]
+    assert all(track is not None for track in tracks)
+    assert sum(track.drift is not None for track in tracks if track) <= 2
 
 
 def test_an_acceleration_is_reported_only_where_it_is_none_by_chance() -> None:

@@ -98,6 +98,26 @@ class FittedMotion:
         return replace(self, t_ns=t_ns, x=x), Phi
 
 
+@value_class
+class GramianRows:
+    """What a scan gives to the observability Gramian.
+
+    Attributes:
+        motion: of the fit that the Gramian follows, at the scan; None before a fit.
+        anew: the Gramian begins anew along this motion.
+        Phi: (20, 20) transition from the last scan; ``anew``: from the epoch of the motion.
+        H: (6, 20) of the scan; ``anew``: H Phi (n, 6, 20) of all poses of the fit.
+        R: (6, 6) their noise, as the registration claims it, None where the pose was not used;
+            ``anew``: (n, 6, 6).
+    """
+
+    motion: FittedMotion | None
+    anew: bool
+    Phi: Array
+    H: Array
+    R: Array | None
+
+
 def rows_along(motion: FittedMotion, fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
     """H Phi of poses along one motion, for the observability Gramian.
 
