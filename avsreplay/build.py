@@ -38,6 +38,7 @@ def stages(
     surface: Surface,
     registrar: Registrar,
     truth_of: Callable[[Scan], Truth],
+    goal: tuple[Task, TargetGeometry],
     clock: tuple[int, float] = (0, 0.0),
 ) -> Stages:
     """Create the chain for one log.
@@ -49,6 +50,7 @@ def stages(
         registrar: of that model; one may serve several chains.
         truth_of: truth at a scan; used for the first pose alone, where the configuration starts
             from the truth.
+        goal: the task and the geometry of the target about its grasp point.
         clock: instant of the first scan [ns], where a known acceleration begins, and interval of
             the scans [s].
 
@@ -60,7 +62,7 @@ def stages(
     estimator = config.estimator
     if config.register.backend == POSES:
         estimator = estimator.at_interval(clock[1], surface.extent)
-    task, target = task_and_target(config, surface)
+    task, target = goal
     robot, arm = with_arm(config.task.with_gripper(config.robot))
     limits = robot.limited(task.corridor(config.limits))
     supervision = config.task.with_tolerance(config.supervisor).resolved(surface.extent)
@@ -99,18 +101,20 @@ def _tracker(config: RunConfig, middle: Array, extent_m: float) -> Tracker | Non
     return Tracker(middle, extent_m) if own and config.estimator.robust else None
 
 
-def task_and_target(config: RunConfig, surface: Surface) -> tuple[Task, TargetGeometry]:
+def task_and_target(
+    config: RunConfig, surface: Surface, geometry_c: TargetGeometry
+) -> tuple[Task, TargetGeometry]:
     """Return the task, compared with the model, and the geometry of the target about its grasp
     point.
 
     Args:
         config: effective configuration.
         surface: model of the target.
+        geometry_c: that of the model about the origin of {C}.
 
     Raises:
         UsageError: the task names a patch that the model does not have.
     """
-    geometry_c = target_geometry(surface, config.fixture_axis_c)
     assert geometry_c.surface is not None
     settings = config.supervisor, config.robot, config.fixture_axis_c
     try:
@@ -133,36 +137,35 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
     return TargetGeometry(
         np.array(axis_c),
         hull_vertices(surface.vertices),
-        _body(surface),
+        Body(
+            np.ascontiguousarray(surface.vertices, float),
+            np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
+        ),
     )
 
 
-def _body(surface: Surface) -> Body:
-    return Body(
-        np.ascontiguousarray(surface.vertices, float),
-        np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),
-    )
-
-
-def grasp_patches(surface: Surface) -> tuple[Patch, ...]:
+def grasp_patches(surface: Surface, geometry_c: TargetGeometry) -> tuple[Patch, ...]:
     """Return flat patches of a model that a straight approach reaches, the largest first.
 
     Args:
         surface: model of the target in {C}.
+        geometry_c: that of the model about the origin of {C}.
     """
-    return patches(surface, _body(surface))
+    assert geometry_c.surface is not None
+    return patches(surface, geometry_c.surface)
 
 
-def grasp_advice(task: Task, surface: Surface) -> str:
+def grasp_advice(task: Task, surface: Surface, geometry_c: TargetGeometry) -> str:
     """Return in words which grasp points could be used in place of one that cannot.
 
     Args:
         task: compared with the model.
         surface: model of the target.
+        geometry_c: that of the model about the origin of {C}.
     """
     if not task.problem:
         return ""
-    found = grasp_patches(surface)
+    found = grasp_patches(surface, geometry_c)
     if not found:
         return "name one with task.grasp_m and task.axis"
     return f"patches that can be reached: {', '.join(patch.option for patch in found)}"

@@ -36,8 +36,6 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.read_budget import BadFile, ReadBudget
 
 CHECKPOINT_VERSION = 2  # of the format of the document; a file of another version is not read
-TRANSIENT = {"transient": True}
-"""Metadata of a field that is not stored: the continued run begins with its default."""
 
 _PACKAGE = __name__.partition(".")[0]
 _HINT = "start the run anew with --overwrite"
@@ -195,11 +193,7 @@ def _fields(cls: type[Any]) -> dict[str, Any]:
         hints = typing.get_type_hints(cls)
     except NameError:  # a name that is imported for the type checker only
         hints = {}
-    return {
-        field.name: hints.get(field.name, Any)
-        for field in dataclasses.fields(cls)
-        if not field.metadata.get("transient")
-    }
+    return {field.name: hints.get(field.name, Any) for field in dataclasses.fields(cls)}
 
 
 class _Reader:

@@ -323,7 +323,9 @@ def _parts(edges: _Edges) -> _Parts:
         most = np.bincount(of, turned) > 0.5 * np.bincount(of)
         reversed_ = (turned ^ most[of]) & (nodes[0] != nodes[1])
     sign = np.where(np.repeat(reversed_, 3), -edges.sign, edges.sign)
-    _, group = np.unique(edges.number * (of.max() + 1) + np.repeat(of, 3), return_inverse=True)
+    group = edges.number
+    if np.bincount(group).max() > 2:  # several parts can meet at such an edge
+        _, group = np.unique(group * (of.max() + 1) + np.repeat(of, 3), return_inverse=True)
     paired = np.bincount(group, sign)[group] == 0.0
     return _Parts(of, reversed_, _share(paired, of) >= PAIRED_EDGE_SHARE)
 

@@ -90,7 +90,7 @@ class Measurement:
 
 @value_class
 class MonitorState:
-    """What the monitors carry from scan to scan; ``motion``: trajectory of the last fit,
+    """What the monitors carry from scan to scan; ``motion``: motion of the last fit,
     which the Gramian follows.
     """
 
@@ -170,7 +170,11 @@ class Monitors:
         track, belief = seen.track, seen.belief
         healthy = seen.innovation if seen.gamma else None
         tested = self.consistency.observe(state.consistency, seen.innovation, seen.gamma)
-        motion, gramian = self._gramian(state, estimator, seen.prior, healthy, track)
+        rows = estimator.gramian_rows(track, seen.prior, healthy, state.motion)
+        if rows.anew and rows.R is not None:
+            gramian = from_trajectory(state.gramian.scale, rows.H, rows.R, rows.Phi)
+        else:
+            gramian = observe(state.gramian, rows.Phi, rows.H, rows.R)
         rank, window = measure(gramian), self.consistency.judge(tested, max(track.levels.common))
         found = estimator.residual_after(track, seen.prior, healthy) if healthy else None
         failed = violations(track.belief, *found) if found else ()
@@ -208,23 +212,7 @@ class Monitors:
             forecast=forecast,
         )
         violated = state.violations + len(failed)
-        return MonitorState(gramian, tested, judged, violated, motion, turns), report
-
-    def _gramian(
-        self,
-        state: MonitorState,
-        estimator: AnyEstimator,
-        prior: Prediction,
-        healthy: Innovation | None,
-        track: Track,
-    ) -> tuple[FittedMotion | None, Gramian]:
-        """The Gramian with one more scan, along the trajectory of the new fit where there is
-        one.
-        """
-        if (seen := estimator.refitted_rows(track)) is not None:
-            return seen[0], from_trajectory(state.gramian.scale, *seen[1])
-        motion, row = estimator.gramian_row(track, prior, healthy, state.motion)
-        return motion, observe(state.gramian, *row)
+        return MonitorState(gramian, tested, judged, violated, rows.motion, turns), report
 
 
 @value_class

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avsreplay.build import grasp_patches, task_and_target
+from avsreplay.build import grasp_patches, target_geometry, task_and_target
 from avsreplay.config import RunConfig
 from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
@@ -112,8 +112,10 @@ def _grasp_patches(surface: Surface | None) -> list[Advice]:
     """
     if surface is None or not surface.sha256:
         return []
-    patches = grasp_patches(surface)
-    task, _ = task_and_target(RunConfig(), surface)
+    config = RunConfig()
+    geometry_c = target_geometry(surface, config.fixture_axis_c)
+    task, _ = task_and_target(config, surface, geometry_c)
+    patches = grasp_patches(surface, geometry_c)
     found = []
     if task.problem:
         option = patches[0].option if patches else "--grasp X,Y,Z"

@@ -15,7 +15,13 @@ import numpy as np
 from avsreplay import arithmetic, geometry, pipeline, settings
 from avsreplay.assess import FlightLog, ScanErrors, Setup, assess
 from avsreplay.assessment import Assessment
-from avsreplay.build import first_state, grasp_advice, stages, task_and_target
+from avsreplay.build import (
+    first_state,
+    grasp_advice,
+    stages,
+    target_geometry,
+    task_and_target,
+)
 from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError, value_class
@@ -146,7 +152,8 @@ class Run:
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
             self.model_check = ModelCheck(self.registrar, self.surface)
-            self.task, self._target = task_and_target(self.config, self.surface)
+            self._shape = target_geometry(self.surface, self.config.fixture_axis_c)
+            self.task, self._target = task_and_target(self.config, self.surface, self._shape)
             self.acceleration = self._fitted_acceleration()
             self.stages = self._new_stages()
             self.estimator = self.stages.estimator
@@ -418,7 +425,7 @@ class Run:
             extent_m=surface.extent,
             since_ns=first_ns,
             thrust_noise_mps2=robot.thrust_noise * self.stages.guidance.params.a_max_mps2,
-            advice=grasp_advice(self.task, surface),
+            advice=grasp_advice(self.task, surface, self._shape),
         )
         since_s = 0.0 if self._scored is None else self._scored.since_s(first_ns)
         given = None if motion is None else (lambda times: motion(times + since_s))
@@ -478,7 +485,8 @@ class Run:
         clock = self.source.first_ns, self.source.clock.period_s * self.source.options.every
         plan = replace(self.config.plan, enabled=plans and self.config.plan.enabled)
         config = replace(self.config, plan=plan)
-        return stages(config, self.header, self.surface, self.registrar, self._true, clock)
+        goal = self.task, self._target
+        return stages(config, self.header, self.surface, self.registrar, self._true, goal, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
         """Fit the acceleration to the measured poses of a first pass if this is set, and use it."""

@@ -56,7 +56,16 @@ def test_a_log_without_a_start_is_searched_and_the_rows_say_so():
         ) as run:
             header = replace(run.source.header, start=None)
             run.stages = build.stages(
-                run.config, header, run.surface, run.registrar, run.source.truth_of
+                run.config,
+                header,
+                run.surface,
+                run.registrar,
+                run.source.truth_of,
+                build.task_and_target(
+                    run.config,
+                    run.surface,
+                    build.target_geometry(run.surface, run.config.fixture_axis_c),
+                ),
             )
             (rows[init],) = run.rows()
     assert rows["log"] == rows["auto"]

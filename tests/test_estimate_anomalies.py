@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import estimate_surprises as surprises
 import numpy as np
@@ -32,7 +33,7 @@ from avsreplay.estimate.measurement import innovation_vector, measurement_jacobi
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
 from avsreplay.geometry import Pose
 from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
-from avsreplay.records import Belief, Innovation, MeasuredPose, ScanStatus
+from avsreplay.records import Alignment, Belief, Innovation, MeasuredPose, ScanStatus
 from avsreplay.register.backend import measured_alignment
 
 CLEAN = surprises.Case("clean", seconds=60.0)
@@ -189,13 +190,25 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
         off @ np.linalg.solve(found.P, off) < 22.5
     )  # 99.9 % of chi-square with 6 degrees of freedom
     at = result.t.index(45.5)
-    assert found.detected_ns * 1e-9 <= 47.0  # the fourth scan after it
     assert np.max(result.pose[at + 10 :]) < surprises.LIMIT
     unused = [k for k, gamma in enumerate(result.gamma) if not gamma]
     assert not any(result.converged[k] for k in unused)
     wrong = np.array(result.converged) & (np.max(result.apart, axis=1) > surprises.LIMIT)
     late = np.array(result.t)[wrong]  # two scans, of 3 and 8 mm at most, do not show the step yet
     assert ((late > 45.2) & (late <= 46.0)).all()
+
+
+@pytest.mark.slow
+def test_a_push_is_reported_within_four_scans_in_the_median() -> None:
+    """A velocity step of 1 cm/s at 45.2 s, of 12 bodies; of none later than at the fifth scan."""
+    case, reported = surprises.Case("push", velocity=0.01, seconds=49.0), []
+    for seed in range(12):
+        result = surprises.run(case, seed)
+        assert result.track is not None
+        (found,) = result.track.manoeuvres
+        reported.append(found.detected_ns * 1e-9)
+    assert np.median(reported) <= 47.0
+    assert max(reported) <= 47.5
 
 
 @pytest.mark.parametrize("seed", [719, pytest.param(2, marks=pytest.mark.slow)])
@@ -460,13 +473,28 @@ def test_the_residuals_of_the_registration_tell_which_poses_are_biased(
 
 
 @pytest.mark.slow
-def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoeuvre() -> None:
-    """The first three scans after the step resemble an offset of 13 mm.
+@pytest.mark.parametrize("seed", [64004, 64006])
+def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoeuvre(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """The errors of the first three poses after the step make them those of an offset of 1 cm.
 
     An offset that grows is a manoeuvre.
     """
+    drawn = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], *rest: Any) -> list[Alignment]:
+        poses = drawn(case, times, *rest)
+        step = surprises.world_of(case, seed)[2]
+        way = step / np.linalg.norm(step)
+        for k in range(times.index(45.5), times.index(46.5) + 1):
+            T, moved = poses[k].T_ac, case.velocity * (times[k] - 45.2)
+            poses[k] = replace(poses[k], T_ac=Pose(T.q, T.t + (0.01 - moved) * way))
+        return poses
+
+    monkeypatch.setattr(surprises, "measured", measured)
     case = surprises.Case("step", at_s=45.0, velocity=0.01, seconds=54.0)
-    result = surprises.run(case, 5016)
+    result = surprises.run(case, seed)
     first = result.t.index(45.5)
     assert "sensor_bias" in result.reason[first : first + 4]
     assert set(result.reason[first + 4 :]) == {"ok"}
@@ -477,7 +505,7 @@ def test_a_step_of_the_velocity_that_was_taken_for_a_bias_is_reported_as_a_manoe
         result.true_velocity, abs=4.0 * float(np.sqrt(found.P[3:, 3:].max()))
     )
     wrong = np.array(result.converged) & (np.max(result.apart, axis=1) > surprises.LIMIT)
-    assert set(np.array(result.t)[wrong]) <= {45.5}  # 3 mm of the first scan do not show the step
+    assert not wrong.any()
 
 
 @pytest.mark.slow

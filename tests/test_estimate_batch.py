@@ -39,7 +39,6 @@ from avsreplay.estimate.noise_levels import NoiseLevels, pose_error_covariance
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import free_fit
-from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 from avsreplay.records import Belief, State
@@ -65,7 +64,7 @@ def grown(fixes: tuple[PoseFix, ...], *counts: int):
     for count in counts:
         poses = poses_of(fixes[:count])
         prior = weak_prior(poses, WHITE)
-        fitted = whole(fit(poses, chart, prior, FitParams()))
+        fitted = fit(poses, chart, prior, FitParams())
         chart = fitted.chart
     return poses, fitted, prior
 
@@ -256,14 +255,14 @@ def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
     )
     poses = poses_of(tuple(fixes))
     prior = weak_prior(poses, WHITE)
-    full = whole(fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False)))
+    full = fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False))
     root = np.linalg.cholesky(full.P_chart)
     reference = full.chart.moved(root @ np.random.default_rng(seed).normal(size=20))
     points = normal_points(poses, reference, np.ones(2))
     assert len(points) < 200
     assert points.counts is not None
     assert points.counts.sum() == len(poses)
-    few = whole(fit(points, reference, prior, FitParams(rescale=False)))
+    few = fit(points, reference, prior, FitParams(rescale=False))
     off = np.linalg.solve(root, few.chart.minus(full.chart))
     assert np.abs(off).max() < 0.2
     there = [Problem(some, prior, np.ones(2), full.chart).covariance for some in (poses, points)]
@@ -319,7 +318,7 @@ def test_exact_poses_give_the_exact_motion() -> None:
     poses = poses_of(fixes)
     flat = Prior(to_chart(rough_state(fixes)), np.diag(np.full(20, 1e8)))
     start = to_chart(world.states[0]).moved(np.full(20, 2e-3))
-    fitted = whole(fit(poses, start, flat, FitParams(rescale=False, gain_tol=1e-9)))
+    fitted = fit(poses, start, flat, FitParams(rescale=False, gain_tol=1e-9))
     assert np.abs(to_chart(world.states[0]).minus(fitted.chart)).max() < 1e-6
     assert fitted.converged
 
@@ -336,9 +335,7 @@ def test_fit_from_nothing_finds_the_truth_within_its_covariance(seed: int) -> No
 def test_fit_is_the_optimum_from_any_side() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    again = whole(
-        fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective)
-    )
+    again = fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective)
     assert again.half_chi2 == pytest.approx(fitted.half_chi2, abs=0.02)
     assert (
         Problem(poses, prior, fitted.effective).cost(to_chart(world.states[0])) > fitted.half_chi2
@@ -355,33 +352,11 @@ def test_a_bent_valley_of_the_cost_is_followed_to_its_minimum_in_few_steps(seed:
     for count in (5, 9, 15, 25, 40, 60):
         poses = poses_of(fixes[:count])
         prior = weak_prior(poses, WHITE)
-        fitted = whole(fit(poses, chart, prior, FitParams(rescale=False)))
+        fitted = fit(poses, chart, prior, FitParams(rescale=False))
         chart, work = fitted.chart, max(work, fitted.steps)
         A, b = Problem(poses, prior, fitted.effective, chart).core.normal()
         assert b @ np.linalg.solve(A, b) < 0.01
     assert work <= 20
-
-
-def test_a_descent_over_many_turns_is_done_in_parts_and_takes_the_same_steps() -> None:
-    """Each step passes the rotation between the poses in pieces; a log of many turns has few
-    normal points.
-    """
-    fixes = seen(tumbling.draw(3, seconds=240.0, hz=0.25, rate=1.0), 3)
-    poses, start = poses_of(fixes), to_chart(tumbling.draw(3, seconds=1.0, rate=1.0).states[0])
-    prior = weak_prior(poses, WHITE)
-    begin = start.moved(np.repeat([2e-3, 1e-7, 2e-3, 1e-5, 1e-7, 0.02], [3, 3, 3, 3, 5, 3]))
-    at_once, spread = (Problem(poses, prior, np.ones(2), begin) for _ in range(2))
-    want, parts, found = at_once.core.descend(40, 1e-9), spread.descended(40, 1e-9), None
-    count = 0
-    while found is None:
-        try:
-            next(parts)
-            count += 1
-        except StopIteration as end:
-            found = end.value
-    assert count >= 2, (count, want)
-    assert found == want
-    assert np.array_equal(spread.chart.flat, at_once.chart.flat)
 
 
 def test_false_poses_are_weighted_down() -> None:
@@ -423,9 +398,7 @@ def test_residuals_that_stay_widen_the_covariance() -> None:
 def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: float) -> Belief:
     """The belief at the last pose, without process noise."""
     problem = Problem(poses, prior, found.fitted.effective)
-    return moments(
-        whole(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds))
-    )
+    return moments(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds))
 
 
 def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
@@ -436,7 +409,7 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     for seed in (3, 6, 9, 15, 2):
         world = tumbling.draw(seed, seconds=40.0)
         poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
-        found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
+        found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
         assert not found.gaussian
         plain.append(
             nees(at_the_end(replace(found, directions=()), poses, prior, 40.0), world.states[-1])
@@ -453,9 +426,9 @@ def test_the_variance_along_a_non_gaussian_direction_is_that_between_the_fits() 
     world = tumbling.draw(3, seconds=20.0)
     poses, fitted, prior = grown(seen(world, 3), 21, 41)
     problem = Problem(poses, prior, fitted.effective)
-    found = whole(covariance_of(problem, fitted, FitParams()))
+    found = covariance_of(problem, fitted, FitParams())
     assert len(found.directions) > 1
-    mixture = whole(final_mixture(found, problem, poses.latest(12, 20.0), (0.0, 0.0), 0, 0.0))
+    mixture = final_mixture(found, problem, poses.latest(12, 20.0), (0.0, 0.0), 0, 0.0)
     for direction in found.directions:
         gaussian = float(direction.row @ fitted.P_chart @ direction.row)
         assert all(float(direction.row @ c.P @ direction.row) < 0.01 * gaussian for c in mixture)
@@ -467,7 +440,7 @@ def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_varia
     """The variance along it is that of the Gaussian; without its components it was 0."""
     world = tumbling.draw(3, seconds=20.0)
     poses, fitted, prior = grown(seen(world, 3), 21, 41)
-    found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
+    found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
     others = at_the_end(replace(found, directions=found.directions[1:]), poses, prior, 20.0)
     lost = found.directions[0].points[1].pin
 
@@ -552,7 +525,7 @@ def _inverse(A: Array) -> Array:
 def test_a_long_arc_settles() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
+    found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
     assert found.gaussian
     here = at_the_end(found, poses, prior, 100.0)
     assert nees(here, world.states[-1]) == pytest.approx(
@@ -567,8 +540,8 @@ def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others()
     row[12] = 1.0
     shift = 2.0 * np.sqrt(fitted.P_chart[12, 12])
     problem = Problem(poses, prior, fitted.effective)
-    held, _, _ = whole(
-        problem.pinned(fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift), 40)
+    held, _, _ = problem.pinned(
+        fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift), 40
     )
     assert held.minus(fitted.chart)[12] == pytest.approx(shift, rel=0.02)
     rise = problem.cost(held) - fitted.half_chi2
@@ -624,7 +597,7 @@ def test_too_few_poses() -> None:
     fixes = seen(tumbling.draw(0, seconds=1.0), 0)[:2]
     poses = poses_of(fixes)
     with pytest.raises(ValueError, match="2 poses"):
-        whole(fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, WHITE), FitParams()))
+        fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, WHITE), FitParams())
 
 
 def test_poses_can_be_cut() -> None:
@@ -716,8 +689,6 @@ def test_a_fit_without_any_prior_knowledge_ends_although_first_trials_are_absurd
     fixes = seen(tumbling.draw(0, mu_deg=80.0, seconds=4.0), 0, pos_m=0.05)[:count]
     poses = poses_of(fixes)
     prior = weak_prior(poses, WHITE)
-    fitted = whole(
-        fit(poses, to_chart(rough_state(fixes)), Prior(prior.mean, 1e6 * prior.P), FitParams())
-    )
+    fitted = fit(poses, to_chart(rough_state(fixes)), Prior(prior.mean, 1e6 * prior.P), FitParams())
     assert np.isfinite(fitted.half_chi2)
     assert fitted.half_chi2 < 10.0 * len(fixes)

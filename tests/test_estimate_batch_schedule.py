@@ -32,7 +32,6 @@ from avsreplay.estimate.measurement import innovation_of
 from avsreplay.estimate.mixture import contradicted
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.estimate.work import whole
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
 
@@ -168,7 +167,7 @@ def test_process_noise_increases_the_covariance_and_zero_noise_gives_the_fit() -
     found = fixes(4, 100.0)
     poses, params = poses_of(found), WHITE.resolved(2.0)
     prior = weak_prior(poses, params)
-    fitted = whole(fit(poses, to_chart(rough_state(found)), prior, FitParams()))
+    fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
     problem = Problem(poses, prior, fitted.effective, fitted.chart)
     curvature = problem.covariance
     y, calm = process_noise_pass(fitted.chart, None, problem, (0.0, 0.0))
@@ -206,7 +205,7 @@ def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
 
 def test_a_difference_is_a_contradiction_beyond_the_larger_covariance() -> None:
     found = fixes(4, 100.0)
-    cold = whole(batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS))
+    cold = batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS)
     assert not contradicted(cold.belief, cold.belief)
     sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
     axis = np.linalg.eigh(cold.belief.P)[1][:, -1]
@@ -330,8 +329,7 @@ def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
     assert sorted(f.t_ns for f in fewer) == [f.t_ns for f in fewer]
     params, rules = EstimatorParams().resolved(2.0), FitParams(rescale=False)
     every, part = (
-        whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference))
-        for some in (fixes, fewer)
+        batch_estimate(some, params, rules, NO_LEVELS, start=reference) for some in (fixes, fewer)
     )
     assert part.count == every.count == len(fixes)
     there = to_chart(every.belief.x)
@@ -379,8 +377,8 @@ def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: i
         if a.covariance is not None
     )
     params, levels = EstimatorParams().resolved(4.0), NoiseLevels(torque=1e-7, count=100)
-    P = whole(
-        batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first))
+    P = batch_estimate(
+        fixes, params, FitParams(rescale=False), levels, start=to_chart(first)
     ).belief.P
     assert np.all(np.isfinite(P))
     scale = np.sqrt(np.diagonal(P))

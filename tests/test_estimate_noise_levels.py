@@ -28,7 +28,6 @@ from avsreplay.estimate.noise_levels import (
 )
 from avsreplay.estimate.normal_points import normal_points, position_rows
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
 from avsreplay.records import Manoeuvre
 
@@ -63,7 +62,7 @@ def levels_of(found, truth, rounds: int = 4) -> tuple[NoiseLevels, Problem]:
         problem.core.descend(40, 1e-3)
         chart = problem.chart
         problem.core.linearise(chart.flat)
-        levels = whole(estimate_levels(points, problem, levels, False, (None, None)))
+        levels = estimate_levels(points, problem, levels, False, (None, None))
     return levels, problem
 
 
@@ -140,7 +139,7 @@ def test_a_given_density_is_not_changed() -> None:
     chart = to_chart(world.states[0])
     points = normal_points(poses, chart, np.ones(2), MOST_NORMAL_POINTS, scatter=True)
     problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
-    levels = whole(estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0)))
+    levels = estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0))
     assert (levels.torque, levels.force) == (pytest.approx(1e-5), 0.0)
     assert levels.white == (1.0, 1.0)
 

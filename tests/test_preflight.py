@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Writer
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 import avsreplay.model_size
-from avsreplay.build import task_and_target
+from avsreplay.build import target_geometry, task_and_target
 from avsreplay.config import RunConfig
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
@@ -574,7 +574,7 @@ def test_patches_that_a_gripper_reaches_are_proposed(usable):
     for advice in offered:
         name = advice.text.split(":")[0].removeprefix("--set task.patch=")
         config = RunConfig(task=TaskParams(patch=name))
-        task, target = task_and_target(config, body)
+        task, target = task_and_target(config, body, target_geometry(body, config.fixture_axis_c))
         assert not task.problem
         away = target.surface(np.linspace(0.01, 1.0, 20)[:, None] * task.axis_c)[1]
         assert (away > 0.0).all()  # the approach does not meet the body

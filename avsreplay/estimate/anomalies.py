@@ -62,7 +62,6 @@ from avsreplay.estimate.track import (
     with_history,
     with_nis,
 )
-from avsreplay.estimate.work import whole
 from avsreplay.geometry import skew
 from avsreplay.records import Admission, Belief, Finding, Manoeuvre
 
@@ -399,8 +398,6 @@ class AnomalyTest:
             recent=(),
             doubtful=(),
             pending=False,
-            fitting=None,
-            testing=None,
             previous=_kept(window[best.onset].track),
         )
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
@@ -428,12 +425,12 @@ class AnomalyTest:
         inflation = np.ones(2) if track.inflation is None else track.inflation
         window = track.window.factors
         factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
-        fitted = whole(fit(poses, prior.mean, prior, FitParams(rescale=False), factors))
+        fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
         now_ns, noise = fixes[-1].scan_ns, self.batch.noise_levels(track)
         found = BatchCovariance(fitted, ())
         after_s = (now_ns - t_ns) * 1e-9
         problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
-        components = whole(final_mixture(found, problem, latest, noise, now_ns, after_s))
+        components = final_mixture(found, problem, latest, noise, now_ns, after_s)
         plain = np.array([window[3], window[0]])
         return BatchResult(
             t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components
@@ -455,7 +452,7 @@ class AnomalyTest:
         """A new track from some poses; None where they contradict one another."""
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
         poses, start = poses_of(fixes), to_chart(rough_state(fixes))
-        fitted = whole(fit(poses, start, weak_prior(poses, self.params), FitParams(rescale=False)))
+        fitted = fit(poses, start, weak_prior(poses, self.params), FitParams(rescale=False))
         agree = 2.0 * fitted.half_chi2 <= EXPLAINED * (6 * len(fixes) - 12)
         return self._started(track, epochs, levels) if agree else None
 

@@ -27,19 +27,15 @@ from numpy.typing import NDArray
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import SUBSTEP_RAD
 from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.relative_orbit import OrbitArc
-from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
-# linearised poses of a descent, or pieces of their rotation, from which it is continued later
-_MOST_WORK = 2 * BUDGET
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,23 +288,10 @@ class Problem:
         """Half chi-square of the poses alone."""
         return self.core.residuals(chart.flat)[1]
 
-    def descended(self, most: int, gain_tol: float) -> Parts[tuple[int, bool]]:
-        """Descend to the minimum, in parts, and return the number of steps and whether the stopping
-        rule was met.
-        """
-        turned = float(np.linalg.norm(self.chart.w_c)) * float(np.ptp(self.poses.times_s))
-        part = max(1, int(_MOST_WORK / max(len(self.poses), turned / SUBSTEP_RAD)))
-        steps, done = self.core.descend(min(part, most), gain_tol)
-        while not done and steps < most:
-            yield BUDGET
-            more, done = self.core.descend(min(part, most - steps), gain_tol, go_on=True)
-            steps += more
-        return steps, done
-
     def pinned(
         self, start: Chart, params: FitParams, pin: Pin, most: int
-    ) -> Parts[tuple[Chart, Array, int]]:
-        """The fit from ``start`` with one direction fixed, in parts.
+    ) -> tuple[Chart, Array, int]:
+        """The fit from ``start`` with one direction fixed.
 
         Returns:
             Its chart, its covariance (20, 20) in the chart, and the number of steps, at most
@@ -316,7 +299,7 @@ class Problem:
         """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
-        steps, _ = yield from self.descended(most, max(params.gain_tol, _PIN_TOL))
+        steps, _ = self.core.descend(most, max(params.gain_tol, _PIN_TOL))
         found = self.chart, self.covariance, steps
         self.core.unpin()
         return found
@@ -354,8 +337,8 @@ def fit(
     every: Poses | None = None,
     robust_start: bool = False,
     slack: float = 1.0,
-) -> Parts[BatchFit]:
-    """Fit from ``start``, in parts. The noise factors begin at ``factors``; they are refined for
+) -> BatchFit:
+    """Fit from ``start``. The noise factors begin at ``factors``; they are refined for
     ``params.rescale``.
 
     The residuals' correlation can be estimated only once there are many; ``params.least_inflation``
@@ -384,9 +367,9 @@ def fit(
     core, steps = problem.core, 0
     if factors is None or robust_start:
         problem.reweigh(problem.factors, redescend=False)
-        steps, _ = yield from problem.descended(params.max_steps, params.gain_tol)
+        steps, _ = core.descend(params.max_steps, params.gain_tol)
         problem.reweigh(problem.factors)
-    more, done = yield from problem.descended(params.max_steps, params.gain_tol)
+    more, done = core.descend(params.max_steps, params.gain_tol)
     steps += more
     plain, inflation = problem.factors / least, least**2
     if params.rescale and len(every) >= _FEWEST_FOR_FACTORS:
@@ -394,7 +377,7 @@ def fit(
             plain, found = _noise_of(problem, every)
             inflation = np.maximum(found, params.least_inflation)
             problem.reweigh(plain * np.sqrt(inflation))
-            more, done = yield from problem.descended(params.max_steps, params.gain_tol)
+            more, done = core.descend(params.max_steps, params.gain_tol)
             steps += more
     core.linearise(
         core.chart

@@ -40,7 +40,6 @@ from avsreplay.estimate.noise_levels import (
     pose_error_covariance,
 )
 from avsreplay.estimate.relative_orbit import OrbitArc
-from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 _LEAST_NODE2 = 3.0  # square of the distance of the profile fits of at most three directions [sigma]
@@ -103,9 +102,9 @@ class BatchCovariance:
         return not (self.directions or self.others)
 
 
-def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Parts[BatchCovariance]:
+def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> BatchCovariance:
     """Test the weakest directions of a fit (relative to the prior) and profile the non-Gaussian
-    ones, in parts.
+    ones.
 
     Args:
         problem: the cost that was fitted, at the noise factors ``fitted.effective``.
@@ -126,13 +125,12 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Part
     for axis, row in bent:  # row @ axis = 1
         points = []
         for side in (math.sqrt(node2), -math.sqrt(node2)):
-            point, steps = yield from _profile(problem, fitted, params, axis, row, side, left)
+            point, steps = _profile(problem, fitted, params, axis, row, side, left)
             left -= steps
             if point is None:
                 others = True  # this direction keeps the covariance of the fit
                 break
             points.append(point)
-            yield steps * len(problem.poses)
         else:
             directions.append(NonGaussianDirection(row, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions), others, node2)
@@ -163,7 +161,7 @@ def _profile(
     row: Array,
     side: float,
     most: int,
-) -> Parts[tuple[ProfilePoint | None, int]]:
+) -> tuple[ProfilePoint | None, int]:
     """The fit with the direction fixed where the cost has risen by side^2 / 2, the best of
     ``_TRIES`` from ``side`` on.
 
@@ -176,9 +174,7 @@ def _profile(
         if spent >= most:
             break
         pin = Pin(fitted.chart, row, side, _PIN_1S)
-        there, P, steps = yield from problem.pinned(
-            there, params, pin, min(_PINNED_FIT_STEPS, most - spent)
-        )
+        there, P, steps = problem.pinned(there, params, pin, min(_PINNED_FIT_STEPS, most - spent))
         spent += steps
         rise = problem.cost(there) - fitted.half_chi2
         found.append((abs(float(np.log(max(rise, 1e-9) / wanted))), ProfilePoint(there, P, pin)))
@@ -286,8 +282,8 @@ def final_mixture(
     after_s: float,
     spread: tuple[Array, Array] | None = None,
     unseen: Array | None = None,
-) -> Parts[tuple[Component, ...]]:
-    """The fit with process noise as a Gaussian mixture at the last pose, in parts; the first has
+) -> tuple[Component, ...]:
+    """The fit with process noise as a Gaussian mixture at the last pose; the first has
     the published mean.
 
     A direction of which a profile fit cannot be propagated is treated as Gaussian.
@@ -319,7 +315,6 @@ def final_mixture(
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in zip((weights / weights.sum()).tolist(), charts, pins, strict=True):
         y, P = process_noise_pass(chart, pin, problem, noise)
-        yield 3 * len(problem.poses)
         lost = not (
             np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE
         )  # the linearisation does not hold
@@ -339,11 +334,7 @@ def final_mixture(
             )  # rounding at the epoch, where the spin is unstable
         if pin is not None and lost:
             left = _without(found, pin)
-            return (
-                yield from final_mixture(
-                    left, problem, latest, noise, t_ns, after_s, spread, unseen
-                )
-            )
+            return final_mixture(left, problem, latest, noise, t_ns, after_s, spread, unseen)
         out.append(Component(weight, weight, t_ns, there, definite(P), share))
     return tuple(out)
 

@@ -10,8 +10,7 @@ filter's estimate.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from bisect import bisect_left
 from dataclasses import replace
 from operator import attrgetter
 
@@ -30,7 +29,6 @@ from avsreplay.estimate.initialise import (
     batch_estimate,
     first_belief,
     joined,
-    pose_count,
 )
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -45,7 +43,6 @@ from avsreplay.estimate.noise_levels import NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
-from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
@@ -54,7 +51,6 @@ MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does no
 FEWEST_TO_CHECK = 50
 CHECK_GROWTH = 0.25
 FEWEST_WITH_OUTLIERS = 10
-FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
 _UNSEEN_TURN_RAD = 12.0  # turn between two scans that no estimate has: poses cannot show it
 _LATEST_POSES = 5  # poses of which the least interval counts
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
@@ -65,7 +61,7 @@ _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) 
 _LEAST_TORQUE = 1e-6
 _LONGEST_MEMORY_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _GAP = 2  # intervals between poses after which a mixture is propagated by its components
-_instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
+_instant = attrgetter("t_ns")
 
 
 class BatchSchedule:
@@ -97,14 +93,12 @@ class BatchSchedule:
         prediction: Prediction,
         innovation: Innovation,
         converged: bool,
-        spread: bool = False,
     ) -> Track:
         """The track after a healthy pose while the fit is in use: a new fit if enough poses have
         come since the last.
 
         Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every
-        component of the mixture is updated by itself. ``spread``: a fit to many poses is left to
-        ``advanced``.
+        component of the mixture is updated by itself.
         """
         fixes, older = self._with(track, prediction, innovation)
         track = track.changed(fixes=fixes, older=older, R=innovation.R, since=track.since + 1)
@@ -113,15 +107,7 @@ class BatchSchedule:
         last = track.batch
         if last is None or self._due(track, last):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
-                return self.fitted(
-                    forgot, converged, track, whole(self.fit(track, prediction.belief, forgot))
-                )
-            if not track.fitting:
-                job = Computation(
-                    ComputationKind.FIT, (track, prediction.belief, forgot), (forgot, converged)
-                )
-                track = track.changed(fitting=job)
+            return self._fitted(track, prediction.belief, forgot, converged)
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return track.changed(belief=belief)
@@ -142,35 +128,20 @@ class BatchSchedule:
         belief = belief if belief.t_ns == t_ns else self.propagated(track, belief, t_ns)[0]
         return track.changed(belief=belief, batch=replace(last, components=mixture))
 
-    def fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
-        """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an
-        earlier pose.
+    def _fitted(self, track: Track, belief: Belief, forgot: bool, converged: bool) -> Track:
+        """The track with a fit to all its poses. ``forgot``: the last fit began with an earlier
+        pose.
         """
         start = self.chart_at(belief, track.fixes[0].t_ns) if forgot else None
-        levels, given = self._levels(track), self._given(track)
-        return (
-            yield from batch_estimate(
-                track.fixes, self.params, self._rules, levels, track.batch, start, given
-            )
-        )
-
-    def fitted(self, forgot: bool, converged: bool, track: Track, result: BatchResult) -> Track:
-        """The track with a fit, which is corrected by the poses that came since it began."""
-        last, noise = track.batch, self.noise_levels(track)
-        result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
+        levels, given, last = self._levels(track), self._given(track), track.batch
+        result = batch_estimate(track.fixes, self.params, self._rules, levels, last, start, given)
+        result = with_last_pose(result, track.fixes[-1], self.noise_levels(track))
         rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
         track = track.changed(reinitialised=track.reinitialised + rejected)
         remembers = (
             forgot and track.levels.slack > 1.0
         )  # the filter keeps information of poses left out of fits
         return self.adopted(track, result, result.gaussian and (converged or remembers))
-
-    def _at_present(self, track: Track, result: BatchResult) -> BatchResult:
-        """The result of a fit, corrected by the later poses of a track."""
-        later = track.fixes[bisect_right(track.fixes, result.components[0].t_ns, key=_scan) :]
-        return replace(
-            with_later_poses(result, later, self.noise_levels(track)), count=pose_count(track.fixes)
-        )
 
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is
@@ -214,45 +185,34 @@ class BatchSchedule:
             since=track.since + 1,
         )
 
-    def check_against_batch(self, track: Track, spread: bool = False) -> Track:
+    def checked(self, track: Track) -> Track:
         """The filter's track, or the fit's where a fit to the same poses contradicts it.
-
-        ``spread``: a fit to many poses is left to ``advanced``.
-        """
-        enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
-        due = FEWEST_WITH_OUTLIERS if track.window.many_outliers else enough
-        if not self.checked_poses or track.drift is not None or track.since < due or track.fitting:
-            return track
-        epoch_ns = track.fixes[0].t_ns
-        rejected = track.batch is not None and track.batch.prior_rejected
-        begin, given = (
-            self.chart_at(track.belief, epoch_ns),
-            None if rejected else self._given(track),
-        )
-        last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
-        poses = track.fixes, self.params, self._rules, self._levels(track), last, begin, given
-        finish = (last is not None,)
-        if spread:
-            return track.changed(fitting=Computation(ComputationKind.CHECK, poses, finish))
-        return self.checked(*finish, track, whole(batch_estimate(*poses)))
-
-    def checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
-        """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the
-        filter.
 
         A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves
         contradict the filter. The noise window stays, since the noise of the last scans may differ
         from the level of all poses; with many outliers its residuals are errors of the estimate.
+
+        Args:
+            track: after the filter's update.
         """
-        many_outliers, linear = track.window.many_outliers, result.components[0].share == 1.0
-        result = self._at_present(track, result)
+        enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
+        many_outliers = track.window.many_outliers
+        due = FEWEST_WITH_OUTLIERS if many_outliers else enough
+        if not self.checked_poses or track.drift is not None or track.since < due:
+            return track
+        epoch_ns, last = track.fixes[0].t_ns, track.batch
+        given = None if last is not None and last.prior_rejected else self._given(track)
+        last = last if last is not None and last.epoch_ns == epoch_ns else None
+        begin, levels = self.chart_at(track.belief, epoch_ns), self._levels(track)
+        result = batch_estimate(track.fixes, self.params, self._rules, levels, last, begin, given)
+        linear = result.components[0].share == 1.0
         sound = result.gaussian and _better_than_measured(result.belief, track.R)
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
             adopted = self.adopted(track, result, result.gaussian).changed(
                 reinitialised=track.reinitialised + 1
             )
             return adopted if many_outliers else adopted.changed(window=track.window)
-        if sound and whole_memory and linear:
+        if sound and last is not None and linear:
             return self.adopted(track, result, to_filter=True).changed(window=track.window)
         return track.changed(since=0)
 
@@ -453,25 +413,4 @@ def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]
     if mixture is result.components:
         return result
     belief, _ = propagated(moments(mixture), result.belief.t_ns, *noise, fix.orbit)
-    return replace(result, belief=belief, components=mixture)
-
-
-def with_later_poses(
-    result: BatchResult, fixes: Sequence[PoseFix], noise: tuple[float, float]
-) -> BatchResult:
-    """The result of a fit, corrected by poses that came after those of the fit
-    (``mixture.carried``).
-
-    Args:
-        result: the fit's result.
-        fixes: later poses, oldest first.
-        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
-    """
-    if not fixes:
-        return result
-    mixture, factors = result.components, result.factors * np.sqrt(result.inflation)
-    for fix in fixes:
-        root = _motion.roots(fix.C[None])[0][0]
-        mixture = carried(mixture, fix.t_ns, fix.T_ac, root, factors, fix.weight, noise, fix.orbit)
-    belief, _ = propagated(moments(mixture), fixes[-1].scan_ns, *noise, fixes[-1].orbit)
     return replace(result, belief=belief, components=mixture)

@@ -1,23 +1,17 @@
-"""When the noise levels are estimated and a constant torque is tested for, and the work that is
-spread over scans.
-"""
+"""When the noise levels are estimated and a constant torque or force is tested for."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from statistics import median
-from typing import Any
 
 import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.estimate.batch_schedule import (
     CHECK_GROWTH,
-    FEWEST_TO_SPREAD,
     MOST_FIXES,
     BatchSchedule,
 )
@@ -29,7 +23,6 @@ from avsreplay.estimate.driven_motion import DrivenMotion, driven_motion
 from avsreplay.estimate.initialise import (
     BatchResult,
     PoseFix,
-    batch_estimate,
     improved_levels,
     pose_count,
     poses_of,
@@ -46,7 +39,6 @@ from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.normal_points import PositionRows, position_rows
 from avsreplay.estimate.params import Adaptation
 from avsreplay.estimate.track import Track
-from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
 from avsreplay.geometry import Array
 from avsreplay.records import UNLIKELY, Drift
 from avsreplay.settings import given
@@ -63,7 +55,6 @@ _DRIFT_OF_SPEED = 5e-3
 _EARLY = 2.0
 # least variance of a belief over that of a pose, less 1, for which the pose is used
 _LEAST_EXCESS = 1e-6
-_LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _POSITIONS = 36  # points of the positions from which the density of a force is estimated
 # chi-square with 6 degrees of freedom: a median of FEWEST values is below with probability 1e-5
 _LEAST_NIS = 1.6
@@ -82,7 +73,7 @@ class _Driven:
 
 
 class DisturbanceSchedule:
-    """Runs the tests, and continues the work of a track scan by scan.
+    """Runs the tests.
 
     Args:
         batch: runs the fits.
@@ -90,63 +81,30 @@ class DisturbanceSchedule:
 
     def __init__(self, batch: BatchSchedule) -> None:
         self.batch, self.params = batch, batch.params
-        self._jobs: dict[
-            ComputationKind, tuple[Callable[..., Parts[Any]], Callable[..., Track]]
-        ] = {
-            ComputationKind.FIT: (batch.fit, batch.fitted),
-            ComputationKind.CHECK: (batch_estimate, batch.checked),
-            ComputationKind.LEVELS: (improved_levels, self._levelled),
-            ComputationKind.DRIFT: (self._tested, self._driven),
-        }
         self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(batch.params.start_vel_1s_mps))
 
-    def advanced(self, track: Track, tested: bool) -> Track:
-        """The track after a healthy scan with the work of one scan: noise levels, or a fit and a
-        test in turn.
-
-        Where the levels are too small, every pose makes another fit due: they are estimated before.
-
-        Args:
-            track: after the scan.
-            tested: a test may begin.
-        """
-        if tested:
-            track = self._begun(
-                track.changed(untested=track.untested + 1, unlevelled=track.unlevelled + 1)
-            )
-        job, other = track.fitting, track.testing
-        if other is not None and (
-            job is None or other.kind is ComputationKind.LEVELS or track.unlevelled % 2
-        ):
-            job = other
-        if job is None:
-            return track
-        begin, finish = self._jobs[job.kind]
-        work = job.work.continued(partial(begin, *job.begin))
-        after = None if work.done else replace(job, work=work)
-        track = (
-            track.changed(testing=after) if job is track.testing else track.changed(fitting=after)
-        )
-        return finish(*job.finish, track, work.result) if work.done else track
-
-    def _begun(self, track: Track) -> Track:
-        """The track with a test of the noise levels, else of a drift, if one is due and none is
-        under way.
+    def tested(self, track: Track) -> Track:
+        """The track after a healthy scan, with a test of the noise levels, else of a drift, if one
+        is due.
 
         A drift is tested for each time the poses have grown enough, with all poses: those that have
         left the fit as well, because the random disturbances that shorten it are the other
         explanation. From its first detection on it is part of the motion that the filter predicts.
         The value that is reported is that of the last fit to all poses: where inertia and torque
         explain each other, the filter's covariance becomes too small between fits.
+
+        Args:
+            track: after the scan.
         """
-        if not self.batch.checked_poses or track.batch is None or track.testing is not None:
+        track = track.changed(untested=track.untested + 1, unlevelled=track.unlevelled + 1)
+        if not self.batch.checked_poses or track.batch is None:
             return track
         fixes = self._for_levels(track)
         if fixes:
-            return self._levels_begun(track, track.batch, fixes)
+            return self._levelled(track, track.batch, fixes)
         if track.untested <= FEWEST_TO_TEST or track.since == 0:
             return track
-        return self._drift_begun(track, track.batch)
+        return self._with_drift(track, track.batch)
 
     def _for_levels(self, track: Track) -> tuple[PoseFix, ...]:
         """The poses with which the noise levels are tested, empty if no test is due.
@@ -155,23 +113,26 @@ class DisturbanceSchedule:
         them again.
         """
         count, fixes = pose_count(track.fixes), track.fixes
-        late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        if track.drift is not None or late <= (0 if track.since else _LATEST):
+        if track.drift is not None or track.unlevelled <= max(FEWEST_TO_TEST, LEVEL_GROWTH * count):
             return ()
         if count < FEWEST and _overestimated(track):
             fixes = _all_poses(track).fixes[-FEWEST:]
         return fixes if pose_count(fixes) >= FEWEST else ()
 
-    def _levels_begun(self, track: Track, last: BatchResult, fixes: tuple[PoseFix, ...]) -> Track:
-        """The track with a test of the noise levels, which few poses have at once."""
+    def _levelled(self, track: Track, last: BatchResult, fixes: tuple[PoseFix, ...]) -> Track:
+        """The track with new noise levels."""
         start = self._start(track, last, fixes[0].t_ns)
-        poses = fixes, last, start, self.params, track.levels, _positions(track, start)
-        if len(fixes) < FEWEST_TO_SPREAD:
-            return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
-        return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
+        levels = improved_levels(
+            fixes, last, start, self.params, track.levels, _positions(track, start)
+        )
+        used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
+        more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
+        # estimated without these disturbances: fit again
+        since = pose_count(track.fixes) if more else track.since
+        return track.changed(levels=levels, since=since, unlevelled=0)
 
-    def _drift_begun(self, track: Track, last: BatchResult) -> Track:
-        """The track with a test of a drift, if one is due."""
+    def _with_drift(self, track: Track, last: BatchResult) -> Track:
+        """The track after a test of a drift, if one is due."""
         known = track.drift
         every = _all_poses(track) if known is None else track
         count, epoch_ns = pose_count(every.fixes), every.fixes[0].t_ns
@@ -180,16 +141,13 @@ class DisturbanceSchedule:
         growth = DRIFT_GROWTH if early else CHECK_GROWTH
         if count < FEWEST_WITH_DRIFT or track.untested <= growth * count:
             return track
-        begun = None
+        track, begun = track.changed(untested=0), None
         if known is not None:
             if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
-                return track.changed(untested=0)
+                return track
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
-        start = self._start(track, last, epoch_ns)
-        job = Computation(
-            ComputationKind.DRIFT, (every, start, begun), (epoch_ns, every.fixes[-1].t_ns)
-        )
-        return track.changed(testing=job, untested=0)
+        driven = self._driven_motions(every, self._start(track, last, epoch_ns), begun)
+        return track if driven is None else self._driven(track, last, every, driven)
 
     def _start(self, track: Track, last: BatchResult, epoch_ns: int) -> Chart:
         """Initial values at an instant: those of the last fit, or of the belief propagated back."""
@@ -197,22 +155,13 @@ class DisturbanceSchedule:
             last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
         )
 
-    def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
-        """The track with new noise levels."""
-        used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
-        more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
-        since = (
-            pose_count(track.fixes) if more else track.since
-        )  # estimated without these disturbances: fit again
-        return track.changed(levels=levels, since=since)
-
-    def _tested(
+    def _driven_motions(
         self, track: Track, start: Chart, begun: tuple[float, Array] | None
-    ) -> Parts[_Driven | None]:
-        """The test for a drift, in parts. ``begun``: onset and size of one that is known."""
+    ) -> _Driven | None:
+        """The test for a drift. ``begun``: onset and size of one that is known."""
         factors = np.array([track.window.factors[3], track.window.factors[0]])
         try:
-            found = yield from find_drift(
+            found = find_drift(
                 track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun
             )
             if found is None:
@@ -228,16 +177,14 @@ class DisturbanceSchedule:
                 track.levels, torque=0.0, force=0.0
             )  # the acceleration may have caused these disturbances
             before = first if begun is None else track.levels
-            levels = yield from levels_of(
-                best.fitted, before, widths, claimed, self.params.disturbances, seen
-            )
+            levels = levels_of(best.fitted, before, widths, claimed, self.params.disturbances, seen)
             if (
                 begun is None and levels.established
             ):  # with random disturbances beside it, these may explain everything
                 return None
             motions = []
             for h in found.hypotheses:
-                motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)
+                motion = driven_motion(h.fitted, h.onset_1s_s, widths, levels)
                 if motion is None:
                     return _Driven(found, levels, [])
                 motions.append((h.weight, motion))
@@ -247,38 +194,30 @@ class DisturbanceSchedule:
         ):  # an unstable spin over so long a time that its motion cannot be inverted
             return None
 
-    def _driven(self, epoch_ns: int, until_ns: int, track: Track, driven: _Driven | None) -> Track:
-        """The track with the estimate of a fit with a constant torque or force, and the poses since
-        it began.
+    def _driven(self, track: Track, last: BatchResult, every: Track, driven: _Driven) -> Track:
+        """The track with the estimate of a fit with a constant torque or force.
+
+        Args:
+            track: after the scan.
+            last: its last fit.
+            every: the track with all poses of the fit.
+            driven: the fit.
         """
-        last, now_ns, known = track.batch, track.belief.t_ns, track.drift
-        if driven is None or last is None:
-            return track
+        now_ns, known = track.belief.t_ns, track.drift
+        epoch_ns, count = every.fixes[0].t_ns, pose_count(every.fixes)
         if not driven.motions:
             return (
                 track
                 if known is None
                 else track.changed(levels=replace(driven.levels, count=track.levels.count))
             )
-        fitted = driven_moments(
-            [(weight, motion.belief(epoch_ns, until_ns)) for weight, motion in driven.motions]
-        )
-        if known is None and not _significant(fitted):
+        parts = [(weight, motion.belief(epoch_ns, now_ns)) for weight, motion in driven.motions]
+        fitted = driven_moments(parts)
+        if not np.isfinite(fitted.P).all() or (known is None and not _significant(fitted)):
             return track
-        track = track if known is not None else _all_poses(track, epoch_ns)
-        best, count = driven.found.hypotheses[0], pose_count(track.fixes)
-        later = tuple(f for f in track.fixes if f.t_ns > until_ns)
-        poses = poses_of(later, epoch_ns) if later else None
-        parts = []
-        for weight, motion in driven.motions:
-            belief = motion.belief(epoch_ns, now_ns, poses)
-            if not np.isfinite(belief.P).all():
-                return track
-            parts.append((weight, belief))
+        track, best = every.changed(untested=0), driven.found.hypotheses[0]
         inflation, plain = driven.motions[0][1].inflation, driven.levels.factors(last.share)
-        moved = no_worse_than_pose(
-            driven_moments(parts), track.fixes[-1], plain * np.sqrt(inflation)
-        )
+        moved = no_worse_than_pose(fitted, track.fixes[-1], plain * np.sqrt(inflation))
         onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), driven.found.onset_1s_s
         if onset_ns == epoch_ns:  # it may have acted before the first of these poses
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
@@ -297,7 +236,7 @@ class DisturbanceSchedule:
             share=last.share,
             position_m2=last.position_m2,
         )
-        track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
+        track = track.changed(drift=drift, levels=replace(driven.levels, count=count))
         return self.batch.adopted(track, result, to_filter=True)
 
 
@@ -317,9 +256,9 @@ def _significant(fitted: DrivenBelief) -> bool:
     return bool(np.isfinite(P).all()) and float(u @ np.linalg.solve(P, u)) > UNLIKELY[len(open_)]
 
 
-def _all_poses(track: Track, since_ns: int = 0) -> Track:
-    """The track with a fit to all poses since an instant and since the last manoeuvre."""
-    last_ns = max([since_ns, *(m.t_ns for m in track.manoeuvres)])
+def _all_poses(track: Track) -> Track:
+    """The track with a fit to all poses since the last manoeuvre."""
+    last_ns = max([0, *(m.t_ns for m in track.manoeuvres)])
     begin = bisect_left(track.older, last_ns, key=_instant)
     return track.changed(
         fixes=(*track.older[begin:], *track.fixes)[-MOST_FIXES:], older=track.older[:begin]

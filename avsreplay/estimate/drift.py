@@ -40,7 +40,6 @@ from avsreplay.estimate.noise_levels import (
 )
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 
 # number of onsets tried, the first at the epoch, and around the most likely one
@@ -71,8 +70,8 @@ def find_drift(
     scale: tuple[float, float],
     levels: NoiseLevels = NO_LEVELS,
     known: tuple[float, Array] | None = None,
-) -> Parts[DriftFound | None]:
-    """The drift that the poses show with the initial values of the motion, in parts.
+) -> DriftFound | None:
+    """The drift that the poses show with the initial values of the motion.
 
     The result is None where free motion explains the poses.
 
@@ -90,29 +89,27 @@ def find_drift(
     """
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, NO_ACCELERATION) if known is None else known
-    free = yield from fit_driven(poses, start, prior, factors, onset_s, u)
-    yield _size(free)
+    free = fit_driven(poses, start, prior, factors, onset_s, u)
     anew = known is None and poor_fit(free, factors, levels)
-    begin = (yield from _from_sphere(fixes, poses, prior, factors, widths)) if anew else free
-    frame, found, onsets = yield from _improved(poses, prior, factors, widths, begin)
+    begin = _from_sphere(fixes, poses, prior, factors, widths) if anew else free
+    frame, found, onsets = _improved(poses, prior, factors, widths, begin)
     if poor_fit(frame, factors, levels):  # a local minimum, or no constant acceleration at all
-        begin = free if anew else (yield from _from_sphere(fixes, poses, prior, factors, widths))
-        other = yield from _improved(poses, prior, factors, widths, begin)
+        begin = free if anew else _from_sphere(fixes, poses, prior, factors, widths)
+        other = _improved(poses, prior, factors, widths, begin)
         frame, found, onsets = min((frame, found, onsets), other, key=lambda each: each[0].cost)
     best = max(found, key=lambda f: f.log_odds)
     if not frame.u.any() or (known is not None and best.log_odds < _FOUND):
         return None
-    if known is None:
-        nearer = fit_driven(poses, frame.chart, prior, factors, 0.0, NO_ACCELERATION)
-        if poor_fit(frame, factors, levels) or not (
-            yield from _shown(frame, free, nearer, best, params, levels, widths)
-        ):
-            return None
+    if known is None and (
+        poor_fit(frame, factors, levels)
+        or not _shown(poses, frame, free, best, params, levels, widths)
+    ):
+        return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
     later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)
     if frame.onset_s == 0.0:
         return DriftFound((later,), best.width * widths, within.spread_s)
-    always, _, _ = yield from _improved(poses, prior, factors, widths, frame, only=np.zeros(1))
+    always, _, _ = _improved(poses, prior, factors, widths, frame, only=np.zeros(1))
     noise = _remaining_noise(frame, frame.columns(best.onset_s).reshape(-1, 6), best)
     odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(
         within.width_s / float(poses.times_s[-1])
@@ -124,21 +121,21 @@ def find_drift(
 
 
 def _shown(
+    poses: Poses,
     frame: DrivenFit,
     free: DrivenFit,
-    nearer: Parts[DrivenFit],
     best: _Found,
     params: EstimatorParams,
     levels: NoiseLevels,
     widths: Array,
-) -> Parts[bool]:
+) -> bool:
     """Whether the poses show a drift better than free motion, a change of the velocities, and
     random disturbances do.
 
     Args:
+        poses: the measurements.
         frame: fit with the drift.
-        free: fit of free motion.
-        nearer: the fit of free motion that begins at ``frame``, which may be the better one.
+        free: fit of free motion. The one that begins at ``frame`` may be the better one.
         best: the drift.
         params: settings.
         levels: noise levels.
@@ -146,16 +143,16 @@ def _shown(
     """
     if _odds(best, frame, free) < _FOUND:
         return False
-    other = yield from nearer
+    known = frame.problem
+    other = fit_driven(poses, frame.chart, known.prior, known.factors, 0.0, NO_ACCELERATION)
     free = min(free, other, key=lambda f: f.cost)
-    yield _size(free)
     if _odds(best, frame, free) < _FOUND:
         return False
     if best.log_odds - _step_odds(frame, params, best.noise) < _CONSTANT:
         return False
-    if not (yield from _constant(frame, free, levels, best, widths)):
+    if not _constant(frame, free, levels, best, widths):
         return False
-    return (yield from is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0)))
+    return is_bounded(frame, np.where(frame.u != 0.0, widths, 0.0))
 
 
 @value_class
@@ -209,7 +206,7 @@ def _improved(
     widths: Array,
     begin: DrivenFit,
     only: Array | None = None,
-) -> Parts[tuple[DrivenFit, list[_Found], Array]]:
+) -> tuple[DrivenFit, list[_Found], Array]:
     """The best joint fit with any onset and kind of acceleration, and the drifts from each onset
     (n,) on about it.
 
@@ -232,10 +229,7 @@ def _improved(
             break
         open_ = np.where(best.u != 0.0, widths, 0.0)
         start = np.where(best.u != 0.0, frame.u, 0.0)
-        closer = yield from fit_jointly(
-            poses, frame.chart, prior, factors, best.onset_s, start, open_
-        )
-        yield _size(closer)
+        closer = fit_jointly(poses, frame.chart, prior, factors, best.onset_s, start, open_)
         if closer.cost > frame.cost - _RELINEARISED_GAIN and (
             only is None or k
         ):  # the first of given onsets may be worse
@@ -246,33 +240,26 @@ def _improved(
 
 def _from_sphere(
     fixes: tuple[PoseFix, ...], poses: Poses, prior: Prior, factors: Array, widths: Array
-) -> Parts[DrivenFit]:
+) -> DrivenFit:
     """The joint fit of a torque since the first pose that begins with a sphere at a constant rate.
 
     In the fit of free motion a wrong inertia explains a part of the torque. A descent from there
     may end in a local minimum.
     """
     start, torque = to_chart(rough_state(fixes)), np.append(widths[:3], np.zeros(3))
-    return (yield from fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque))
-
-
-def _size(fitted: DrivenFit) -> int:
-    """Work of a fit and of what follows from it, in linearised poses."""
-    return 12 * len(fitted.points) + len(fitted.poses)
+    return fit_jointly(poses, start, prior, factors, 0.0, NO_ACCELERATION, torque)
 
 
 def _constant(
     frame: DrivenFit, free: DrivenFit, levels: NoiseLevels, best: _Found, widths: Array
-) -> Parts[bool]:
+) -> bool:
     """Return whether a constant disturbance alone explains the poses better than random ones do."""
-    random = yield from _evidence(free, levels, best, None)
-    constant = yield from _evidence(frame, levels, best, widths)
+    random = _evidence(free, levels, best, None)
+    constant = _evidence(frame, levels, best, widths)
     return constant - random >= _CONSTANT
 
 
-def _evidence(
-    frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None
-) -> Parts[float]:
+def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None) -> float:
     """Log likelihood of the poses with a constant disturbance, or with random ones of the same
     kind.
 
@@ -286,7 +273,6 @@ def _evidence(
     if widths is not None:
         unknown, size = drift_unknowns(frame, points, coarse, widths, open_)
         likely = [(scale * unknown, size / scale) for scale in _SCALES]
-    yield BUDGET // 2
     return disturbed_likelihood(points, coarse, levels, kinds, likely)
 
 

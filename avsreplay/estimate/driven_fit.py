@@ -28,7 +28,6 @@ from avsreplay.estimate.noise_levels import (
     pose_error_covariance,
 )
 from avsreplay.estimate.normal_points import PositionRows, normal_points
-from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 NO_ACCELERATION = np.zeros(6)
@@ -92,8 +91,8 @@ class DrivenFit:
 
 def fit_driven(
     poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s: float, u: Array
-) -> Parts[DrivenFit]:
-    """Fit all poses with a given acceleration, in parts. The fit need not converge where another
+) -> DrivenFit:
+    """Fit all poses with a given acceleration. The fit need not converge where another
     one acts.
 
     Args:
@@ -106,7 +105,7 @@ def fit_driven(
     """
     poses = without_drift(poses, start, onset_s, u) if u.any() else poses
     points = normal_points(poses, start, factors)
-    fitted = yield from fit(points, start, prior, FitParams(rescale=False), factors)
+    fitted = fit(points, start, prior, FitParams(rescale=False), factors)
     problem, chart = Problem(points, prior, factors, fitted.chart), fitted.chart
     e, H = problem.core.rows()
     G = H[:, :, :REACHED]
@@ -210,9 +209,8 @@ def levels_of(
     claimed: bool,
     fixed: tuple[float | None, float | None],
     positions: PositionRows | None = None,
-) -> Parts[NoiseLevels]:
-    """Noise levels from the residuals of the poses about the motion with the acceleration, in
-    parts.
+) -> NoiseLevels:
+    """Noise levels from the residuals of the poses about the motion with the acceleration.
 
     Args:
         fitted: the fit.
@@ -228,9 +226,7 @@ def levels_of(
     )
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
-    return (
-        yield from estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions)
-    )
+    return estimate_levels(points, problem, levels, claimed, fixed, unknowns, positions)
 
 
 def drift_unknowns(

@@ -28,7 +28,6 @@ from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, definite
 from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.noise_levels import NoiseLevels, mean_share
 from avsreplay.estimate.normal_points import normal_points
-from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 # most linearisations; size of a step, in 1 sigma, after which none follows
@@ -53,7 +52,6 @@ _MOST_DAMPING = 1e8
 _PIN = 0.1
 _PROFILE_STEPS = 20
 _LEAST_PROFILE_RISE = 1.0
-_JOINT_WORK = 4  # work of a step for each pose, in linearised poses
 # the acceleration and its onset after the 20 initial values
 _U = slice(DIM, DIM + 6)
 _ONSET = DIM + 6
@@ -67,9 +65,9 @@ def fit_jointly(
     onset_s: float,
     u: Array,
     widths: Array,
-) -> Parts[DrivenFit]:
+) -> DrivenFit:
     """Fit initial values and acceleration together by Levenberg-Marquardt along the motion with
-    both, in parts.
+    both.
 
     Where a wrong inertia makes up for a part of the acceleration, estimates of them in turn stop
     far from the minimum.
@@ -96,14 +94,13 @@ def fit_jointly(
         )
         joint = _joint(seen, prior, factors, onset_s, widths)
         joint.linearise(chart.flat, u)
-        yield _JOINT_WORK * len(seen)
-        left -= yield from _descended(joint, len(seen), left, 0.0 if last else _COARSE)
+        left -= _descended(joint, left, 0.0 if last else _COARSE)
         chart, u = Chart(joint.chart), joint.u
         if last:
             break
     joint.noise((float(factors[0]), float(factors[1])), True, GATE)  # Cauchy's weights
     joint.linearise(chart.flat, u)
-    yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
+    _descended(joint, _LAST_STEPS, 0.0, _LAST_GAIN)
     return _linear_fit(poses, seen, prior, factors, joint, onset_s)
 
 
@@ -142,8 +139,8 @@ def _linear_fit(
     return DrivenFit(*motion, white.reshape(-1), J.reshape(-1, DIM), G, prior.info, off, along=True)
 
 
-def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
-    """Return whether the standard deviations of the acceleration are not too small, in parts.
+def is_bounded(fitted: DrivenFit, widths: Array) -> bool:
+    """Return whether the standard deviations of the acceleration are not too small.
 
     The acceleration is moved by two standard deviations in the direction in which it is known
     least, and the initial values are fitted again (profile likelihood). Half the chi-square
@@ -157,7 +154,7 @@ def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     seen = without_drift(fitted.points, fitted.about, fitted.onset_s, fitted.u, back=True)
     joint = _joint(seen, fitted.problem.prior, fitted.problem.factors, fitted.onset_s, widths)
     joint.linearise(fitted.chart.flat, fitted.u)
-    yield from _descended(joint, len(seen), _LAST_STEPS, 0.0)
+    _descended(joint, _LAST_STEPS, 0.0)
     chart, u, cost = Chart(joint.chart), joint.u, joint.cost
     open_ = np.flatnonzero(np.append(np.ones(DIM, dtype=bool), widths > 0.0))
     P = np.linalg.inv(joint.normal()[0][np.ix_(open_, open_)])
@@ -171,16 +168,16 @@ def is_bounded(fitted: DrivenFit, widths: Array) -> Parts[bool]:
     for side in (-2.0, 2.0):
         joint.measure(row, side / _PIN + float(row @ fitted.u))
         joint.linearise(chart.moved(side * step[:DIM]).flat, u + side * step[_U])
-        yield from _descended(joint, len(seen), _PROFILE_STEPS, 0.0)
+        _descended(joint, _PROFILE_STEPS, 0.0)
         if joint.cost - cost < _LEAST_PROFILE_RISE:
             return False
     return True
 
 
 def _descended(
-    joint: _motion.Driven, count: int, most: int, share: float, least: float = _LEAST_JOINT_GAIN
-) -> Parts[int]:
-    """Descend to the minimum of a cost of ``count`` poses, and return the number of steps, at most
+    joint: _motion.Driven, most: int, share: float, least: float = _LEAST_JOINT_GAIN
+) -> int:
+    """Descend to the minimum of a cost, and return the number of steps, at most
     ``most``.
 
     The descent ends where the linearised cost decreases by less than ``least`` and this share of
@@ -189,7 +186,6 @@ def _descended(
     damping, steps = _DAMPING, 0
     while steps < most and damping < _MOST_DAMPING and joint.left > max(least, share * joint.cost):
         damping, steps = joint.step(damping), steps + 1
-        yield _JOINT_WORK * count
     return steps
 
 
@@ -220,17 +216,14 @@ class DrivenMotion:
     v: Array
     P: Array
 
-    def belief(self, epoch_ns: int, now_ns: int, later: Poses | None = None) -> DrivenBelief:
+    def belief(self, epoch_ns: int, now_ns: int) -> DrivenBelief:
         """The belief at an instant after the last pose.
 
         Args:
             epoch_ns: instant of the first pose.
             now_ns: the instant [ns].
-            later: poses after those of the fit.
         """
         v, P = self.v, self.P
-        if later is not None:
-            v, P = _smoothed(self, later, float(self.seen.times_s[-1]), v, P)
         chart, u, onset_s = (
             self.chart.moved(v[:DIM]),
             self.u + v[_U],
@@ -244,8 +237,8 @@ class DrivenMotion:
 
 def driven_motion(
     fitted: DrivenFit, onset_1s_s: float, widths: Array, levels: NoiseLevels
-) -> Parts[DrivenMotion | None]:
-    """The motion of a fit with an acceleration, with disturbances and an unknown onset, in parts.
+) -> DrivenMotion | None:
+    """The motion of a fit with an acceleration, with disturbances and an unknown onset.
 
     The result is None where the steps do not become small: the problem is not linear about the
         motion found.
@@ -271,13 +264,12 @@ def driven_motion(
     )
     joint = _joint(seen, prior, scale, onset_s, np.where(u != 0.0, widths, 0.0), 1.0)
     joint.linearise(chart.flat, u)
-    yield from _descended(joint, len(seen), _LAST_STEPS, 0.0, _LAST_GAIN)
+    _descended(joint, _LAST_STEPS, 0.0, _LAST_GAIN)
     chart, u = Chart(joint.chart), joint.u
     for k in range(_LINEARISATIONS):  # first about the motion of the fit, then about the one found
         off = np.concatenate([-chart.minus(prior.mean), -u, [fitted.onset_s - onset_s]])
         motion = replace(motion, chart=chart, u=u, onset_s=onset_s)
         v, P = _smoothed(motion, seen, float(seen.times_s[0]), off, before)
-        yield 12 * len(seen)
         if not np.isfinite(v).all() or float(np.abs(v[:DIM]).max()) > LARGEST_MOVE:
             break
         size = _size(v, P)

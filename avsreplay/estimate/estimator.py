@@ -26,7 +26,7 @@ from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast, p
 from avsreplay.estimate.error_state import RHO, semidefinite
 from avsreplay.estimate.frame import ZERO, EstimatorFrame
 from avsreplay.estimate.grasp_point import at_grasp
-from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
+from avsreplay.estimate.initialise import given_prior, guessed_belief
 from avsreplay.estimate.measurement import (
     gate_of,
     in_camera,
@@ -39,7 +39,7 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.mixture import mixture_forecast
 from avsreplay.estimate.noise import NO_INFLATION, Noise, NoiseWindow
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.reference import FittedMotion, rows_along
+from avsreplay.estimate.reference import FittedMotion, GramianRows, rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import (
     Epoch,
@@ -228,7 +228,7 @@ class Estimator:
             track,
             epoch,
             admission,
-            lambda t: self.update(t, prediction, innovation, admitted, converged, True),
+            lambda t: self.update(t, prediction, innovation, admitted, converged),
         )
         after = after.changed(
             undetermined=undetermined(track, innovation, finding.used, self._length_m)
@@ -236,8 +236,8 @@ class Estimator:
         if not finding.used:
             return after, finding
         after = self.anomalies.with_possible_change(after)
-        due = after.mode in ("fit", "filter")
-        after = self.disturbances.advanced(after, self._robust) if due else after
+        if self._robust and after.mode in ("fit", "filter"):
+            after = self.disturbances.tested(after)
         return self.batch.resolved(after), finding
 
     def track_forecast(self, track: Track, times_s: Array, grasp_c: Array = ZERO) -> Forecast:
@@ -271,56 +271,38 @@ class Estimator:
             (move, turn),
         )
 
-    def refitted_rows(self, track: Track) -> tuple[FittedMotion, tuple[Array, Array, Array]] | None:
-        """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no
-        new fit.
-
-        Args:
-            track: after a scan.
-
-        Returns:
-            The motion at the scan; H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the
-            transition (20, 20).
-        """
-        start, trimmed = (
-            track.batch,
-            track.mode == "filter" and len(track.fixes) >= self.params.audit_poses,
-        )
-        if start is None or track.since or trimmed or start.count != pose_count(track.fixes):
-            return None
-        motion, Phi = (first := FittedMotion.of(start)).at(track.belief.t_ns, self.batch.orbit)
-        return motion, (*rows_along(first, track.fixes), Phi)
-
-    def gramian_row(
+    def gramian_rows(
         self,
         track: Track,
         prediction: Prediction,
         innovation: Innovation | None,
         last: FittedMotion | None,
-    ) -> tuple[FittedMotion | None, tuple[Array, Array, Array | None, bool]]:
-        """Phi (20, 20) and H (6, 20) of a scan, and R (6, 6) as the registration claims it.
+    ) -> GramianRows:
+        """What a scan gives to the observability Gramian, which follows the motion of the last fit:
+        the mean of a mixture between two fits follows no motion of the body.
 
-        Between two fits along the trajectory of the last one: the mean of a mixture follows no
-            motion of the body.
+        A new fit is another motion, along which the Gramian begins anew with all its poses. The
+        filter, and a fit that begins with a manoeuvre, continue it by their own predictions.
 
         Args:
             track: after the scan.
             prediction: of the scan.
             innovation: of the scan; None where it was not used.
-            last: trajectory of the last fit at the last scan; None before a fit.
-
-        Returns:
-            That at this scan; Phi, H, R or None, and whether Phi begins at the first pose and not
-            at the last scan.
+            last: motion of the fit that was followed until now; None before a fit.
         """
-        start = track.batch
-        if track.mode != "fit" or start is None or start.points is None:
+        fitted, filters = track.batch, track.mode == "filter"
+        if fitted is not None and (last is None or not last.is_of(fitted)):
+            last = FittedMotion.of(fitted)
+            if not filters or 0 < len(track.fixes) < self.params.audit_poses:
+                motion, Phi = last.at(track.belief.t_ns, self.batch.orbit)
+                return GramianRows(motion, True, Phi, *rows_along(last, track.fixes))
+        if last is None or fitted is None or fitted.points is None or filters:
             R = None if innovation is None else self.noise.base(innovation.R, prediction.window)
-            return None, (prediction.Phi, prediction.H, R, False)
-        known, pose = last if last is not None and last.is_of(start) else None, track.fixes[-1]
-        motion, Phi = (known or FittedMotion.of(start)).at(prediction.belief.t_ns, self.batch.orbit)
+            return GramianRows(last, False, prediction.Phi, prediction.H, R)
+        motion, Phi = last.at(prediction.belief.t_ns, self.batch.orbit)
+        pose = track.fixes[-1]
         R = None if innovation is None else in_camera(pose.C, pose.T_ac.q, motion.x.q_bc)
-        return motion, (Phi, measurement_jacobian(motion.x), R, known is None)
+        return GramianRows(motion, False, Phi, measurement_jacobian(motion.x), R)
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
@@ -402,7 +384,6 @@ class Estimator:
         innovation: Innovation | None,
         gamma: int,
         converged: bool = True,
-        spread: bool = False,
     ) -> Track:
         """The posterior. With gamma 0 or no innovation it equals the prior exactly.
 
@@ -412,7 +393,6 @@ class Estimator:
             innovation: None where the scan gave no pose.
             gamma: 1 for a healthy scan, 0 for a faulty one.
             converged: t_1 was reached at the last scan. A fit hands over to the filter only then.
-            spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
             return track.changed(
@@ -420,10 +400,9 @@ class Estimator:
                 change_P=prediction.Phi @ track.change_P @ prediction.Phi.T,
             )
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
-            after = self.batch.initialised(track, prediction, innovation, converged, spread)
+            after = self.batch.initialised(track, prediction, innovation, converged)
         else:
-            after = self.batch.filtered(track, prediction, innovation)
-            after = self.batch.check_against_batch(after, spread)
+            after = self.batch.checked(self.batch.filtered(track, prediction, innovation))
         return self.batch.resolved(after)
 
     def disturbances_of(self, track: Track) -> tuple[float, float] | None:

@@ -38,7 +38,6 @@ from avsreplay.estimate.noise_levels import MOST_NORMAL_POINTS, NoiseLevels, est
 from avsreplay.estimate.normal_points import PositionRows, gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
-from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 from avsreplay.settings import given
@@ -270,9 +269,8 @@ def batch_estimate(
     last: BatchResult | None = None,
     start: Chart | None = None,
     given: Prior | None = None,
-) -> Parts[BatchResult]:
-    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit, in
-    parts.
+) -> BatchResult:
+    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit.
 
     ``given`` is the prior at the first pose; it is left out once the poses contradict it.
     """
@@ -291,25 +289,20 @@ def batch_estimate(
     points = normal_points(poses, start, factors * np.sqrt(levels.slack))
     first, rejected = last is None, last is not None and last.prior_rejected
     noise, slack = (levels.torque, levels.force), levels.slack
-    fitted = yield from fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
+    fitted = fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
     if given is not None and not rejected:
-        joint = yield from fit(
-            points, start, given, rules, factors, robust_start=first, slack=slack
-        )
+        joint = fit(points, start, given, rules, factors, robust_start=first, slack=slack)
         rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
-    yield fitted.steps * len(points)
     problem = Problem(points, prior, factors, fitted.chart, slack)
-    found = yield from covariance_of(problem, fitted, rules)
+    found = covariance_of(problem, fitted, rules)
     problem.core.linearise(fitted.chart.flat)
     spread, inflation = sandwich(problem, points, levels)
     now_ns = fixes[-1].scan_ns
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
     unseen = unseen_torque(problem, after_s) if params.torque_noise_radps15 is None else None
     latest = poses.latest(LATEST, after_s)
-    components = yield from final_mixture(
-        found, problem, latest, noise, now_ns, after_s, spread, unseen
-    )
+    components = final_mixture(found, problem, latest, noise, now_ns, after_s, spread, unseen)
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
@@ -345,9 +338,8 @@ def improved_levels(
     params: EstimatorParams,
     levels: NoiseLevels,
     positions: PositionRows | None = None,
-) -> Parts[NoiseLevels]:
-    """Noise levels from the residuals of the poses but those with gross errors, which are no noise,
-    in parts.
+) -> NoiseLevels:
+    """Noise levels from the residuals of the poses but those with gross errors, which are no noise.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -368,12 +360,11 @@ def improved_levels(
         problem = Problem(
             points, prior, factors, chart, np.inf
         )  # residuals with disturbances have the weight 1
-        yield from problem.descended(_LEVEL_STEPS, _LEVEL_TOL)
+        problem.core.descend(_LEVEL_STEPS, _LEVEL_TOL)
         chart = problem.chart
     problem.core.linearise(chart.flat)
-    yield BUDGET
     claimed = params.adapt is Adaptation.OFF
-    found = yield from estimate_levels(
+    found = estimate_levels(
         points, problem, levels, claimed, params.disturbances, positions=positions
     )
     return replace(found, count=pose_count(fixes))

@@ -45,7 +45,6 @@ from avsreplay.estimate.dynamics import propagate_state, torque_density
 from avsreplay.estimate.error_state import RHO, VEL, W
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.normal_points import PositionRows, error_parts
-from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 MOST_NORMAL_POINTS = 24  # normal points of an estimate
@@ -146,9 +145,9 @@ def estimate_levels(
     fixed: tuple[float | None, float | None],
     others: tuple[Array, Array] | None = None,
     positions: PositionRows | None = None,
-) -> Parts[NoiseLevels]:
+) -> NoiseLevels:
     """Improve variance components by a bounded number of steps, from those of an estimate with
-    fewer poses, in parts.
+    fewer poses.
 
     Args:
         points: normal points, at most ``MOST_NORMAL_POINTS``.
@@ -170,7 +169,6 @@ def estimate_levels(
     data = data if others is None else _extended(data, *others)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
         theta = _improved(theta, open_, parts, data, points)
-        yield n**3 // 40
     likely = theta.copy()
     found: dict[int, tuple[Marginal, Present]] = {}
     for k in (k for k in (4, 5) if open_[k]):
@@ -181,7 +179,6 @@ def estimate_levels(
                 _of_impulses(k - 4, likely, parts, data),
                 parts.present[k - 4],
             )
-        yield n**3 // 40
     for k, each in found.items():
         beside = found[9 - k][0].evidence if 9 - k in found else 0.0
         theta[k] = density_in_use(*each, probability_beside(beside)) ** 2

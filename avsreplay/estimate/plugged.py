@@ -27,6 +27,7 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.noise import Noise
 from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
 from avsreplay.estimate.plugin import Context, Method, load_method
+from avsreplay.estimate.reference import FittedMotion, GramianRows
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.parts import ESTIMATORS, OWN, PRINTED
@@ -157,19 +158,16 @@ class PluggedEstimator:
         """Covariance (6, 6) of the pose of {C}, see ``Estimator.pose_covariance``."""
         return _motion.pose_covariance(belief.P, measurement_jacobian(belief.x))
 
-    def refitted_rows(self, track: Track) -> None:
-        """None: there is no fit along whose trajectory the Gramian would be formed anew."""
-
-    def gramian_row(
+    def gramian_rows(
         self,
         track: Track,  # noqa: ARG002
         prediction: Prediction,
         innovation: Innovation | None,
-        last: object,  # noqa: ARG002
-    ) -> tuple[None, tuple[Array, Array, Array | None, bool]]:
-        """Phi (20, 20), H (6, 20) and R (6, 6) of a scan, None where its pose was not used."""
+        last: FittedMotion | None,
+    ) -> GramianRows:
+        """What a scan gives to the observability Gramian, see ``Estimator.gramian_rows``."""
         R = None if innovation is None else innovation.R
-        return None, (prediction.Phi, prediction.H, R, False)
+        return GramianRows(last, False, prediction.Phi, prediction.H, R)
 
     def residual_after(
         self,

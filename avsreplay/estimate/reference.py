@@ -16,7 +16,6 @@ from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Track
-from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 
@@ -99,6 +98,26 @@ class FittedMotion:
         return replace(self, t_ns=t_ns, x=x), Phi
 
 
+@value_class
+class GramianRows:
+    """What a scan gives to the observability Gramian.
+
+    Attributes:
+        motion: of the fit that the Gramian follows, at the scan; None before a fit.
+        anew: the Gramian begins anew along this motion.
+        Phi: (20, 20) transition from the last scan; ``anew``: from the epoch of the motion.
+        H: (6, 20) of the scan; ``anew``: H Phi (n, 6, 20) of all poses of the fit.
+        R: (6, 6) their noise, as the registration claims it, None where the pose was not used;
+            ``anew``: (n, 6, 6).
+    """
+
+    motion: FittedMotion | None
+    anew: bool
+    Phi: Array
+    H: Array
+    R: Array | None
+
+
 def rows_along(motion: FittedMotion, fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
     """H Phi of poses along one motion, for the observability Gramian.
 
@@ -143,10 +162,8 @@ def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> BatchFit:
     prior, rules = weak_prior(poses, params), FitParams(max_steps=60)
     chart = start
     for count in _windows(poses, start):
-        chart = whole(
-            fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False))
-        ).chart
-    return whole(fit(poses, chart, prior, rules))
+        chart = fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False)).chart
+    return fit(poses, chart, prior, rules)
 
 
 def _windows(poses: Poses, start: Chart) -> list[int]:

@@ -18,7 +18,6 @@ from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
-from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
@@ -132,7 +131,6 @@ class Track:
             last test for one.
         levels: noise levels estimated so far.
         unlevelled: healthy poses since the last estimate of them.
-        fitting, testing: a fit and a test that are spread over scans, None where none is under way.
         undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so
             far determines, each as large as half the extent: 1 sigma.
         change_probability, change_P: of a change of the velocities in the last scans, and what it
@@ -168,8 +166,6 @@ class Track:
     untested: int = 0
     levels: NoiseLevels = NO_LEVELS
     unlevelled: int = 0
-    fitting: Computation | None = None
-    testing: Computation | None = None
     undetermined: Array = field(default_factory=lambda: _NO_MOTION)
     change_probability: float = 0.0
     change_P: Array = field(default_factory=lambda: NO_CHANGE)
@@ -257,9 +253,7 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
         replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes
     )
     belief = replace(track.belief, x=x)
-    anew = track.changed(
-        belief=belief, fixes=fixes, older=(), mode="start", batch=None, fitting=None, testing=None
-    )
+    anew = track.changed(belief=belief, fixes=fixes, older=(), mode="start", batch=None)
     return anew.changed(recent=(), doubtful=(), bias=None)
 
 

@@ -82,9 +82,7 @@ def gramian(prior_1s: Array) -> Gramian:
     return Gramian(zero, zero, np.eye(scale.size), scale)
 
 
-def observe(
-    state: Gramian, Phi: Array, H: Array, R: Array | None, from_first: bool = False
-) -> Gramian:
+def observe(state: Gramian, Phi: Array, H: Array, R: Array | None) -> Gramian:
     """Return the Gramian after one more scan: Phi_k0 = Phi Phi_k-1,0, and H Phi_k0 is added for a
     healthy scan.
 
@@ -93,9 +91,8 @@ def observe(
         Phi: (n, n) transition from the last scan.
         H: (m, n) measurement Jacobian.
         R: (m, m) measurement noise, None for a faulty scan.
-        from_first: ``Phi`` begins at the first scan instead of the last one.
     """
-    Phi_k0 = Phi if from_first else Phi @ state.Phi_k0
+    Phi_k0 = Phi @ state.Phi_k0
     if R is None:
         return Gramian(state.root, state.white, Phi_k0, state.scale)
     return _added(state, (H @ Phi_k0)[None], R[None], Phi_k0)

@@ -15,8 +15,9 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ def read(path: Path, checksum: Checksum) -> NDArray[np.uint8] | None:
     return payload if whole else None
 
 
-def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
+def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, NDArray[Any]]:
     """Return the arrays that ``write_arrays`` wrote by their names; none without a complete,
     unchanged file.
     """
@@ -110,7 +111,7 @@ def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
         return {}
 
 
-def write_arrays(path: Path | None, arrays: dict[str, Array], checksum: Checksum) -> None:
+def write_arrays(path: Path | None, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
     """Write arrays to a file where there is a path; the same arrays give the same bytes."""
     if path is not None:
         out = io.BytesIO()

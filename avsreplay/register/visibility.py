@@ -41,7 +41,7 @@ FRONT = 1
 BACK = 2
 BOTH = 3
 CENTROID_CELL = 0.02  # of the image in which the nearest points are seen, over the extent
-SIDES_VERSION = 1  # of the rule for the sides of open parts, for the cache
+SIDES_VERSION = 2  # of the rule for the sides of open parts, for the cache
 
 
 class Visibility:
@@ -199,11 +199,6 @@ def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface
         The surface, and whether the outer sides of its faces are known: a closed surface encloses a
         positive volume; of one with openings enough is seen from one side only.
     """
-    distinct, part = mesh.open_parts(surface.vertices, surface.faces)
-    if not (part >= 0).any():
-        return surface, mesh.signed_volume(surface.vertices, surface.faces) > 0.0
-    faces = surface.faces[distinct]
-    closed, opened = faces[part < 0], faces[part >= 0]
     kernel, path = kernel_module(), None
     if cache_dir is not None:
         layout = f"{kernel.LAYOUT} sides {SIDES_VERSION}"
@@ -211,16 +206,25 @@ def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface
             cache_dir, layout, surface.vertices, surface.faces, surface.extent
         )
     kept = index_cache.read_arrays(path, kernel.checksum)
-    if "sides" not in kept:
-        kept["sides"] = _sides(replace(surface, faces=faces), opened, part[part >= 0])
+    if "faces" not in kept:
+        faces, known = _towards_cameras(surface)
+        kept = {"faces": faces, "known": np.array([float(known)])}
         index_cache.write_arrays(path, kept, kernel.checksum)
-    sides = kept["sides"]
+    return replace(surface, faces=kept["faces"]), bool(kept["known"][0])
+
+
+def _towards_cameras(surface: Surface) -> tuple[NDArray[np.int32], bool]:
+    """The faces and whether their outer sides are known, as ``seen_sides`` returns them."""
+    distinct, part = mesh.open_parts(surface.vertices, surface.faces)
+    if not (part >= 0).any():
+        return surface.faces, mesh.signed_volume(surface.vertices, surface.faces) > 0.0
+    faces = surface.faces[distinct]
+    closed, opened = faces[part < 0], faces[part >= 0]
+    sides = _sides(replace(surface, faces=faces), opened, part[part >= 0])
     wound = np.concatenate([closed, opened[sides != BACK], opened[sides != FRONT][:, ::-1]])
     area = np.linalg.norm(mesh.normals(surface.vertices, faces), axis=1)
     both = area[part >= 0][sides == BOTH].sum()
-    return replace(surface, faces=np.ascontiguousarray(wound)), bool(
-        both <= (1.0 - LEAST_ONE_SIDED) * area.sum()
-    )
+    return np.ascontiguousarray(wound), bool(both <= (1.0 - LEAST_ONE_SIDED) * area.sum())
 
 
 def _sides(

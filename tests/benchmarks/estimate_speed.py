@@ -40,7 +40,6 @@ from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.estimate.work import whole
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyParams,
@@ -114,7 +113,7 @@ def audit_ms(scans: int) -> tuple[float, float]:
     """
     estimator, track, _, _ = tracked(EstimatorParams(start=Start.NEAR), scans)
     due = replace(track, since=len(track.fixes))
-    whole = 1e3 * least(lambda: estimator.batch.check_against_batch(due), 1)
+    whole = 1e3 * least(lambda: estimator.batch.checked(due), 1)
     return whole, whole / max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
 
 
@@ -135,7 +134,7 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
     )
     once = least(lambda: rotation_history(world.states[0], world.times), 2)
     begun = time.process_time()
-    fitted = whole(fit(poses, start, prior, FitParams()))
+    fitted = fit(poses, start, prior, FitParams())
     off = float(
         geometry.angle(
             geometry.multiply(geometry.conjugate(fitted.x.T_ac.q), world.states[0].T_ac.q)

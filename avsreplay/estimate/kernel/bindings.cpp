@@ -486,12 +486,12 @@ nb::tuple residuals(const Problem& self, const Flat& at) {
   return nb::make_tuple(cost, misfit, out);
 }
 
-nb::tuple descend(Problem& self, int most, double gain_tol, bool go_on) {
+nb::tuple descend(Problem& self, int most, double gain_tol) {
   int steps = 0;
   bool done;
   {
     nb::gil_scoped_release release;
-    done = self.descend(most, gain_tol, steps, go_on);
+    done = self.descend(most, gain_tol, steps);
   }
   return nb::make_tuple(steps, done);
 }
@@ -857,7 +857,7 @@ NB_MODULE(_motion, m) {
       .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"), nb::arg("gate"))
       .def("linearise", [](Problem& self, const Flat& at) { self.linearise(chart(at)); }, nb::arg("chart"))
       .def("residuals", &residuals, nb::arg("chart"))
-      .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"), nb::arg("go_on") = false)
+      .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"))
       .def("normal", &normal)
       .def("rows", &rows)
       .def("absorbed", &absorbed, nb::arg("P"))

@@ -370,9 +370,8 @@ bool Problem::bent(const Square M, const Square A, double step[DIM], std::vector
   return sizes[1] <= MOST_BENT * sizes[0];
 }
 
-bool Problem::descend(int most, double gain_tol, int& steps, bool go_on) {
-  double& damping = next_damping;
-  if (!go_on) damping = 1e-3;
+bool Problem::descend(int most, double gain_tol, int& steps) {
+  double damping = 1e-3;
   Square A, M;
   double b[DIM], step[DIM];
   std::vector<double> trial(d.size());

@@ -53,7 +53,6 @@ class Problem {
   Chart at;
   double cost;
   std::vector<double> d, weights;  // residuals (n, 6), M-estimator weights (n)
-  double next_damping = 0;  // of a descent that goes on
   std::vector<double> J, Ju;  // (n, 6, 20) by the error states at the epoch; (n, 6, 7) by the acceleration and its onset
   Square T;  // error states by chart steps
 
@@ -68,8 +67,7 @@ class Problem {
   // Residual and Jacobian (by the error states at the epoch) of a pose, of unit variance.
   void whitened(size_t k, double e[SEEN], Rows H) const;
   // Levenberg-Marquardt from the present linearisation; returns whether the stopping rule was met within `most` steps.
-  // `go_on`: with the damping of the last step, as one descent of more steps would.
-  bool descend(int most, double gain_tol, int& steps, bool go_on);
+  bool descend(int most, double gain_tol, int& steps);
   // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
   void absorbed(const Square P, double out[2]) const;
   // Kalman pass over the poses with process noise since an instant [s], from y and P in N = 20 chart steps, or in 27 unknowns
