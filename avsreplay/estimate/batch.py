@@ -107,6 +107,11 @@ class Poses:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    @property
+    def core(self) -> _motion.Poses:
+        """The poses, as the extension takes them."""
+        return _motion.Poses(times=self.times_s, q=self.q, t=self.t, root=self.root, info=self.info)
+
     def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
         """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where
         ``problem`` is linearised.
@@ -264,10 +269,7 @@ class Problem:
         slack: float = 1.0,
     ) -> None:
         self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
-        core = _motion.Problem(
-            poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info
-        )
-        self.core = core
+        core = self.core = _motion.Problem(poses.core, prior.mean.flat, prior.info)
         follow_orbit(core, poses)
         self.reweigh(factors)
         if start is not None:
