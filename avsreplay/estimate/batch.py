@@ -290,19 +290,16 @@ class Problem:
         """Half chi-square of the poses alone."""
         return self.core.residuals(chart.flat)[1]
 
-    def pinned(
-        self, start: Chart, params: FitParams, pin: Pin, most: int
-    ) -> tuple[Chart, Array, int]:
+    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> tuple[Chart, Array]:
         """The fit from ``start`` with one direction fixed.
 
         Returns:
-            Its chart, its covariance (20, 20) in the chart, and the number of steps, at most
-            ``most``.
+            Its chart and its covariance (20, 20) in the chart, after at most ``most`` steps.
         """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
-        steps, _ = self.core.descend(most, max(params.gain_tol, _PIN_TOL))
-        found = self.chart, self.covariance, steps
+        self.core.descend(most, max(params.gain_tol, _PIN_TOL))
+        found = self.chart, self.covariance
         self.core.unpin()
         return found
 
