@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.aliasing import Turns, in_words, two_rates
 from avsreplay.config import Guess
 from avsreplay.errors import value_class
 from avsreplay.estimate import Prediction, Track, after_change, in_doubt
@@ -29,7 +30,6 @@ from avsreplay.estimate.reference import FittedMotion
 from avsreplay.estimate.scan_duration import deskew, with_scan_duration
 from avsreplay.estimate.track import moves
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.aliasing import Turns, in_words, two_rates
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyTrack,

@@ -540,7 +540,7 @@ def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others()
     row[12] = 1.0
     shift = 2.0 * np.sqrt(fitted.P_chart[12, 12])
     problem = Problem(poses, prior, fitted.effective)
-    held, _, _ = problem.pinned(
+    held, _ = problem.pinned(
         fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift), 40
     )
     assert held.minus(fitted.chart)[12] == pytest.approx(shift, rel=0.02)

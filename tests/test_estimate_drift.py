@@ -308,7 +308,7 @@ def test_the_derivatives_along_the_motion_are_those_of_differences() -> None:
     prior = Prior(chart, np.eye(20))
 
     def residuals(step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        where = poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info
+        where = poses.core, prior.mean.flat, prior.info
         core = _motion.Driven(*where, onset_s + step[26], np.ones(6))
         core.linearise(chart.moved(step[:20]).flat, u + step[20:26])
         return core.rows()

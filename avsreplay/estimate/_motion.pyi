@@ -1,6 +1,9 @@
+from typing import TypedDict
+
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.estimate.events.linear import LinearModel
 from avsreplay.geometry import Array
 
 def follow(
@@ -53,9 +56,7 @@ def forecast(
     times: Array,
 ) -> Array: ...
 def mixture_forecast(
-    charts: Array,
-    references: Array,
-    P: Array,
+    mixture: Mixture,
     weights: Array,
     torque: Array,
     published: Array,
@@ -90,40 +91,10 @@ def transition(chart: Array, h: float, path: Array) -> tuple[Array, Array]: ...
 def chains(
     charts: Array, steps: Array, counts: NDArray[np.int64], paths: Array
 ) -> tuple[Array, Array]: ...
-def passes(
-    F: Array,
-    b: Array,
-    Q: Array,
-    z: Array,
-    H: Array,
-    R: Array,
-    used: NDArray[np.bool_],
-    m0: Array,
-    P0: Array,
-) -> tuple[float, Array, Array, Array, Array, Array, Array]: ...
-def carry(
-    charts: Array,
-    references: Array,
-    P: Array,
-    h: float,
-    path: Array,
-    torque: float,
-    force: float,
-    q: Array,
-    t: Array,
-    root: Array,
-    factors: tuple[float, float],
-    weight: float,
-) -> tuple[Array, Array, Array, Array]: ...
+def passes(model: LinearModel) -> Passes: ...
+def carry(mixture: Mixture, step: Step, seen: Weighed) -> tuple[Mixture, Array]: ...
 def without_drift(
-    chart: Array,
-    u: Array,
-    onset: float,
-    times: Array,
-    centre: Array,
-    q: Array,
-    t: Array,
-    back: bool,
+    chart: Array, u: Array, onset: float, poses: Poses, centre: Array, back: bool
 ) -> tuple[Array, Array]: ...
 def corrected_poses(
     x: Array, attitude: Array, centre: Array, error: Array, moved: Array
@@ -153,25 +124,49 @@ def propagate(
     torque: tuple[float, float, float],
     force: float,
 ) -> tuple[Array, Array, Array]: ...
-def nees(
-    x: Array,
-    truth: Array,
-    P: Array,
-    R_nb: Array,
-    q_bn: Array,
-) -> tuple[int, float, float, list[float]]: ...
+def nees(x: Array, truth: Array, P: Array, R_nb: Array, q_bn: Array) -> Errors: ...
+
+class Errors:
+    @property
+    def best(self) -> int: ...
+    @property
+    def size(self) -> float: ...
+    @property
+    def chart(self) -> float: ...
+    @property
+    def block(self) -> list[float]: ...
+
+class Passes(TypedDict):
+    log_likelihood: float
+    before: Array
+    before_P: Array
+    score: Array
+    information: Array
+    error: Array
+    weight: Array
+
+class Mixture:
+    def __init__(self, charts: Array, references: Array, P: Array) -> None: ...
+    @property
+    def charts(self) -> Array: ...
+    @property
+    def references(self) -> Array: ...
+    @property
+    def P(self) -> Array: ...
+
+class Step:
+    def __init__(self, h: float, path: Array, torque: float, force: float) -> None: ...
+
+class Weighed:
+    def __init__(
+        self, q: Array, t: Array, root: Array, factors: tuple[float, float], weight: float
+    ) -> None: ...
+
+class Poses:
+    def __init__(self, times: Array, q: Array, t: Array, root: Array, info: Array) -> None: ...
 
 class Problem:
-    def __init__(
-        self,
-        times: Array,
-        q: Array,
-        t: Array,
-        root: Array,
-        info: Array,
-        mean: Array,
-        prior_info: Array,
-    ) -> None: ...
+    def __init__(self, poses: Poses, mean: Array, prior_info: Array) -> None: ...
     def paths(self, paths: Array) -> None: ...
     def pin(self, centre: Array, row: Array, target: float, one_sigma: float) -> None: ...
     def unpin(self) -> None: ...
@@ -202,16 +197,7 @@ class Problem:
 
 class Driven(Problem):
     def __init__(
-        self,
-        times: Array,
-        q: Array,
-        t: Array,
-        root: Array,
-        info: Array,
-        mean: Array,
-        prior_info: Array,
-        onset: float,
-        widths: Array,
+        self, poses: Poses, mean: Array, prior_info: Array, onset: float, widths: Array
     ) -> None: ...
     def measure(self, row: Array, target: float) -> None: ...
     def linearise(self, chart: Array, u: Array) -> None: ...  # type: ignore[override]

@@ -107,6 +107,11 @@ class Poses:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    @property
+    def core(self) -> _motion.Poses:
+        """The poses, as the extension takes them."""
+        return _motion.Poses(times=self.times_s, q=self.q, t=self.t, root=self.root, info=self.info)
+
     def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
         """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where
         ``problem`` is linearised.
@@ -264,10 +269,7 @@ class Problem:
         slack: float = 1.0,
     ) -> None:
         self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
-        core = _motion.Problem(
-            poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info
-        )
-        self.core = core
+        core = self.core = _motion.Problem(poses.core, prior.mean.flat, prior.info)
         follow_orbit(core, poses)
         self.reweigh(factors)
         if start is not None:
@@ -288,19 +290,16 @@ class Problem:
         """Half chi-square of the poses alone."""
         return self.core.residuals(chart.flat)[1]
 
-    def pinned(
-        self, start: Chart, params: FitParams, pin: Pin, most: int
-    ) -> tuple[Chart, Array, int]:
+    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> tuple[Chart, Array]:
         """The fit from ``start`` with one direction fixed.
 
         Returns:
-            Its chart, its covariance (20, 20) in the chart, and the number of steps, at most
-            ``most``.
+            Its chart and its covariance (20, 20) in the chart, after at most ``most`` steps.
         """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
-        steps, _ = self.core.descend(most, max(params.gain_tol, _PIN_TOL))
-        found = self.chart, self.covariance, steps
+        self.core.descend(most, max(params.gain_tol, _PIN_TOL))
+        found = self.chart, self.covariance
         self.core.unpin()
         return found
 

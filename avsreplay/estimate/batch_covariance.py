@@ -29,7 +29,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents
-from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
+from avsreplay.estimate.dynamics import MOST_RAD, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, ROUNDING, definite
 from avsreplay.estimate.mixture import Component, volumes
 from avsreplay.estimate.noise import cholesky_root
@@ -47,10 +47,7 @@ _LEAST_NODE2 = 3.0  # square of the distance of the profile fits of at most thre
 _TRIAL = 2.0
 _TRIES = 6
 _LOST = 3.0
-# budget of a fit with one direction fixed, and least budget of all of them
-_PINNED_FIT_STEPS = 15
-_FEWEST_STEPS = 40
-_PIN_WORK = 12_000  # budget of all of them in steps times poses and pieces
+_PINNED_FIT_STEPS = 15  # of a fit with one direction fixed
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _LINEAR_RAD = 0.05
@@ -121,12 +118,11 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
         if _non_gaussian(problem, fitted, params, axis)
     ]
     node2 = max(_LEAST_NODE2, float(len(bent)))
-    directions, others, left = [], False, _affordable_steps(problem, fitted)
+    directions, others = [], False
     for axis, row in bent:  # row @ axis = 1
         points = []
         for side in (math.sqrt(node2), -math.sqrt(node2)):
-            point, steps = _profile(problem, fitted, params, axis, row, side, left)
-            left -= steps
+            point = _profile(problem, fitted, params, axis, row, side)
             if point is None:
                 others = True  # this direction keeps the covariance of the fit
                 break
@@ -134,14 +130,6 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
         else:
             directions.append(NonGaussianDirection(row, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions), others, node2)
-
-
-def _affordable_steps(problem: Problem, fitted: BatchFit) -> int:
-    """Steps of the fits with one direction fixed; a step passes all poses, and the rotation
-    between them in pieces.
-    """
-    turned = float(np.linalg.norm(fitted.chart.w_c)) * float(np.ptp(problem.poses.times_s))
-    return max(_FEWEST_STEPS, int(_PIN_WORK / (len(problem.poses) + turned / SUBSTEP_RAD)))
 
 
 def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: Array) -> bool:
@@ -154,28 +142,19 @@ def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: A
 
 
 def _profile(
-    problem: Problem,
-    fitted: BatchFit,
-    params: FitParams,
-    axis: Array,
-    row: Array,
-    side: float,
-    most: int,
-) -> tuple[ProfilePoint | None, int]:
+    problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float
+) -> ProfilePoint | None:
     """The fit with the direction fixed where the cost has risen by side^2 / 2, the best of
     ``_TRIES`` from ``side`` on.
 
     A fit that ends far above that begins again nearer to the minimum: it did not follow the valley
-    of the cost. The result is None if no fit came near within ``most`` steps, because its
-    covariance would not be that of a point in the valley. The number of steps is returned as well.
+    of the cost. The result is None if no fit came near, because its covariance would not be that of
+    a point in the valley.
     """
-    there, found, spent, wanted = fitted.chart.moved(side * axis), [], 0, 0.5 * side**2
+    there, found, wanted = fitted.chart.moved(side * axis), [], 0.5 * side**2
     for _ in range(_TRIES):
-        if spent >= most:
-            break
         pin = Pin(fitted.chart, row, side, _PIN_1S)
-        there, P, steps = problem.pinned(there, params, pin, min(_PINNED_FIT_STEPS, most - spent))
-        spent += steps
+        there, P = problem.pinned(there, params, pin, _PINNED_FIT_STEPS)
         rise = problem.cost(there) - fitted.half_chi2
         found.append((abs(float(np.log(max(rise, 1e-9) / wanted))), ProfilePoint(there, P, pin)))
         if abs(rise - wanted) < 0.2 * wanted:
@@ -184,7 +163,7 @@ def _profile(
         if rise > _LOST * wanted:
             there = fitted.chart.moved(side * axis)
     near = [f for f in found if f[0] < float(np.log(_LOST))]
-    return (min(near, key=lambda f: f[0])[1] if near else None), spent
+    return min(near, key=lambda f: f[0])[1] if near else None
 
 
 def sandwich(

@@ -16,6 +16,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from avsreplay.aliasing import COMPARED_POSES, is_shown
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
@@ -51,8 +52,6 @@ MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does no
 FEWEST_TO_CHECK = 50
 CHECK_GROWTH = 0.25
 FEWEST_WITH_OUTLIERS = 10
-_UNSEEN_TURN_RAD = 12.0  # turn between two scans that no estimate has: poses cannot show it
-_LATEST_POSES = 5  # poses of which the least interval counts
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 # largest age of a given start over the fit's memory; until then disturbances change it little
 _RECENT = 0.1
@@ -217,16 +216,13 @@ class BatchSchedule:
         return track.changed(since=0)
 
     def resolved(self, track: Track) -> Track:
-        """The track, begun anew from its last poses where it turns faster than poses can show.
+        """The track, begun anew from its last poses where it turns faster than they can show.
 
         A fit to poses with far larger errors than stated may diverge, and its motion cannot be
         predicted.
         """
-        stamps = [fix.t_ns for fix in track.fixes[-_LATEST_POSES:]]
-        if len(stamps) < 2:
-            return track
-        turn = float(np.linalg.norm(track.belief.x.w_b)) * float(np.diff(stamps).min()) * 1e-9
-        if turn <= _UNSEEN_TURN_RAD:
+        stamps = [fix.t_ns for fix in track.fixes[-COMPARED_POSES:]]
+        if is_shown(float(np.linalg.norm(track.belief.x.w_b)), stamps):
             return track
         fixes = track.fixes[1 - FEWEST_TO_FIT :]
         return Track(

@@ -226,8 +226,8 @@ def nearest_permutation(estimate: Belief, truth: State) -> tuple[State, float]:
     Where the covariance is singular, the permutation is the nearest by the variances, and the NEES
     is their sum.
     """
-    best, size, _, _ = _compared(estimate, truth)
-    return permute_axes(truth, AXIS_PERMUTATIONS[best]), size
+    found = _compared(estimate, truth)
+    return permute_axes(truth, AXIS_PERMUTATIONS[found.best]), found.size
 
 
 def nees(belief: Belief, truth: State) -> float:
@@ -238,7 +238,7 @@ def nees(belief: Belief, truth: State) -> float:
     are one smooth matrix, and what cannot be observed is only a direction with a large variance.
     NaN where the covariance is singular.
     """
-    return _compared(belief, truth)[2]
+    return _compared(belief, truth).chart
 
 
 def nees_by_block(belief: Belief, truth: State) -> tuple[float, dict[str, float]]:
@@ -252,13 +252,13 @@ def nees_by_block(belief: Belief, truth: State) -> tuple[float, dict[str, float]
         belief: the estimate and its covariance.
         truth: true state at the same instant.
     """
-    _, _, total, blocks = _compared(belief, truth)
-    return total, dict(zip(BLOCKS, blocks, strict=True))
+    found = _compared(belief, truth)
+    return found.chart, dict(zip(BLOCKS, found.block, strict=True))
 
 
-def _compared(belief: Belief, truth: State) -> tuple[int, float, float, list[float]]:
-    """Number of the nearest permutation, NEES of the error states in it, NEES in the chart, and
-    that of each block.
+def _compared(belief: Belief, truth: State) -> _motion.Errors:
+    """Number of the nearest permutation ``best``, NEES of the error states in it ``size``, NEES in
+    the ``chart``, and that of each ``block``.
     """
     return _motion.nees(belief.x.flat, truth.flat, belief.P, _R_NB, _Q_BN)
 

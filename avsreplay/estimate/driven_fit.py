@@ -140,8 +140,7 @@ def without_drift(
     ``back``: the inverse.
     """
     centre = translated(to_state(about), poses.times_s, poses.arc)[0]
-    motions = about.flat, u, onset_s, poses.times_s, centre
-    return poses.moved(*_motion.without_drift(*motions, poses.q, poses.t, back))
+    return poses.moved(*_motion.without_drift(about.flat, u, onset_s, poses.core, centre, back))
 
 
 def equivalents(

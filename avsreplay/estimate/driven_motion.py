@@ -115,10 +115,7 @@ def _joint(
     """The cost of initial values and an acceleration, with Huber's weights, or Cauchy's where
     ``slack`` is given.
     """
-    mean = prior.mean.flat
-    core = _motion.Driven(
-        seen.times_s, seen.q, seen.t, seen.root, seen.info, mean, prior.info, onset_s, widths
-    )
+    core = _motion.Driven(seen.core, prior.mean.flat, prior.info, onset_s, widths)
     follow_orbit(core, seen)
     core.noise((float(factors[0]), float(factors[1])), slack is not None, (slack or 1.0) * GATE)
     return core

@@ -23,7 +23,6 @@ from avsreplay.records import Belief, Forecast, Possible, State, Trajectory
 
 Triple = tuple[float, float, float]
 
-SUBSTEP_RAD = 0.2  # largest rotation of one Taylor series (SUBSTEP in motion.hpp)
 MOST_RAD = 2e4  # largest rotation of a single step [rad]; it takes a few seconds of processor time
 _I3 = np.eye(3)
 _I20 = np.eye(DIM)

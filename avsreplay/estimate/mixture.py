@@ -121,6 +121,17 @@ def volumes(P: Sequence[Array], rows: Sequence[Array]) -> Array:
     )
 
 
+def _along(components: tuple[Component, ...], references: list[Chart]) -> _motion.Mixture:
+    """The components as the extension takes them; ``references``: charts along which their
+    covariances are taken.
+    """
+    return _motion.Mixture(
+        charts=np.array([c.chart.flat for c in components]),
+        references=np.array([chart.flat for chart in references]),
+        P=np.array([c.P for c in components]),
+    )
+
+
 def carried(
     components: tuple[Component, ...],
     t_ns: int,
@@ -145,21 +156,14 @@ def carried(
         orbit: the relative orbit that the target is on; None for free motion.
     """
     h = (t_ns - components[0].t_ns) * 1e-9
-    charts, references, P, misfits = _motion.carry(
-        np.array([c.chart.flat for c in components]),
-        np.array([(c.reference or c.chart).flat for c in components]),
-        np.array([c.P for c in components]),
-        h,
-        translation(h, None if orbit is None else orbit.at(components[0].t_ns)),
-        noise[0],
-        noise[1] ** 2,
-        pose.q,
-        pose.t,
-        root,
-        (float(factors[0]), float(factors[1])),
-        weight,
+    path = translation(h, None if orbit is None else orbit.at(components[0].t_ns))
+    scale = float(factors[0]), float(factors[1])
+    after, misfits = _motion.carry(
+        _along(components, [c.reference or c.chart for c in components]),
+        _motion.Step(h=h, path=path, torque=noise[0], force=noise[1] ** 2),
+        _motion.Weighed(q=pose.q, t=pose.t, root=root, factors=scale, weight=weight),
     )
-    found = misfits.tolist()
+    charts, references, P, found = after.charts, after.references, after.P, misfits.tolist()
     # one of weight 0 keeps it, however well it explains the pose
     best = min(value for c, value in zip(components, found, strict=True) if c.weight > 0.0)
     weights = [
@@ -287,9 +291,7 @@ def mixture_forecast(
     if fastest * float(ahead.max(initial=0.0)) > MOST_RAD:
         return Forecast(times, *np.full((3, len(times)), np.inf))
     moments = _motion.mixture_forecast(
-        np.array([c.chart.flat for c in components]),
-        np.array([chart.flat for chart in about]),
-        np.array([c.P for c in components]),
+        _along(components, about),
         np.array([c.weight for c in components]),
         np.array([torque_density(to_state(chart).sigma, torque) for chart in about]),
         separated(published.chart, published.P).flat,

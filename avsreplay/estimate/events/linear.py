@@ -79,12 +79,11 @@ def passed(model: LinearModel) -> Passed:
         ArithmeticError: a covariance is not positive, because a motion that explains the poses was
             not found.
     """
-    m = model
     try:
-        found = _motion.passes(m.F, m.b, m.Q, m.z, m.H, m.R, m.used, m.m0, m.P0)
+        found = _motion.passes(model)
     except ValueError as error:
         raise ArithmeticError(str(error)) from None
-    return Passed(*found)
+    return Passed(**found)
 
 
 def shock_size(score: Array, information: Array, one_sigma: Array) -> tuple[Array, Array]:

@@ -410,15 +410,19 @@ Numpy body_numbers(const Flat& from, const Matrix<DIM, DIM>& P, double largest) 
   return out;
 }
 
-void fill(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
-            const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
-            const Matrix<DIM, DIM>& prior_info) {
+// Measured poses, as a fit takes them.
+struct Poses {
+  std::vector<Measured> each;
+};
+
+void create_poses(Poses* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
+                  const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info) {
   const size_t n = t.shape(0);
   if (q.shape(0) != n || p.shape(0) != n || root.shape(0) != n || info.shape(0) != n)
     throw std::invalid_argument("times, q, p, root and info must be equally many");
-  self->poses.resize(n);
+  std::vector<Measured>& poses = (new (self) Poses{std::vector<Measured>(n)})->each;
   for (size_t k = 0; k < n; ++k) {
-    Measured& pose = self->poses[k];
+    Measured& pose = poses[k];
     pose.t = t(k);
     pose.speed = {{{pose.t, 0, 0}, {0, pose.t, 0}, {0, 0, pose.t}}};
     std::memcpy(&pose.q, q.data() + 4 * k, sizeof pose.q);
@@ -426,21 +430,22 @@ void fill(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1
     std::memcpy(pose.root, root.data() + SEEN * SEEN * k, sizeof pose.root);
     std::memcpy(pose.info, info.data() + 18 * k, sizeof pose.info);
   }
-  self->mean = chart(mean);
-  std::memcpy(self->prior_info, prior_info.data(), sizeof self->prior_info);
 }
 
-void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
-            const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
-            const Matrix<DIM, DIM>& prior_info) {
-  fill(new (self) Problem(), t, q, p, root, info, mean, prior_info);
+void fill(Problem& self, const Poses& poses, const Flat& mean, const Matrix<DIM, DIM>& prior_info) {
+  self.poses = poses.each;
+  self.mean = chart(mean);
+  std::memcpy(self.prior_info, prior_info.data(), sizeof self.prior_info);
+}
+
+void create(Problem* self, const Poses& poses, const Flat& mean, const Matrix<DIM, DIM>& prior_info) {
+  fill(*new (self) Problem(), poses, mean, prior_info);
 }
 
 // An acceleration with a prior 1 sigma of zero is fixed at zero.
-void create_driven(Driven* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
-                   const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
-                   const Matrix<DIM, DIM>& prior_info, double onset, const Vector<SEEN>& widths) {
-  fill(new (self) Driven(), t, q, p, root, info, mean, prior_info);
+void create_driven(Driven* self, const Poses& poses, const Flat& mean, const Matrix<DIM, DIM>& prior_info, double onset,
+                   const Vector<SEEN>& widths) {
+  fill(*new (self) Driven(), poses, mean, prior_info);
   self->push.onset = onset;
   for (int k = 0; k < SEEN; ++k) {
     self->open[k] = widths(k) > 0;
@@ -575,10 +580,16 @@ nb::tuple chains(const Matrix<-1, CHART>& from, const Times& steps, const nb::nd
   return nb::make_tuple(nodes_, F_);
 }
 
-// The passes over a linear model in time; without `back` the likelihood and what is before each measurement only.
-nb::tuple passes(const Matrix<-1, -1, -1>& F, const Matrix<-1, -1>& b, const Matrix<-1, -1, -1>& Q, const Matrix<-1, 6>& z,
-                 const Matrix<-1, 6, -1>& H, const Matrix<-1, 6, 6>& R,
-                 const nb::ndarray<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>& used, const Times& m0, const Matrix<-1, -1>& P0) {
+// The passes over a linear model in time (events/linear.py), by the names of its attributes.
+nb::dict passes(const nb::object& given) {
+  const auto of = [&](const char* name) { return given.attr(name); };
+  const auto F = nb::cast<Matrix<-1, -1, -1>>(of("F")), Q = nb::cast<Matrix<-1, -1, -1>>(of("Q"));
+  const auto b = nb::cast<Matrix<-1, -1>>(of("b")), P0 = nb::cast<Matrix<-1, -1>>(of("P0"));
+  const auto z = nb::cast<Matrix<-1, 6>>(of("z"));
+  const auto H = nb::cast<Matrix<-1, 6, -1>>(of("H"));
+  const auto R = nb::cast<Matrix<-1, 6, 6>>(of("R"));
+  const auto used = nb::cast<nb::ndarray<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>>(of("used"));
+  const auto m0 = nb::cast<Times>(of("m0"));
   const size_t count = b.shape(0), n = b.shape(1);
   for (const auto* each : {&F, &Q})
     if (each->shape(0) != count || each->shape(1) != n || each->shape(2) != n) throw std::invalid_argument("a model in time has matrices (k, n, n)");
@@ -586,9 +597,10 @@ nb::tuple passes(const Matrix<-1, -1, -1>& F, const Matrix<-1, -1>& b, const Mat
       P0.shape(0) != n || P0.shape(1) != n)
     throw std::invalid_argument("the arrays of a model in time differ in length");
   TimePasses out{};
-  Numpy mean = array({count, n}, &out.mean), covariance = array({count, n, n}, &out.covariance);
-  Numpy score = array({count, n}, &out.score), information = array({count, n, n}, &out.information);
-  Numpy error = array({count, SEEN}, &out.error), weight = array({count, SEEN, SEEN}, &out.weight);
+  nb::dict found;
+  found["before"] = array({count, n}, &out.mean), found["before_P"] = array({count, n, n}, &out.covariance);
+  found["score"] = array({count, n}, &out.score), found["information"] = array({count, n, n}, &out.information);
+  found["error"] = array({count, SEEN}, &out.error), found["weight"] = array({count, SEEN, SEEN}, &out.weight);
   std::fill(out.error, out.error + count * SEEN, 0.0);
   std::fill(out.weight, out.weight + count * SEEN * SEEN, 0.0);
   const TimeModel model{count, n, F.data(), b.data(), Q.data(), z.data(), H.data(), R.data(), m0.data(), P0.data(), used.data()};
@@ -596,38 +608,39 @@ nb::tuple passes(const Matrix<-1, -1, -1>& F, const Matrix<-1, -1>& b, const Mat
     nb::gil_scoped_release free;
     pass_over(model, out);
   }
-  return nb::make_tuple(out.likelihood, mean, covariance, score, information, error, weight);
+  found["log_likelihood"] = out.likelihood;
+  return found;
 }
 
 // The poses (n) as they would be without an acceleration since an instant, or with it where `back`: turned and moved by
 // the difference of the two motions from a chart. `centre` is the centre of mass in free motion.
-nb::tuple without_drift(const Flat& from, const Vector<SEEN>& u, double onset, const Times& times, const Matrix<-1, 3>& centre,
-                        const Matrix<-1, 4>& q, const Matrix<-1, 3>& p, bool back) {
-  const size_t n = times.shape(0);
-  if (centre.shape(0) != n || q.shape(0) != n || p.shape(0) != n)
-    throw std::invalid_argument("times, centre, q and p must be equally many");
+nb::tuple without_drift(const Flat& from, const Vector<SEEN>& u, double onset, const Poses& seen, const Matrix<-1, 3>& centre,
+                        bool back) {
+  const std::vector<Measured>& poses = seen.each;
+  const size_t n = poses.size();
+  if (centre.shape(0) != n) throw std::invalid_argument("poses and centres must be equally many");
   double *turned, *moved, t = 0;
   Numpy qs = array({n, 4}, &turned), ps = array({n, 3}, &moved);
   const State x = state_of(chart(from));
   double join[3][2];
   Body body = body_of(x, join), driven = body;
   Turn free = turn_of(x), pushed = free;
-  for (size_t k = 0; k < n; t = times(k++)) {
-    advance(free, body, times(k) - t);
-    if (t <= onset && onset < times(k)) {
+  for (size_t k = 0; k < n; t = poses[k++].t) {
+    advance(free, body, poses[k].t - t);
+    if (t <= onset && onset < poses[k].t) {
       const V3 drive = matrix(quad(x.q_bc)) * vector(u.data());
       advance(pushed, driven, onset - t);
       std::memcpy(driven.drive, drive.x, sizeof driven.drive);
       t = onset;
     }
-    advance(pushed, driven, times(k) - t);
-    const double since = std::max(times(k) - onset, 0.0);
+    advance(pushed, driven, poses[k].t - t);
+    const double since = std::max(poses[k].t - onset, 0.0);
     V3 away = 0.5 * since * since * vector(u.data() + 3), to = vector(centre.data() + 3 * k), was = to + away;
     if (back) std::swap(to, was);
     Quad turn = quad(free.q) * conjugate(quad(pushed.q));
     if (back) turn = conjugate(turn);
-    const Quad seen = turn * quad(q.data() + 4 * k);
-    const V3 place = to + matrix(turn) * (vector(p.data() + 3 * k) - was);
+    const Quad seen = turn * poses[k].q;
+    const V3 place = to + matrix(turn) * (poses[k].p - was);
     std::memcpy(turned + 4 * k, &seen, sizeof seen);
     std::memcpy(moved + 3 * k, place.x, sizeof place.x);
   }
@@ -653,31 +666,71 @@ nb::tuple corrected_poses(const Mean& mean, const Matrix<-1, 4>& attitude, const
   return nb::make_tuple(qs, ps);
 }
 
-// Of the components of a mixture: charts, references and P (n, 20, 20) h seconds later and corrected by a pose, and the
-// chi-square of the pose with the log determinant of its covariance (n).
-nb::tuple carry_of(const Matrix<-1, CHART>& from, const Matrix<-1, CHART>& along, const Matrix<-1, DIM, DIM>& P0, double h,
-                   const Matrix<6, 6>& path, double torque, double force, const Vector<4>& q, const Vector<3>& p,
-                   const Matrix<SEEN, SEEN>& root, const Two& factors, double weight) {
-  const size_t n = from.shape(0);
-  if (along.shape(0) != n || P0.shape(0) != n) throw std::invalid_argument("charts and covariances must be equally many");
-  double *charts, *references, *P, *misfit, density[3], told[2];
-  Numpy first = array({n, (size_t)CHART}, &charts), second = array({n, (size_t)CHART}, &references);
-  Numpy third = array({n, (size_t)DIM, (size_t)DIM}, &P), last = array({n}, &misfit);
-  std::memcpy(charts, from.data(), n * sizeof(Chart));
-  std::memcpy(references, along.data(), n * sizeof(Chart));
-  std::memcpy(P, P0.data(), n * sizeof(Square));
-  Measured pose = {};
-  std::memcpy(&pose.q, q.data(), sizeof pose.q);
-  std::memcpy(&pose.p, p.data(), sizeof pose.p);
-  std::memcpy(pose.root, root.data(), sizeof pose.root);
+// Components of a mixture: charts, the charts along which their covariances P (n, 20, 20) are taken, and these.
+struct Mixture {
+  std::vector<Chart> charts, references;
+  std::vector<double> P;
+  Square& covariance(size_t k) { return *reinterpret_cast<Square*>(P.data() + DIM * DIM * k); }
+  size_t size() const { return charts.size(); }
+};
+
+void create_mixture(Mixture* self, const Matrix<-1, CHART>& charts, const Matrix<-1, CHART>& references,
+                    const Matrix<-1, DIM, DIM>& P) {
+  const size_t n = charts.shape(0);
+  if (references.shape(0) != n || P.shape(0) != n)
+    throw std::invalid_argument("charts and covariances must be equally many");
+  const Chart* first = reinterpret_cast<const Chart*>(charts.data());
+  const Chart* second = reinterpret_cast<const Chart*>(references.data());
+  new (self) Mixture{{first, first + n}, {second, second + n}, {P.data(), P.data() + DIM * DIM * n}};
+}
+
+Numpy flat(const std::vector<Chart>& from) {
+  double* to;
+  Numpy out = array({from.size(), (size_t)CHART}, &to);
+  std::memcpy(to, from.data(), from.size() * sizeof(Chart));
+  return out;
+}
+
+// A step of time h, over which `path` takes position and velocity of the centre of mass; root density of the torque, and
+// density of the force.
+struct Step {
+  double h, path[6][6], torque, force;
+};
+
+void create_step(Step* self, double h, const Matrix<6, 6>& path, double torque, double force) {
+  new (self) Step{h, {}, torque, force};
+  std::memcpy(self->path, path.data(), sizeof self->path);
+}
+
+// A pose, its factors on the standard deviations of attitude and position, and its Cauchy weight.
+struct Weighed {
+  Measured pose;
+  Two factors;
+  double weight;
+};
+
+void create_weighed(Weighed* self, const Vector<4>& q, const Vector<3>& p, const Matrix<SEEN, SEEN>& root, const Two& factors,
+                    double weight) {
+  new (self) Weighed{{}, factors, weight};
+  std::memcpy(&self->pose.q, q.data(), sizeof self->pose.q);
+  std::memcpy(&self->pose.p, p.data(), sizeof self->pose.p);
+  std::memcpy(self->pose.root, root.data(), sizeof self->pose.root);
+}
+
+// A mixture after a step of time and corrected by a pose there, and the chi-square of the pose with the log determinant of
+// its covariance (n).
+nb::tuple carry_of(const Mixture& mixture, const Step& step, const Weighed& seen) {
+  Mixture after = mixture;
+  const size_t n = after.size();
+  double *misfit, density[3], told[2];
+  Numpy misfits = array({n}, &misfit);
   for (size_t k = 0; k < n; ++k) {
-    Chart& one = reinterpret_cast<Chart*>(charts)[k];
-    torque_density(state_of(one), torque, density);
-    carry(one, reinterpret_cast<Chart*>(references)[k], reinterpret_cast<Square*>(P)[k], h,
-          as<double[6][6]>(path.data()), density, force, pose, factors.data(), weight, told);
+    torque_density(state_of(after.charts[k]), step.torque, density);
+    carry(after.charts[k], after.references[k], after.covariance(k), step.h, step.path, density, step.force, seen.pose,
+          seen.factors.data(), seen.weight, told);
     misfit[k] = told[0] + told[1];
   }
-  return nb::make_tuple(first, second, third, last);
+  return nb::make_tuple(std::move(after), misfits);
 }
 
 // Of covariances C (n, 6, 6): roots (n, 6, 6) with root C root' = 1, and the inverses (n, 2, 3, 3) of the diagonal blocks.
@@ -735,20 +788,18 @@ Numpy by_drive(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, con
 }
 
 // Per instant, of a mixture: second moments of position, velocity and half-angle attitude about the motion of a chart.
-Numpy mixture_forecast_of(const Matrix<-1, CHART>& charts, const Matrix<-1, CHART>& references,
-                          const Matrix<-1, DIM, DIM>& P, const Vector<-1>& weights, const Matrix<-1, 3>& torque,
+Numpy mixture_forecast_of(const Mixture& mixture, const Vector<-1>& weights, const Matrix<-1, 3>& torque,
                           const Flat& published, double force, const Times& times, const Three& origin) {
-  const size_t count = charts.shape(0), n = times.shape(0);
-  if (references.shape(0) != count || P.shape(0) != count || weights.shape(0) != count || torque.shape(0) != count)
-    throw std::invalid_argument("charts, covariances, weights and densities must be equally many");
+  const size_t count = mixture.size(), n = times.shape(0);
+  if (weights.shape(0) != count || torque.shape(0) != count)
+    throw std::invalid_argument("components, weights and densities must be equally many");
   double* moments;
   Numpy out = array({n, 3}, &moments);
   {
     nb::gil_scoped_release release;
-    mixture_forecast(reinterpret_cast<const Chart*>(charts.data()), reinterpret_cast<const Chart*>(references.data()),
-                     reinterpret_cast<const Square*>(P.data()), weights.data(),
-                     reinterpret_cast<const double(*)[3]>(torque.data()), count, chart(published), force, times.data(), n,
-                     V3{{origin[0], origin[1], origin[2]}}, reinterpret_cast<double(*)[3]>(moments));
+    mixture_forecast(mixture.charts.data(), mixture.references.data(), reinterpret_cast<const Square*>(mixture.P.data()),
+                     weights.data(), reinterpret_cast<const double(*)[3]>(torque.data()), count, chart(published), force,
+                     times.data(), n, V3{{origin[0], origin[1], origin[2]}}, reinterpret_cast<double(*)[3]>(moments));
   }
   return out;
 }
@@ -775,18 +826,15 @@ nb::tuple propagate_of(const Mean& mean, const Matrix<DIM, DIM>& P0, double h, c
   return nb::make_tuple(flat(x), made(Phi), made(P));
 }
 
-// Number of the nearest order of the truth's axes among R_nb, and NEES: of all states in that order, in the chart, by block.
-nb::tuple nees_of(const Mean& mean, const Mean& true_mean, const Matrix<DIM, DIM>& P,
+// The nearest order of the truth's axes among R_nb, and the NEES of a belief.
+Errors nees_of(const Mean& mean, const Mean& true_mean, const Matrix<DIM, DIM>& P,
                   const Matrix<-1, 3, 3>& R_nb, const Matrix<-1, 4>& q_bn) {
   if (!R_nb.shape(0) || q_bn.shape(0) != R_nb.shape(0))
     throw std::invalid_argument("rotations and quaternions must be equally many, one at least");
   const State x = state(mean);
   const State truth = state(true_mean);
-  const Errors found = errors_squared(truth, x, as<Square>(P.data()), reinterpret_cast<const M3*>(R_nb.data()),
-                                      reinterpret_cast<const Quad*>(q_bn.data()), (int)R_nb.shape(0));
-  std::array<double, BLOCK_COUNT> block;
-  std::copy(found.block, found.block + BLOCK_COUNT, block.begin());
-  return nb::make_tuple(found.best, found.size, found.chart, block);
+  return errors_squared(truth, x, as<Square>(P.data()), reinterpret_cast<const M3*>(R_nb.data()),
+                        reinterpret_cast<const Quad*>(q_bn.data()), (int)R_nb.shape(0));
 }
 
 }  // namespace
@@ -797,9 +845,8 @@ NB_MODULE(_motion, m) {
   m.def("correct", &correct_of, nb::arg("x"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"));
   m.def("forecast", &forecast_of, nb::arg("x"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
-  m.def("mixture_forecast", &mixture_forecast_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"),
-        nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"),
-        nb::arg("origin_c"));
+  m.def("mixture_forecast", &mixture_forecast_of, nb::arg("mixture"), nb::arg("weights"), nb::arg("torque"),
+        nb::arg("published"), nb::arg("force"), nb::arg("times"), nb::arg("origin_c"));
   m.def("innovation", &innovation_of, nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("R"));
   m.def("pose_jacobian", &pose_jacobian_of, nb::arg("x"));
   m.def("pose_covariance", &pose_covariance_of, nb::arg("P"), nb::arg("H"));
@@ -829,13 +876,19 @@ NB_MODULE(_motion, m) {
   m.def("errors", &errors, nb::arg("chart"));
   m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
   m.def("chains", &chains, nb::arg("charts"), nb::arg("steps"), nb::arg("counts"), nb::arg("paths"));
-  m.def("passes", &passes, nb::arg("F"), nb::arg("b"), nb::arg("Q"), nb::arg("z"), nb::arg("H"), nb::arg("R"), nb::arg("used"),
-        nb::arg("m0"), nb::arg("P0"));
+  m.def("passes", &passes, nb::arg("model"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
-  m.def("carry", &carry_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
-        nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
-  m.def("without_drift", &without_drift, nb::arg("chart"), nb::arg("u"), nb::arg("onset"), nb::arg("times"), nb::arg("centre"),
-        nb::arg("q"), nb::arg("t"), nb::arg("back"));
+  nb::class_<Mixture>(m, "Mixture")
+      .def("__init__", &create_mixture, nb::arg("charts"), nb::arg("references"), nb::arg("P"))
+      .def_prop_ro("charts", [](const Mixture& self) { return flat(self.charts); }, nb::rv_policy::move)
+      .def_prop_ro("references", [](const Mixture& self) { return flat(self.references); }, nb::rv_policy::move)
+      .def_prop_ro("P", [](const Mixture& self) { return copied(self.P, {self.size(), DIM, DIM}); }, nb::rv_policy::move);
+  nb::class_<Step>(m, "Step").def("__init__", &create_step, nb::arg("h"), nb::arg("path"), nb::arg("torque"), nb::arg("force"));
+  nb::class_<Weighed>(m, "Weighed")
+      .def("__init__", &create_weighed, nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
+  m.def("carry", &carry_of, nb::arg("mixture"), nb::arg("step"), nb::arg("seen"));
+  m.def("without_drift", &without_drift, nb::arg("chart"), nb::arg("u"), nb::arg("onset"), nb::arg("poses"), nb::arg("centre"),
+        nb::arg("back"));
   m.def("corrected_poses", &corrected_poses, nb::arg("x"), nb::arg("attitude"), nb::arg("centre"), nb::arg("error"),
         nb::arg("moved"));
   m.def("roots", &roots_of, nb::arg("C"));
@@ -846,11 +899,17 @@ NB_MODULE(_motion, m) {
   m.def("join", &join_of, nb::arg("charts"), nb::arg("P"), nb::arg("weights"), nb::arg("quadrature"));
   m.def("propagate", &propagate_of, nb::arg("x"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"));
+  nb::class_<Errors>(m, "Errors")
+      .def_ro("best", &Errors::best)
+      .def_ro("size", &Errors::size)
+      .def_ro("chart", &Errors::chart)
+      .def_prop_ro("block", [](const Errors& self) { return std::vector<double>(self.block, self.block + BLOCK_COUNT); });
   m.def("nees", &nees_of, nb::arg("x"), nb::arg("truth"), nb::arg("P"),
         nb::arg("R_nb"), nb::arg("q_bn"));
+  nb::class_<Poses>(m, "Poses")
+      .def("__init__", &create_poses, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"));
   nb::class_<Problem>(m, "Problem")
-      .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
-           nb::arg("mean"), nb::arg("prior_info"))
+      .def("__init__", &create, nb::arg("poses"), nb::arg("mean"), nb::arg("prior_info"))
       .def("paths", &set_paths, nb::arg("paths"))
       .def("pin", &set_pin, nb::arg("centre"), nb::arg("row"), nb::arg("target"), nb::arg("one_sigma"))
       .def("unpin", [](Problem& self) { self.pinned = false; })
@@ -868,8 +927,8 @@ NB_MODULE(_motion, m) {
       .def_prop_ro("d", [](const Problem& self) { return copied(self.d, {self.poses.size(), SEEN}); }, nb::rv_policy::move)
       .def_prop_ro("weights", [](const Problem& self) { return copied(self.weights, {self.poses.size()}); }, nb::rv_policy::move);
   nb::class_<Driven, Problem>(m, "Driven")
-      .def("__init__", &create_driven, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
-           nb::arg("mean"), nb::arg("prior_info"), nb::arg("onset"), nb::arg("widths"))
+      .def("__init__", &create_driven, nb::arg("poses"), nb::arg("mean"), nb::arg("prior_info"), nb::arg("onset"),
+           nb::arg("widths"))
       .def("measure", &set_row, nb::arg("row"), nb::arg("target"))
       .def("linearise", [](Driven& self, const Flat& at, const Vector<SEEN>& u) { self.linearise(chart(at), u.data()); },
            nb::arg("chart"), nb::arg("u"))

@@ -6,7 +6,7 @@
 
 namespace avs {
 
-constexpr double LEAST_GAP = 1e-4;  // as in chart.py
+constexpr double LEAST_GAP = 1e-4;
 constexpr int NEXT[3] = {1, 2, 0}, LAST[3] = {2, 0, 1};
 
 struct V3 {

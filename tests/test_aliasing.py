@@ -6,7 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay import geometry
-from avsreplay.monitor.aliasing import COMPARED_POSES, LEAST_TURNS, Turns, in_words, two_rates
+from avsreplay.aliasing import (
+    COMPARED_POSES,
+    LEAST_TURNS,
+    Turns,
+    in_words,
+    is_shown,
+    two_rates,
+)
 
 
 def poses(spans, rate, axis=(0.0, 0.6, 0.8)):
@@ -55,3 +62,15 @@ def test_a_few_poses_and_poses_at_random_show_no_rate():
         q = rng.normal(size=4)
         turns = turns.after(k * 500_000_000, q / np.linalg.norm(q))
     assert two_rates(turns) is None
+
+
+def test_the_faster_of_two_rates_is_shown_and_no_rate_beyond():
+    """Turns of 2.1 rad at 2 Hz: 4.2 and 8.37 rad/s; a repeated stamp is no interval."""
+    turns = poses([0.5] * 9, 4.2)
+    slow, fast = two_rates(turns)
+    assert is_shown(slow, turns.t_ns)
+    assert is_shown(fast, turns.t_ns)
+    assert not is_shown(8.6, turns.t_ns)
+    assert not is_shown(8.6, (*turns.t_ns, turns.t_ns[-1]))
+    assert is_shown(8.6, (*turns.t_ns, turns.t_ns[-1] + 100_000_000))
+    assert is_shown(8.6, turns.t_ns[:1])

@@ -1,4 +1,5 @@
-"""Whether the poses determine the angular rate, or another rate explains them as well.
+"""The turn that poses can show, and whether they determine the angular rate or another rate
+explains them as well.
 
 Poses at multiples of one interval T are the same for a rotation by the angle w T and by w T - 2 pi
 about one axis. Where the target turns by more than about 2 rad from pose to pose, the slower of
@@ -10,6 +11,7 @@ estimate follows one of the two motions or neither.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import field
 
 import numpy as np
@@ -20,6 +22,8 @@ from avsreplay.geometry import Array, frozen
 
 # Turn between two poses: less is far enough from half a turn for any tumbling body.
 MAX_UNIQUE_TURN_RAD = 2.0
+# Turn of the faster of two rates. Beyond it the slower one looks like the only one.
+MAX_SHOWN_TURN_RAD = 2.0 * math.pi - MAX_UNIQUE_TURN_RAD
 ALIKE_RAD = 0.35  # the other rate differs at no pose by more than this, so that none excludes it
 COMPARED_POSES = 32  # poses that are compared
 LEAST_TURNS = 6  # turns from pose to pose whose median counts
@@ -49,6 +53,18 @@ class Turns:
         )
 
 
+def is_shown(rate_radps: float, t_ns: Sequence[int]) -> bool:
+    """Return whether poses can show a rate: its turn within their least interval is not above
+    ``MAX_SHOWN_TURN_RAD``.
+
+    Args:
+        rate_radps: angular rate [rad/s].
+        t_ns: instants of the poses [ns], oldest first.
+    """
+    period = _period_s(t_ns)
+    return period is None or rate_radps * period <= MAX_SHOWN_TURN_RAD
+
+
 def two_rates(turns: Turns) -> tuple[float, float] | None:
     """Return the slower and the faster angular rate [rad/s] that explain the poses, None where only
     one does.
@@ -56,10 +72,10 @@ def two_rates(turns: Turns) -> tuple[float, float] | None:
     Args:
         turns: of the poses so far.
     """
-    spans = np.diff(turns.t_ns) * 1e-9
-    if not len(spans) or not (spans > 0.0).any():
+    period = _period_s(turns.t_ns)
+    if period is None:
         return None
-    period = float(spans[spans > 0.0].min())
+    spans = np.diff(turns.t_ns) * 1e-9
     number = spans / period
     single = np.round(number) == 1.0
     if np.count_nonzero(single) < LEAST_TURNS:
@@ -73,6 +89,12 @@ def two_rates(turns: Turns) -> tuple[float, float] | None:
         return None
     mean_s = float(np.median(spans[single]))
     return turn / mean_s, (2.0 * math.pi - turn) / mean_s
+
+
+def _period_s(t_ns: Sequence[int]) -> float | None:
+    """Least interval of the poses [s]; None where there is none."""
+    spans = np.diff(t_ns) * 1e-9
+    return float(spans[spans > 0.0].min()) if (spans > 0.0).any() else None
 
 
 def in_words(rates: tuple[float, float]) -> str:
