@@ -170,11 +170,11 @@ def test_scattered_points_are_left_out_and_a_clean_scan_is_not_changed() -> None
     rng = np.random.default_rng(SEED)
     plane = np.column_stack([rng.uniform(-1, 1, (1000, 2)), np.zeros(1000)])
     scattered = rng.uniform(-1.5, 1.5, (1500, 3))
-    kept = without_scattered_points(np.vstack([plane, scattered]))
+    kept = without_scattered_points(np.vstack([plane, scattered]), 3.0)
     near = np.abs(kept[:, 2]) < 0.1
     assert near.mean() > 0.9
     assert near.sum() > 800
-    assert len(without_scattered_points(plane)) == len(plane)
+    assert len(without_scattered_points(plane, 3.0)) == len(plane)
 
 
 def test_a_body_is_separated_from_the_wall_behind_it(surface: Surface) -> None:

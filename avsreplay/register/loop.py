@@ -318,7 +318,9 @@ class Loop:
             rounds: most rounds of the search.
             known: a pose T_ca that is compared as well.
         """
-        case.target = without_scattered_points(np.asarray(case.points, dtype=np.float64))
+        case.target = without_scattered_points(
+            np.asarray(case.points, dtype=np.float64), self._extent
+        )
         few, tried = self.screen.part(case.target), list[Round]()
         parts = attempts(case.target, self._extent, lambda: tried[0].found.measured)
         for part, number in islice(parts, rounds):

@@ -391,7 +391,9 @@ class ModelCheck:
 
     def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""
-        points = without_scattered_points(np.asarray(scan.points, dtype=np.float64))
+        points = without_scattered_points(
+            np.asarray(scan.points, dtype=np.float64), self._surface.extent
+        )
         if len(points) and self._fits_mirrored(points, scan.sensor):
             return f"the scans fit the mirror image of the model, {_MIRRORED}"
         own, seen = diameter(self._surface.vertices, trimmed=False), diameter(points)

@@ -39,6 +39,7 @@ SCATTERED = 2.0
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 BIMODAL = 2.5
+ALONE_OF_EXTENT = 0.5  # distance to neighbour NEIGHBOUR of a point that is not on the target
 SIGHT_POINTS = 1500  # of a scan, whose normals show the line of sight
 NORMAL_NEIGHBOURS = 12  # points of a scan to which the plane at one of them is fitted
 # a scan smaller than so many extents probably shows a part of the target, or it from a narrow side
@@ -204,16 +205,30 @@ def at_instant(points: Array, times_s: NDArray[Any], rate: Array, velocity: Arra
     return np.asarray(np.einsum("nij,nj->ni", back, points - times * velocity))
 
 
-def without_scattered_points(points: Array) -> Array:
+def without_scattered_points(points: Array, extent_m: float) -> Array:
     """Return the points that lie on a surface, if the scan has many that do not; (n, 3) -> (k, 3).
 
     The distance to the eighth neighbour is small on a surface and large among outliers spread over
-    a volume.
+    a volume. A point whose eighth neighbour is half an extent away is never on the target: a few
+    such points far away would move the centroid of the scan by more than the size of the target.
+
+    Args:
+        points: (n, 3) [m].
+        extent_m: of the model.
     """
     if len(points) < 10 * NEIGHBOUR:
         return points
     points = np.ascontiguousarray(points, dtype=np.float64)
     tree = kernel_module().PointTree(points)
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1) > extent_m
+    if away.any():
+        kept = ~away
+        kept[away] = (
+            tree.query(points[away], k=NEIGHBOUR + 1)[0][:, -1] < ALONE_OF_EXTENT * extent_m
+        )
+        if 10 * NEIGHBOUR <= np.count_nonzero(kept) < len(points):
+            points = np.ascontiguousarray(points[kept])
+            tree = kernel_module().PointTree(points)
     few: Array = tree.query(points[:: max(1, len(points) // TESTED)].copy(), k=NEIGHBOUR + 1)[0][
         :, -1
     ]
