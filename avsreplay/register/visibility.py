@@ -200,7 +200,7 @@ def seen_sides(surface: Surface, cache_dir: Path | None = None) -> tuple[Surface
         positive volume; of one with openings enough is seen from one side only.
     """
     kernel, path = kernel_module(), None
-    if cache_dir is not None:
+    if cache_dir is not None and len(surface.faces):
         layout = f"{kernel.LAYOUT} sides {SIDES_VERSION}"
         path = index_cache.cache_path(
             cache_dir, layout, surface.vertices, surface.faces, surface.extent
