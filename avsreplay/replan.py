@@ -5,11 +5,9 @@ belief, its errors against the truth, and the simulated approach.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
-from operator import itemgetter
 
 import numpy as np
 
@@ -34,7 +32,7 @@ from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, turn_time, with_turn, without_turn
 from avsreplay.plan.constrained import constrained, linearised_s, with_safety
-from avsreplay.plan.flights import Ended, Miss, miss
+from avsreplay.plan.flights import Decided, Ended, Miss, changes_of, miss
 from avsreplay.plan.guidance import Guidance, PlannerInput
 from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.limits import (
@@ -58,9 +56,6 @@ from avsreplay.tables import column_of
 from avsreplay.task import target_at, task_of
 
 FLIGHT_INSTANTS = 401  # instants of the flight on its page
-Decided = tuple[float, str, str]
-"""Time after the first scan [s], action and rule of a decision of the supervisor."""
-
 _NO_MODEL = Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int32), "", "")
 
 
@@ -330,17 +325,17 @@ class Replanning:
         log.convergence, log.errors = self._known(self.saved.rows[index])
         return simulated(self._setup(count, seed), log, None, self.belief(index))
 
-    def recorded(self) -> tuple[Assessment | None, list[Decided]]:
+    def recorded(self) -> tuple[Assessment | None, tuple[Decided, ...]]:
         """Return the assessment of the run, None where the result has none, and the changes of the
         supervisor's decision.
         """
         rows = self.saved.rows
         columns = (column_of(rows, name) for name in ("t_s", "action", "supervisor_rule"))
-        return self.saved.assessment, _changes(zip(*columns, strict=True))
+        return self.saved.assessment, changes_of(zip(*columns, strict=True))
 
     def assess(
         self, index: int, flights: int = SIMULATED_FLIGHTS, seed: int = 0
-    ) -> tuple[Assessment, list[Decided]]:
+    ) -> tuple[Assessment, tuple[Decided, ...]]:
         """Return whether the robot would capture if its approach began at a scan, and the changes
         of the supervisor's decision.
 
@@ -350,7 +345,7 @@ class Replanning:
             seed: of all draws.
         """
         log, decisions = self._flown(index)
-        return assess(self._setup(flights, seed), log, self.truth), _changes(decisions)
+        return assess(self._setup(flights, seed), log, self.truth), changes_of(decisions)
 
     def _flown(self, index: int | None = None) -> tuple[FlightLog, list[Decided]]:
         """The flight over the result that begins at a scan, and its decisions; None: the robot
@@ -416,8 +411,3 @@ class Replanning:
         return Guidance(
             self.params, supervisor, self.limits, extent_m, self.robot.gripper, self.arm
         )
-
-
-def _changes(decisions: Iterable[Decided]) -> list[Decided]:
-    """The first of equal decisions one after the other."""
-    return [next(alike) for _, alike in groupby(decisions, key=itemgetter(1, 2))]

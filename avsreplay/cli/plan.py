@@ -188,7 +188,7 @@ def plan_command(
     made = _usable(lambda: planning.stated(index, planning.plan_at(index)))
     changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    flown, actions = (None, []) if _asked() else planning.recorded()
+    flown, actions = (None, ()) if _asked() else planning.recorded()
     if flown is None:
         flown, actions = _usable(lambda: planning.assess(index, flights, seed))
     joints = _usable(lambda: planning.joints(index, made))

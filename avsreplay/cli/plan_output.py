@@ -9,10 +9,10 @@ from avsreplay.errors import value_class
 if TYPE_CHECKING:
     from avsreplay.assessment import Assessment
     from avsreplay.outcome import Plan
-    from avsreplay.plan.flights import Miss
+    from avsreplay.plan.flights import Decided, Miss
     from avsreplay.plan.joint_path import JointPath
     from avsreplay.plan.uncertainty import Spread
-    from avsreplay.replan import Decided, Replanning
+    from avsreplay.replan import Replanning
     from avsreplay.report.table import Table
 
 
@@ -61,7 +61,7 @@ class Answer:
     spread: Spread | None
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
-    actions: list[Decided]
+    actions: tuple[Decided, ...]
     changes: list[PossibleChange]
 
 
@@ -273,7 +273,7 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     )
 
 
-def _actions_table(actions: list[Decided]) -> Table:
+def _actions_table(actions: tuple[Decided, ...]) -> Table:
     from avsreplay.report.table import Table
 
     rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in actions)

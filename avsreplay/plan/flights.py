@@ -8,8 +8,10 @@ time. Guidance has no access to it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +154,19 @@ def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     return at
 
 
+Decided = tuple[float, str, str]
+"""Time after the first scan [s], action and rule of a decision of the supervisor."""
+
+
+def changes_of(decisions: Iterable[Decided]) -> tuple[Decided, ...]:
+    """Return the decisions that differ from the one before.
+
+    Args:
+        decisions: one after each scan.
+    """
+    return tuple(next(alike) for _, alike in groupby(decisions, key=itemgetter(1, 2)))
+
+
 @value_class
 class Ended:
     """End of one simulated approach.
@@ -163,7 +178,7 @@ class Ended:
         touched: whether the end-effector touched the body outside the grasp.
     """
 
-    actions: tuple[tuple[float, str, str], ...]
+    actions: tuple[Decided, ...]
     at_s: float
     miss: Miss | None
     touched: bool
@@ -253,7 +268,7 @@ def closed_loop(
         ValueError: There is no input.
     """
     aimed: Array | None = None
-    actions: list[tuple[float, str, str]] = []
+    decisions: list[Decided] = []
     last_ns, known, state = start_ns, next(inputs, None), state or guidance.initial(start_ns)
     flown = [np.zeros((0, 3)) if before is None else before]
     while known is not None:
@@ -262,27 +277,26 @@ def closed_loop(
             flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
         segment = with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
         state, last_ns = guidance.step(replace(state, segment=segment), known), known.t_ns
-        decided = state.decision.action.value, state.decision.rule
-        if not actions or actions[-1][1:] != decided:
-            actions.append(((known.t_ns - start_ns) * 1e-9, *decided))
+        decision, t_s = state.decision, (known.t_ns - start_ns) * 1e-9
+        decisions.append((t_s, decision.action.value, decision.rule))
         closing, attitude = state.decision.action is Action.CAPTURE, known.scene.attitude
         if closing and aimed is None and attitude is not None:
             aimed = attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]
         ended = state.captured_ns is not None or state.decision.action is Action.ABORT
         known = None if ended else _sent(inputs, state)
-    if not actions:
+    if not decisions:
         raise ValueError("the log contains no scan")
-    y = np.concatenate(flown)
+    actions, y = changes_of(decisions), np.concatenate(flown)
     touched = contact is not None and bool(contact.touched(y[None])[0])
     if state.decision.action is not Action.CAPTURE:
-        return Ended(tuple(actions), (last_ns - start_ns) * 1e-9, None, touched)
+        return Ended(actions, (last_ns - start_ns) * 1e-9, None, touched)
 
     def truth(times: Array) -> tuple[Array, Array, Array]:
         turned = np.full((len(times), 4), np.nan)
         return *target.goal(times), turned if target.attitude is None else target.attitude(times)
 
     found = closed_miss(state, start_ns, truth, aimed)
-    return Ended(tuple(actions), found.at_s, found, touched)
+    return Ended(actions, found.at_s, found, touched)
 
 
 def _sent(
