@@ -397,8 +397,8 @@ def _at_rest(setup: Setup, log: FlightLog, state: GuidanceState, belief: Belief)
 
 
 def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> dict[str, Any]:
-    """Why an estimate does not suffice for an approach, and what would change it. Only where no
-    further scan changes this the answer is known.
+    """Why an estimate does not suffice for an approach, and what would change it; undecided where
+    further scans may reduce the error.
     """
     lost = " any more" if any(leg.action is not Action.STAND_STILL for leg in log.legs) else ""
     words = f"the estimate does not suffice{lost}"
@@ -412,7 +412,6 @@ def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> dict[str, Any
             "known_s": setup.at_s(belief.t_ns),
             "change": "a larger tolerance or a more exact model would help",
         }
-    open_: dict[str, Any] = {"chance": Chance.UNDECIDED, "probability": None}
     after = _planned_s(setup, belief)
     worst, size, cause = _predicted(setup, belief, after)
     if size <= setup.limits[worst]:
@@ -420,7 +419,12 @@ def _insufficient(setup: Setup, log: FlightLog, belief: Belief) -> dict[str, Any
     else:
         limit = f"predicted {_QUANTITIES[worst]} error {_of_tolerance(setup, worst, size)}"
         limit += f" at a capture in {after:.0f} s, from {cause}"
-    return {**open_, "limit": f"{words}: {limit}", "change": _change(setup, cause)}
+    return {
+        "chance": Chance.UNDECIDED,
+        "probability": None,
+        "limit": f"{words}: {limit}",
+        "change": _change(setup, cause),
+    }
 
 
 def _of_tolerance(setup: Setup, which: int, size: float) -> str:

@@ -206,11 +206,12 @@ def at_instant(points: Array, times_s: NDArray[Any], rate: Array, velocity: Arra
 
 
 def without_scattered_points(points: Array, extent_m: float) -> Array:
-    """Return the points that lie on a surface, if the scan has many that do not; (n, 3) -> (k, 3).
+    """Return the points (k, 3) of a scan (n, 3) that may lie on a surface.
 
-    The distance to the eighth neighbour is small on a surface and large among outliers spread over
-    a volume. A point whose eighth neighbour is half an extent away is never on the target: a few
-    such points far away would move the centroid of the scan by more than the size of the target.
+    A point whose eighth neighbour is half an extent away is not on the target: a few such points
+    far away would move the centroid of the scan by more than the size of the target. If the scan
+    has many outliers spread over a volume, those are left out too whose distance to the eighth
+    neighbour is large compared with that on a surface.
 
     Args:
         points: (n, 3) [m].
