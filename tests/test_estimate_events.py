@@ -25,6 +25,7 @@ from avsreplay.estimate.chart import (
     to_chart,
     to_errors,
 )
+from avsreplay.estimate.events import search as event_search
 from avsreplay.estimate.events.kinds import KINDS
 from avsreplay.estimate.events.linear import LinearModel, passed, shock_gain
 from avsreplay.estimate.events.naming import Cause
@@ -225,6 +226,7 @@ def test_without_an_event_none_is_found_and_the_claims_hold(case):
         ({"rate": 0.02, "random": (3e-5, 3e-5)}, ["rate_step"]),
         ({"velocity": 0.02, "share": 0.5}, ["velocity_step"]),
         ({"offset": 0.03}, ["sensor_offset"]),
+        ({"rate": 0.005, "seconds": 300.0}, ["rate_step"]),  # more poses than are searched
     ],
     ids=lambda value: "+".join(value) if isinstance(value, list) else "",
 )
@@ -273,6 +275,22 @@ def test_rows_name_a_cause_once_the_poses_show_it(torque, said):
     assert [bool(found) for found in kinds] == [bool(words) for words in told]
     assert all(said in found for found in kinds if found)
     assert said in kinds[-1]
+
+
+@pytest.mark.slow
+def test_a_search_ends_where_a_set_has_more_evidence_each_time_that_it_is_fitted(monkeypatch):
+    """Fits that are not converged: the set without events is proposed again and again."""
+    fixes = _scene(341, seconds=60.0, velocity=0.05)[0]
+    rounds = []
+
+    def without(problem, top, sets):
+        rounds.append(len(sets))
+        return replace(sets[0], evidence=1e6 + len(rounds))
+
+    monkeypatch.setattr(event_search, "pruned", without)
+    monkeypatch.setattr(event_search, "total", lambda _, fit: fit.evidence + len(fit.events) * 1e3)
+    smoothed(fixes, PARAMS)
+    assert len(rounds) == 1
 
 
 def test_a_covariance_that_is_not_positive_is_an_error_of_arithmetic():

@@ -126,10 +126,14 @@ def candidates(problem: Problem, fit: Fit, found: Passed) -> Iterator[tuple[floa
 
 
 def search(problem: Problem, fit: Fit) -> list[Fit]:
-    """Sets of events that were compared, each once, by falling evidence."""
+    """Sets of events that were compared, each once, by falling evidence.
+
+    Each round adds one event and may remove others. A round that ends with the set with which it
+    began is the last one, although another linearisation of the same set may have more evidence.
+    """
     sets = [fit]
     best = fit
-    while len(best.events) < _MOST_EVENTS:
+    for _ in range(_MOST_EVENTS):
         tried: list[Fit] = []
         for value, event in proposals(problem, best):
             if value >= _LEAST_LOG_ODDS_TRIED and not any(
@@ -144,7 +148,7 @@ def search(problem: Problem, fit: Fit) -> list[Fit]:
         sets.append(best)
         if total(problem, top) > total(problem, best):
             top = pruned(problem, top, sets)
-        if total(problem, top) <= total(problem, best):
+        if total(problem, top) <= total(problem, best) or _same(top.events, best.events):
             break
         best = top
     out: list[Fit] = []
@@ -296,7 +300,6 @@ def described(problem: Problem, fit: Fit, event: Event) -> Found:
     size = p @ sizes
     away = sizes - size
     covariance = np.einsum("m,mij->ij", p, covariances) + np.einsum("m,mi,mj->ij", p, away, away)
-    own = (knots == event.knot) & (lates == event.late)
     step = float(problem.times[event.knot] - problem.times[max(event.knot - 1, 0)]) * 0.2 / 3.5
     return Found(
         event=event,
@@ -306,5 +309,5 @@ def described(problem: Problem, fit: Fit, event: Event) -> Found:
         onset_1s_s=float(np.sqrt(p @ np.square(at - onset) + step**2))
         if event.kind.anywhere
         else 0.0,
-        gain=float(gain[own].max()) + odds(problem, event),
+        gain=float(gain.max()) + odds(problem, event),
     )
