@@ -15,7 +15,7 @@ from avsreplay.estimate.batch import Problem
 from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, line_of_sight_1s
-from avsreplay.estimate.disturbance_density import density_in_use
+from avsreplay.estimate.disturbance_density import mean_square
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import (
@@ -125,7 +125,7 @@ def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(
         arm, one = to_chart(world.states[0]).arm_c, np.ones(len(seen))
         rows = position_rows(poses_of(tuple(seen)), one, arm, 36, 0, [change] if step else [])
         likelihood = _of_positions(_variances(NO_LEVELS), rows)
-        found.append(density_in_use(likelihood, rows.present))
+        found.append(np.sqrt(mean_square(likelihood)))
         excluded.append(likelihood.excluded)
     if force:
         assert all(force / 2.0 < q < 2.0 * force for q in found), found

@@ -5,18 +5,14 @@ The whitened residuals of the poses are linear in the initial values y and in im
 disturbance between the poses, with u ~ N(0, q^2). Those of other disturbances are further unknowns
 with a prior, not a part of the covariance of the residuals: over a long log they are so large that
 this covariance could no longer be factored. The likelihood of every root density q is a
-closed form in the eigenvectors of the information on u; so are the mean and the covariance of the
-present rate or velocity, given q.
+closed form in the eigenvalues of the information on u.
 
 Half of the prior probability is that of no disturbance, the other half that of the densities that
 the poses do not exclude, in equal parts a decade. Were it spread over all densities, most of it
 would be that of excluded ones, and what they lose would count for no disturbance.
 
-The estimator uses one density. The distribution over all densities has a larger covariance than the
-likely density alone wherever the poses do not determine q: a density of small probability under
-which the velocity has moved far counts as much as its square. The density in use is therefore the
-one about whose mean and with whose covariance the expected NEES of the present velocity is 1 (law
-of total covariance).
+The estimator uses one density, whose square is the posterior mean of q^2: a disturbance to come has
+this second moment, which is what forecasts and covariances need.
 """
 
 from __future__ import annotations
@@ -71,34 +67,18 @@ def information_root(info: Array) -> Array:
 
 
 @value_class
-class Present:
-    """The present rate or velocity: its derivatives by the m initial values (3, m) and by the
-    k impulses (3, k).
-    """
-
-    by_initial: Array
-    by_impulses: Array
-
-
-@value_class
 class Marginal:
     """The likelihood of k impulses with the initial values marginal over them.
 
     Attributes:
         none: log likelihood of no impulses, without its constant.
         values: (k,) eigenvalues of the information on the impulses.
-        vectors: (k, k) its eigenvectors.
-        along: (k,) the gradient of the log likelihood along them.
-        R, cross: (m, m) root of the information on the initial values, and (m, k) its product with
-            their derivatives by the impulses.
+        along: (k,) the gradient of the log likelihood along its eigenvectors.
     """
 
     none: float
     values: Array
-    vectors: Array
     along: Array
-    R: Array
-    cross: Array
 
     @property
     def log_odds(self) -> Array:
@@ -150,9 +130,7 @@ def marginal(V: Array, effects: Array, data: Residuals) -> Marginal:
     values, vectors = np.linalg.eigh(columns.T @ columns - cross.T @ cross)
     values = np.maximum(values, 0.0)
     most = np.sqrt(chi2 * values)  # the bound of Cauchy and Schwarz, which rounding can exceed
-    return Marginal(
-        none, values, vectors, np.clip(vectors.T @ (columns.T @ left), -most, most), R, cross
-    )
+    return Marginal(none, values, np.clip(vectors.T @ (columns.T @ left), -most, most))
 
 
 def divided(L: Array, B: Array) -> Array:
@@ -191,37 +169,11 @@ def posterior(found: Marginal, probability: float) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def density_in_use(found: Marginal, present: Present, probability: float = 0.5) -> float:
-    """Root density for which the expected NEES of the present velocity is 1 under the posterior of
-    all densities.
-
-    Zero where no disturbance is certain; between two candidates the density is interpolated.
+def mean_square(found: Marginal, probability: float = 0.5) -> float:
+    """The posterior mean of the squared root density, which is the density that the estimator uses.
 
     Args:
         found: the likelihood of the impulses.
-        present: the rate or velocity at the last pose.
         probability: prior probability that there is a disturbance.
     """
-    weights = posterior(found, probability)
-    by_initial = np.zeros((3, len(found.R)))  # zero for unknowns besides the initial values
-    by_initial[:, : present.by_initial.shape[1]] = present.by_initial
-    own = np.linalg.solve(found.R.T, by_initial.T).T
-    reach = (present.by_impulses - own @ found.cross) @ found.vectors
-    share = _SQUARES[:, None] / (1.0 + _SQUARES[:, None] * found.values)
-    P = own @ own.T + (reach * share[:, None, :]) @ reach.T
-    mean = (share * found.along) @ reach.T
-    total = np.tensordot(weights, P + mean[:, :, None] * mean[:, None, :], 1)
-    cross = mean[:, :, None] * (weights @ mean)
-    about = total - cross - cross.swapaxes(1, 2) + mean[:, :, None] * mean[:, None, :]
-    excess = np.trace(np.linalg.solve(P, about), axis1=1, axis2=2) / 3.0 - 1.0
-    largest = math.sqrt(
-        float(weights @ _SQUARES)
-    )  # a variance grows at most with the square of the density
-    enough = np.flatnonzero(excess <= 0.0)
-    if not enough.size:
-        return largest
-    k = int(enough[0])
-    if k == 0:
-        return 0.0
-    part = float(excess[k - 1] / (excess[k - 1] - excess[k]))
-    return min(largest, math.sqrt(_SQUARES[k - 1] + part * (_SQUARES[k] - _SQUARES[k - 1])))
+    return float(posterior(found, probability) @ _SQUARES)

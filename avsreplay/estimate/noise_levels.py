@@ -32,17 +32,16 @@ from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.disturbance_density import (
     DENSITIES,
     Marginal,
-    Present,
     Residuals,
-    density_in_use,
     divided,
     information_root,
     marginal,
+    mean_square,
     probability_beside,
 )
 from avsreplay.estimate.driven import impulses
-from avsreplay.estimate.dynamics import propagate_state, torque_density
-from avsreplay.estimate.error_state import RHO, VEL, W
+from avsreplay.estimate.dynamics import torque_density
+from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.normal_points import PositionRows, error_parts
 from avsreplay.geometry import Array
@@ -170,18 +169,15 @@ def estimate_levels(
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
         theta = _improved(theta, open_, parts, data, points)
     likely = theta.copy()
-    found: dict[int, tuple[Marginal, Present]] = {}
+    found: dict[int, Marginal] = {}
     for k in (k for k in (4, 5) if open_[k]):
         if positions is not None and k == 5:
-            found[k] = _of_positions(likely, positions), positions.present
+            found[k] = _of_positions(likely, positions)
         else:
-            found[k] = (
-                _of_impulses(k - 4, likely, parts, data),
-                parts.present[k - 4],
-            )
+            found[k] = _of_impulses(k - 4, likely, parts, data)
     for k, each in found.items():
-        beside = found[9 - k][0].evidence if 9 - k in found else 0.0
-        theta[k] = density_in_use(*each, probability_beside(beside)) ** 2
+        beside = found[9 - k].evidence if 9 - k in found else 0.0
+        theta[k] = mean_square(each, probability_beside(beside))
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
     return replace(
@@ -191,10 +187,10 @@ def estimate_levels(
         torque=math.sqrt(theta[4]),
         force=math.sqrt(theta[5]),
         slack=slack,
-        evidence=max((each.evidence for each, _ in found.values()), default=0.0),
+        evidence=max((each.evidence for each in found.values()), default=0.0),
         excluded=(
-            found[4][0].excluded if 4 in found else 0.0,
-            found[5][0].excluded if 5 in found else 0.0,
+            found[4].excluded if 4 in found else 0.0,
+            found[5].excluded if 5 in found else 0.0,
         ),
     )
 
@@ -276,13 +272,10 @@ class _Components:
         C: covariances (3n, 3n) of the errors of attitude and position, first the independent ones,
             then the common ones.
         effects: (6n, 3(n - 1)) of impulses of torque and of force, of unit density.
-        present: the rate in {B} and the velocity at the last point, by initial values and by these
-            impulses.
     """
 
     C: tuple[Array, ...]
     effects: tuple[Array, Array]
-    present: tuple[Present, Present]
 
     def errors(self, theta: Array) -> Array:
         """Covariance (6n, 6n) of the errors of the poses."""
@@ -302,7 +295,7 @@ def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components
     """
     (e, H), T = problem.core.rows(), to_errors(problem.chart)
     white, common = (np.kron(np.eye(3), part) for part in error_parts(points))
-    *effects, present = _disturbances(points, problem.chart, H, T)
+    effects = _disturbances(points, problem.chart, H)
     torque, force, J = (
         np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(e.size, -1) for M in (*effects, H @ T)
     )
@@ -312,7 +305,7 @@ def _linearised(points: Poses, problem: Problem) -> tuple[Residuals, _Components
         information_root(problem.prior.info),
     )
     data = Residuals(np.ascontiguousarray(e.T).reshape(-1), J, root, off)
-    return data, _Components(C, (torque, force), present)
+    return data, _Components(C, (torque, force))
 
 
 def _extended(data: Residuals, effects: Array, size: Array) -> Residuals:
@@ -326,15 +319,12 @@ def _pose_errors(theta: Array, parts: _Components) -> list[Array]:
     return [theta[b] * parts.C[b] + theta[2 + b] * parts.C[2 + b] for b in range(POSE_BLOCKS)]
 
 
-def _disturbances(
-    points: Poses, chart: Chart, H: Array, T: Array
-) -> tuple[Array, Array, tuple[Present, Present]]:
+def _disturbances(points: Poses, chart: Chart, H: Array) -> tuple[Array, Array]:
     """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit
-    density; the present.
+    density.
 
     The disturbance between two neighbouring poses acts as one impulse in the middle. An impulse
-    equals the errors at the epoch from which free motion leads to it. ``T`` (20, 20): derivative of
-    the errors by chart steps.
+    equals the errors at the epoch from which free motion leads to it.
     """
     x, times, n = to_state(chart), points.times_s, len(points)
     middle, root = 0.5 * (times[1:] + times[:-1]), np.sqrt(np.diff(times))
@@ -345,10 +335,7 @@ def _disturbances(
     )
     push = H[:, :, None, VEL] - middle[:, None] * H[:, :, None, RHO]
     weight = (later * root)[:, None, :, None]
-    Phi = propagate_state(x, float(times[-1]), points.arc)[1]
-    rate = (Phi[W, :6] @ (back * root[:, None, None])).transpose(1, 0, 2).reshape(3, -1)
-    present = Present(Phi[W] @ T, rate), Present(Phi[VEL] @ T, np.asarray(np.kron(root, np.eye(3))))
-    return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1), present
+    return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1)
 
 
 def _improved(

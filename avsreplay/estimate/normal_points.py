@@ -15,7 +15,6 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
-from avsreplay.estimate.disturbance_density import Present
 from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
@@ -50,7 +49,6 @@ class PositionRows:
         white, common: (n, n) covariance of the independent and of the common errors, the same for
             three axes.
         force: (3n, 3(n - 1)) of impulses of the force between the points, of unit density.
-        present: the velocity at the last point, by the unknowns and by these impulses.
     """
 
     e: Array
@@ -59,7 +57,6 @@ class PositionRows:
     white: Array
     common: Array
     force: Array
-    present: Present
 
 
 def position_rows(
@@ -115,10 +112,6 @@ def position_rows(
     rows = [
         np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)
     ]
-    speed = np.array([0.0, 0.0, 1.0, *(1.0, 0.0) * len(changes)])
-    present = Present(
-        *(np.asarray(np.kron(a, np.eye(3))) for a in (speed, np.sqrt(np.diff(times))))
-    )
     return PositionRows(
         np.ascontiguousarray(e.T).reshape(-1),
         rows[0],
@@ -126,7 +119,6 @@ def position_rows(
         white,
         common,
         rows[1],
-        present,
     )
 
 
