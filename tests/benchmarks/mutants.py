@@ -1,14 +1,13 @@
-"""Whether tests fail where the code is wrong: ``python tests/benchmarks/mutants.py FOLDER
+"""Whether quick tests fail where the code is wrong: ``python tests/benchmarks/mutants.py FOLDER
 --count 300``.
 
 Each mutant changes one operator, comparison, sign, number or condition of one module, chosen by the
 seed among all that the syntax trees of the package contain. The first call copies the checkout to
-FOLDER and runs the tests once that take at most 5 s of processor time each, with probes that record
-which statements each test runs. A mutant is then tested, in a fork of a process that has imported
-the libraries, by the tests that run its statement, the shortest first, until one fails; a change of
-a constant, which runs with the import, by those that run a statement with its name. Where a test
-runs a statement that a cache or fixture of its file keeps for others, the other tests of the file
-follow.
+FOLDER and runs the quick tests once, with probes that record which statements each test runs. A
+mutant is then tested, in a fork of a process that has imported the libraries, by the tests that run
+its statement, the shortest first, until one fails; a change of a constant, which runs with the
+import, by those that run a statement with its name. Where a test runs a statement that a cache
+or fixture of its file keeps for others, the other tests of the file follow.
 
 A survivor may be equivalent to the code. FOLDER has one line of JSON for each verdict, and a
 campaign that was ended continues; ``--again`` tests the survivors anew. Test files that were
@@ -38,8 +37,7 @@ import pytest
 from mutation import Module, Mutant
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = ("-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-n0")
-LONGEST_S = 5.0  # processor time of a test that is used, as slow.txt says
+QUICK = ("-q", "-p", "no:cacheprovider", "-m", "not slow", "--hypothesis-seed=0", "-n0")
 SLACK, START_S = 5.0, 40.0  # processor time of a mutant's tests: times what was recorded, and more
 IDLE_S = 30.0  # tests whose processes use less than LEAST_TICKS for so long do not end [s]
 LEAST_TICKS = 50  # processor time [0.01 s]
@@ -117,12 +115,6 @@ class Recorder:
         own, outer = np.packbits(self.hits), self._outer.pop()
         np.maximum(self.hits, outer, out=self.hits)
         return own
-
-    def pytest_collection_modifyitems(self, items):
-        import conftest
-
-        spent = conftest.listed_as_slow()
-        items[:] = [each for each in items if spent.get(conftest.named(each), 0.0) <= LONGEST_S]
 
     @pytest.hookimpl(wrapper=True)
     def pytest_make_collect_report(self, collector):
@@ -206,7 +198,7 @@ def _file(name: str) -> str:
 
 
 def record(folder: Folder, files: list[str], count: int) -> Map:
-    """Run the tests of some files with probes. Called in a process of its own."""
+    """Run the quick tests of some files with probes. Called in a process of its own."""
     folder.probes.mkdir(exist_ok=True)
     os.environ[mutation.PROBES] = str(folder.probes)
     mutation_of_site = import_module("mutation")
@@ -214,7 +206,7 @@ def record(folder: Folder, files: list[str], count: int) -> Map:
     mutation_of_site.install()
     hits = np.memmap(folder.probes / "hits", dtype=np.uint8, mode="r+", shape=(count,))
     plugin = Recorder(hits)
-    pytest.main([*OPTIONS, *(f"tests/{name}" for name in files)], plugins=[plugin])
+    pytest.main([*QUICK, *(f"tests/{name}" for name in files)], plugins=[plugin])
     names = [name for name in plugin.tests if plugin.passed[name] == 3]
     ran = [plugin.tests[name][1] | plugin.collected.get(_file(name), 0) for name in names]
     spent = [plugin.tests[name][0] for name in names]
@@ -341,7 +333,7 @@ def _tested(folder: Folder, mutant: Mutant | None, tests: list[str]) -> str:
         mutation.__file__ = str(folder.site / "mutation.py")
         mutation.install()
     first = _First()
-    code = pytest.main([*OPTIONS, "-x", *tests], plugins=[first])
+    code = pytest.main([*QUICK, "-x", *tests], plugins=[first])
     return "passed" if code == 0 else first.failed or f"pytest ended with {code}"
 
 
