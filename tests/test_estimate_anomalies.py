@@ -30,10 +30,10 @@ from avsreplay.estimate import (
 from avsreplay.estimate.dynamics import after_change, grasp_forecast, propagate, propagate_state
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
-from avsreplay.estimate.track import Epoch, Prediction, Track, ready
+from avsreplay.estimate.track import Epoch, Prediction, SensorBias, Track, ready
 from avsreplay.geometry import Pose
 from avsreplay.monitor.fault_detection import FaultDetector, FaultParams
-from avsreplay.records import Alignment, Belief, Innovation, MeasuredPose, ScanStatus
+from avsreplay.records import Admission, Alignment, Belief, Innovation, MeasuredPose, ScanStatus
 from avsreplay.register.backend import measured_alignment
 
 CLEAN = surprises.Case("clean", seconds=60.0)
@@ -948,6 +948,27 @@ def test_an_offset_of_noisy_scans_ends_with_the_noise(monkeypatch: pytest.Monkey
     at = dict(zip(result.t, result.reason, strict=True))
     assert {at[t] for t in result.t if 48.0 < t < 60.0} == {"sensor_bias"}
     assert "sensor_bias" not in {at[t] for t in result.t if 60.0 <= t < 62.0}
+
+
+def test_a_sensor_offset_ends_where_free_motion_explains_its_scans() -> None:
+    """Three scans of a clean log are taken for ones with an offset of 5 mm, which is within the
+    noise of their differences.
+    """
+    case = replace(CLEAN, seconds=80.0)
+    times, states, _, _ = surprises.world_of(case, 3)
+    estimator = Estimator(EstimatorParams(), None, surprises.EXTENT)
+    alignments = surprises.measured(case, times, states, 3)
+    track, used = estimator.initial(0, alignments[0].T_ac), []
+    for t, alignment in zip(times, alignments, strict=True):
+        if t == 60.0:
+            *before, a, b, c = track.recent
+            offset, P = np.array([0.005, 0.0, 0.0, 0.0, 0.0, 0.0]), 1e-6 * np.eye(6)
+            track = track.changed(bias=SensorBias(offset, P, c, tuple(before), (a, b, c)))
+        prediction = estimator.predict(track, round(t * 1e9))
+        innovation = estimator.innovate(prediction, alignment)
+        track, found = estimator.step(track, prediction, innovation, Admission.ADMITTED, False)
+        used += [found.used] if t >= 60.0 else []
+    assert all(used[12:])
 
 
 def _swing(t: float) -> Pose:

@@ -194,15 +194,21 @@ class AnomalyTest:
         return window_of(scans, accepted, start, *self.batch.noise_levels(track), arc)
 
     def _still_biased(self, track: Track, bias: SensorBias) -> tuple[Track, Finding]:
-        """The track after one more scan of a sensor error, unless a manoeuvre explains its scans
-        better.
-        """
+        """The track after one more scan of a sensor error, unless its scans have another cause."""
         bias, found = compared(bias, lambda window, first: self._explained(track, window, first))
-        window, best = found or ((), None)
-        if best is not None and best.changes and scans_after(window, best) >= FEWEST_TO_FIT:
-            reported = self._reported(track.changed(bias=None), window, best)
+        biased = track.changed(bias=bias), Finding.OFFSET
+        if found is None:
+            return biased
+        (window, best), track = found, track.changed(bias=None)
+        if best.hypothesis is Hypothesis.MANOEUVRE:
+            if not best.changes or scans_after(window, best) < FEWEST_TO_FIT:
+                return biased
+            reported = self._reported(track, window, best)
             return self._manoeuvred(reported, window, best), Finding.EXPLAINED
-        return track.changed(bias=bias), Finding.OFFSET
+        if best.hypothesis is not Hypothesis.FREE_MOTION:
+            return biased
+        before = with_history(bias.since[0].track, track).changed(recent=track.recent)
+        return self._used(before, bias.since), Finding.EXPLAINED
 
     def _undecidable(self, track: Track) -> tuple[Track, Finding]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones
@@ -297,9 +303,11 @@ class AnomalyTest:
         if best.onset >= first:
             return with_history(track, track).changed(bias=bias)
         then = window[best.onset].track
-        belief, _ = self.batch.propagated(track, then.belief, last.prediction.belief.t_ns)
+        _, again = self._replay(then, last)  # the innovation about the motion that goes on
         return with_history(then, track).changed(
-            belief=belief, recent=window[: best.onset], bias=bias
+            belief=again.prediction.belief,
+            recent=window[: best.onset],
+            bias=replace(bias, last=again),
         )
 
     def _by_agreement(self, track: Track) -> tuple[Track, Finding]:

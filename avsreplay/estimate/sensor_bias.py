@@ -1,5 +1,4 @@
-"""A sensor error in effect: whether it lasts, and whether a manoeuvre explains its scans better
-after all.
+"""A sensor error in effect: whether it lasts, and whether its scans have another cause after all.
 
 A bias of the sensor is a step of the pose; a manoeuvre is a step of the velocity. A small manoeuvre
 between two scans may resemble a bias in the first scans after it. The hypotheses are therefore
@@ -14,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avsreplay.estimate.hypotheses import OVER_FREE, OVER_NEXT, Ranked
+from avsreplay.estimate.hypotheses import Ranked, certain
 from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.scan_window import (
     OFFSETS,
@@ -25,7 +24,6 @@ from avsreplay.estimate.scan_window import (
     Window,
     log_mean,
     mixed,
-    odds_over_free,
     offsets,
 )
 from avsreplay.estimate.track import Epoch, SensorBias
@@ -112,8 +110,8 @@ def _end_odds(window: Window, onset: int, priors: ChangePriors) -> float:
 def compared(
     bias: SensorBias, compare: Compare
 ) -> tuple[SensorBias, tuple[tuple[Epoch, ...], Explanation] | None]:
-    """Return the error with its last scan among those that are compared, and a manoeuvre that
-    explains them instead.
+    """Return the error with its last scan among those that are compared, and another hypothesis
+    that explains them instead.
 
     At most ``_MOST_COMPARED`` scans of the error are kept. Then every second one is left out, and
     the next ones are added half as often, so that a slow growth of the offset is found as well.
@@ -123,8 +121,8 @@ def compared(
         compare: the hypotheses about scans.
 
     Returns:
-        The error, and the scans with the manoeuvre if that is the most likely cause of them; else
-        None.
+        The error, and the scans with their most likely cause if it is another one and certain;
+        else None.
     """
     if bias.left_out + 1 < bias.spacing or not bias.before:
         return replace(bias, left_out=bias.left_out + 1), None
@@ -132,11 +130,9 @@ def compared(
     if len(since) > _MOST_COMPARED:
         since, spacing = since[::2], 2 * spacing
     window, ranked = compare((*bias.before, *since), len(bias.before))
-    best, odds = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence
-    doubted = best.hypothesis is not Hypothesis.SENSOR_BIAS
+    doubted = ranked[0].hypothesis is not Hypothesis.SENSOR_BIAS
     bias = replace(bias, since=since, spacing=spacing, left_out=0, doubted=doubted)
-    certain = best.explains and odds >= OVER_NEXT and odds_over_free(ranked) >= OVER_FREE
-    return bias, (window, best) if best.hypothesis is Hypothesis.MANOEUVRE and certain else None
+    return bias, (window, ranked[0]) if doubted and certain(ranked) else None
 
 
 def squared(y: Array, C: Array) -> float:
