@@ -117,6 +117,28 @@ def test_common_motions_are_those_of_both_sets():
     assert common_motions(np.column_stack([x]), np.column_stack([y]), 1.0).size == 0
 
 
+@pytest.mark.parametrize("height_m", [0.02, 0.04, 0.06])
+def test_points_that_noise_moves_over_an_edge_do_not_determine_a_direction(height_m):
+    """Two sides of a plate, and the bottom 1 deg from the line of sight, without returns: nothing
+    tells the height, although points inside of the plate are nearest the bottom.
+    """
+    mesh = trimesh.creation.box((2.0, 1.2, 0.1))
+    plate = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32), "plate", "")
+    registrar = Registrar(plate)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        y, x, z = rng.uniform(-0.6, 0.6, 400), rng.uniform(-1, 1, 240), rng.uniform(-1, 1, 640)
+        sides = [np.column_stack([np.ones(400), y]), np.column_stack([x, np.full(240, 0.6)])]
+        points = np.column_stack([np.vstack(sides), 0.05 * z])
+        eye = np.array([3.8, 1.15, -0.05 - height_m])
+        rays = points - eye
+        far = np.linalg.norm(rays, axis=1, keepdims=True)
+        T_ac = Pose(Pose.identity().q, -eye)
+        noisy = rays * (1.0 + 0.002 * rng.standard_normal((640, 1)) / far)
+        found = registrar.register(noisy, T_ac)
+        assert found.status is AlignStatus.DEGENERATE
+
+
 def test_a_body_of_revolution_is_found_up_to_its_rotation_and_not_called_ambiguous():
     surface, registrar = stage(), Registrar(stage())
     for seed in range(4):

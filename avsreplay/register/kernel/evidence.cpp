@@ -9,7 +9,7 @@ namespace {
 
 // What one chunk adds.
 struct Part {
-  int inliers = 0;
+  int inliers = 0, summed = 0;
   uint16_t off[CHUNK];  // the first are the numbers of its other points
   double sum_d2 = 0, sum[3] = {0, 0, 0};
   std::vector<Sample> samples;
@@ -25,11 +25,11 @@ class Sorted {
 
   Match* chunk(int64_t k) { return matches_.get() + k * CHUNK; }
 
-  // Adds the inliers of the first chunks to the sums of their patches.
+  // Adds those of the first chunks that count to the sums of their patches.
   void add(const Code& code, const Part* parts, int64_t chunks, double per_m, Numbers& numbers, std::vector<PatchSums>& sums) {
     begin_.assign(numbers.size() + 1, 0);
     for (int64_t k = 0; k < chunks; ++k)
-      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) {
+      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].summed; ++i) {
         const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i].p, per_m));
         if (begin_.size() < p + 2) begin_.resize(p + 2, 0);
         ++begin_[p + 1];
@@ -37,7 +37,7 @@ class Sorted {
     for (size_t p = 1; p < begin_.size(); ++p) begin_[p] += begin_[p - 1];
     next_ = begin_;
     for (int64_t k = 0; k < chunks; ++k)
-      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) order_[next_[patch_[(size_t)i]]++] = (uint32_t)i;
+      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].summed; ++i) order_[next_[patch_[(size_t)i]]++] = (uint32_t)i;
     sums.resize(numbers.size());
     for (size_t p = 0; p < sums.size(); ++p)
       if (begin_[p + 1] > begin_[p]) code.add(matches_.get(), order_.data() + begin_[p], begin_[p + 1] - begin_[p], sums[p]);
@@ -88,6 +88,20 @@ double median(std::vector<double>& x) {
 
 }  // namespace
 
+bool is_clear(const Store& s, int32_t lane, const double* on, double distance) {
+  if (!s.mesh) return false;
+  const uint32_t levels = s.clear[(size_t)lane];
+  const Triangle& t = s.triangles[(size_t)lane];
+  const double d[3] = {on[0] - t.a.x, on[1] - t.a.y, on[2] - t.a.z};
+  const double x = d[0] * t.u.x + d[1] * t.u.y + d[2] * t.u.z, y = d[0] * t.w.x + d[1] * t.w.y + d[2] * t.w.z;
+  const std::array<double, 3> sides = side_distances(t, x, y);
+  bool flat = clear_radius(s, levels >> 4 & 15) >= distance;
+  for (int k = 0; k < 3; ++k) flat = flat && std::max(sides[(size_t)k], clear_radius(s, levels >> (8 + 4 * k) & 15)) >= distance;
+  if (flat) return true;
+  const double left = clear_radius(s, levels & 15) - distance, dx = x - (t.length + t.cx) / 3, dy = y - t.cy / 3;
+  return left >= 0 && dx * dx + dy * dy <= left * left;
+}
+
 Evidence evidence(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
                   const Matches* matches) {
   return evidence(Matcher(s, code, v, T, rule, matches), code, v, rule, team, 0);
@@ -100,24 +114,26 @@ Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const
   Sorted sorted(std::min(chunks, BLOCK));
   Evidence out;
   out.points = v.n;
+  size_t summed = 0;
   for (int64_t first = 0; first < chunks; first += BLOCK) {
     const int64_t many = std::min(BLOCK, chunks - first);
     team.each(many, [&](int64_t k) {
       Match* found = sorted.chunk(k);
       Part& part = parts[(size_t)(first + k)];
       Footing feet[CHUNK];
-      part.inliers = matcher.inliers(first + k, found, part.off, stride > 0 ? feet : nullptr);
+      part.inliers = matcher.inliers(first + k, found, part.off, stride > 0 || rule.noise > 0 ? feet : nullptr);
       for (int i = (int)(stride / 2); stride > 0 && i < part.inliers; i += (int)stride) part.samples.push_back({found[i], feet[i]});
-      for (Match* m = found; m != found + part.inliers; ++m) {
-        part.sum_d2 += m->d2;
-        for (int a = 0; a < 3; ++a) part.sum[a] += m->p[a];
-        onto_face(*m);
+      for (int i = 0; i < part.inliers; ++i) {
+        Match m = found[i];
+        part.sum_d2 += m.d2;
+        for (int a = 0; a < 3; ++a) part.sum[a] += m.p[a];
+        if (rule.noise > 0 && !matcher.is_of_face(m, feet[i], rule.noise)) continue;
+        onto_face(m), found[part.summed++] = m;
       }
     });
     for (int64_t k = 0; k < many; ++k) {
       const Part& part = parts[(size_t)(first + k)];
-      double* to = errors.data() + out.inliers;
-      for (int i = 0; i < part.inliers; ++i) to[i] = std::fabs(sorted.chunk(k)[i].e);
+      for (int i = 0; i < part.summed; ++i) errors[summed++] = std::fabs(sorted.chunk(k)[i].e);
       const int64_t begin = (first + k) * CHUNK, others = std::min<int64_t>(v.n - begin, CHUNK) - part.inliers;
       for (int64_t i = 0; i < others; ++i) out.off.push_back(begin + part.off[i]);
       out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
@@ -127,7 +143,7 @@ Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const
     sorted.add(code, parts.data() + first, many, 1 / rule.side, out.cubes, out.patches);
   }
   for (double& x : out.centre) x = out.inliers ? x / (double)out.inliers : 0;
-  errors.resize((size_t)out.inliers);
+  errors.resize(summed);
   out.median = median(errors);
   if (out.patches.size() > (size_t)rule.least) return out;
   out.patches.clear();  // too few cubes: every point is a patch
@@ -135,8 +151,13 @@ Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const
   const uint32_t one = 0;
   for (int64_t k = 0; k < chunks; ++k) {
     Match found[CHUNK];
-    const int n = matcher.inliers(k, found);
-    for (int i = 0; i < n; ++i) onto_face(found[i]), code.add(found + i, &one, 1, out.patches.emplace_back());
+    Footing feet[CHUNK];
+    uint16_t off[CHUNK];
+    const int n = matcher.inliers(k, found, off, rule.noise > 0 ? feet : nullptr);
+    for (int i = 0; i < n; ++i) {
+      if (rule.noise > 0 && !matcher.is_of_face(found[i], feet[i], rule.noise)) continue;
+      onto_face(found[i]), code.add(found + i, &one, 1, out.patches.emplace_back());
+    }
   }
   return out;
 }

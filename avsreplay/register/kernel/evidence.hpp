@@ -1,5 +1,7 @@
 // The quality of a pose: what its inliers tell, summed over patches of the model.
 #pragma once
+#include <cmath>
+
 #include "cubes.hpp"
 #include "loop.hpp"
 
@@ -25,7 +27,11 @@ struct PatchRule {
   double gate, side;  // [m]; a patch is the points whose feet lie in one cube of this side
   int least;          // with no more patches than this every point is one
   bool facing;
+  double noise = 0;  // [m] along the rays; above 0 points that noise moved over an edge add nothing to the patches
 };
+
+// Whether a measured point within a distance from a place of a face of a mesh is closest to its plane.
+bool is_clear(const Store& store, int32_t lane, const double* on, double distance);
 
 // The closest points of a scan at a pose, a chunk at a time.
 class Matcher {
@@ -43,6 +49,19 @@ class Matcher {
 
   // What is matched, and how.
   const Look& look() const { return look_; }
+
+  // Whether a point near an edge can be of the face with which it is matched: noise along the ray moves it off the face by no more
+  // than its part along the normal. A face that the camera sees at a grazing angle takes points of its neighbours otherwise, which
+  // tell nothing of its place.
+  bool is_of_face(const Match& m, const Footing& at, double noise) const {
+    if (!sided_ || is_clear(s_, at.lane, at.foot, CREDIBLE * noise)) return true;
+    double range2 = 0, along = 0;
+    for (int a = 0; a < 3; ++a) {
+      const double ray = m.p[a] - look_.T[4 * a + 3];
+      range2 += ray * ray, along += ray * m.n[a];
+    }
+    return std::fabs(m.e) * std::sqrt(range2) <= CREDIBLE * noise * std::fabs(along);
+  }
   int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
 
   // The inliers of a chunk, in the order of the scan; returns how many. `off`: the numbers of the others in the chunk; `feet`:
@@ -54,6 +73,7 @@ class Matcher {
   }
 
  private:
+  static constexpr double CREDIBLE = 3;  // standard deviations of the noise
   static constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
   const Store& s_;
   const Code& code_;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 namespace avs {
 namespace {
@@ -164,6 +165,14 @@ Grade grade(const Store& s, const Code& code, const View& v, const double* T, co
   const bool close = (double)e.inliers >= rule.least_close * (double)e.points;
   out.well_off = close ? count_beyond(s, code, v, T, patches.facing, rule.beyond, rule.part, e.off) : (int64_t)e.off.size();
   out.observable = is_observable(out.total, out.used, out.centre, rule.least_information);
+  if (out.observable && stride > 0 && patches.facing) {  // by the points alone that can be of their faces
+    patches.noise = out.noise;
+    PatchArrays sure(evidence(matcher, code, v, patches, team, 0).patches);
+    const Six information = total(sure.normals.data(), sure.size());
+    const int64_t used = std::accumulate(sure.counts.begin(), sure.counts.end(), (int64_t)0);
+    out.observable = used > 0 && is_observable(information, used, out.centre, rule.least_information);
+    if (!out.observable) sums = std::move(sure), out.total = information, out.used = used;
+  }
   if (!out.observable) {
     out.patches = std::move(sums);
     return out;

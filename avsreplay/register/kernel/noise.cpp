@@ -102,7 +102,7 @@ class Simulation {
       double off = q.noise;
       q.lane = samples[k].at.lane;
       for (int a = 0; a < 3; ++a) q.n[a] = m.n[a], q.on[a] = m.p[a] - off * q.u[a];
-      q.near_edge = !is_clear(q.lane, q.on, CLEAR * sigma_);
+      q.near_edge = !(look_.sided && is_clear(s_, q.lane, q.on, CLEAR * sigma_));
       if (q.near_edge && look_.sided) {
         const Hit hit = code_.first_face(s_, {eye_[0], eye_[1], eye_[2]}, q.u, q.range - CREDIBLE * sigma_, q.range + CREDIBLE * sigma_);
         if (hit.lane < 0) continue;
@@ -173,26 +173,6 @@ class Simulation {
     const double c = dot(q.u, m.n);
     q.noise = m.e / c;
     return c;
-  }
-
-  // Whether a measured point within a distance from a place of a face is closest to its plane.
-  bool is_clear(int32_t lane, const double* on, double distance) const {
-    if (!s_.mesh || !look_.sided) return false;
-    const uint32_t levels = s_.clear[(size_t)lane];
-    const Triangle& t = s_.triangles[(size_t)lane];
-    double x, y;
-    in_plane(t, on, x, y);
-    const std::array<double, 3> sides = side_distances(t, x, y);
-    bool flat = clear_radius(s_, levels >> 4 & 15) >= distance;
-    for (int k = 0; k < 3; ++k) flat = flat && std::max(sides[(size_t)k], clear_radius(s_, levels >> (8 + 4 * k) & 15)) >= distance;
-    if (flat) return true;
-    const double left = clear_radius(s_, levels & 15) - distance, dx = x - (t.length + t.cx) / 3, dy = y - t.cy / 3;
-    return left >= 0 && dx * dx + dy * dy <= left * left;
-  }
-
-  static void in_plane(const Triangle& t, const double* on, double& x, double& y) {
-    const double d[3] = {on[0] - t.a.x, on[1] - t.a.y, on[2] - t.a.z};
-    x = d[0] * t.u.x + d[1] * t.u.y + d[2] * t.u.z, y = d[0] * t.w.x + d[1] * t.w.y + d[2] * t.w.z;
   }
 
   // The place at the true pose, seen from the pose of the scan, where it is on the same ray; false where the ray is along the face.
