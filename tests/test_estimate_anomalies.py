@@ -849,7 +849,7 @@ def test_an_error_of_a_known_acceleration_needs_no_other_evidence() -> None:
     edges, white = np.linspace(0.0, 6.0, 13), rng.normal(size=72)
     between, priors = rng.normal(size=(12, 72, 6)), scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
     begins, known = (
-        hypotheses.accelerated(edges, between, white, -5.0, priors, known)
+        hypotheses.constant_acceleration(edges, between, white, -5.0, priors, known)
         for known in (False, True)
     )
     assert known.log_evidence - begins.log_evidence == pytest.approx(np.log(1e3))
@@ -1061,7 +1061,7 @@ def test_a_disturbance_that_the_earlier_poses_exclude_must_begin_within_the_scan
         [np.sqrt(h) * part[:, 3:] for h, part in zip(np.diff(edges), between, strict=True)]
     )
     white = rng.normal(size=6 * n) + 0.03 * A @ rng.normal(size=3 * n)
-    found = hypotheses.disturbed(edges, between, white, 0.0, (math.inf, least))
+    found = hypotheses.random_disturbance(edges, between, white, 0.0, (math.inf, least))
     possible, values = densities < least, []
     for q in densities:
         C = np.eye(6 * n) + q * q * A @ A.T

@@ -115,8 +115,8 @@ def explain(
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), len(white), len(epochs)),
         _manoeuvre(window, start, white, free, priors),
-        disturbed(edges, between, white, free, excluded),
-        accelerated(
+        random_disturbance(edges, between, white, free, excluded),
+        constant_acceleration(
             edges, between, white, free, priors, isinstance(epochs[-1].track.belief, DrivenBelief)
         ),
         _sensor_bias(window, white, free, priors),
@@ -201,7 +201,7 @@ def _manoeuvre(
     return replace(best, log_evidence=odds, onset=onset)
 
 
-def disturbed(
+def random_disturbance(
     edges: Array, between: Array, white: Array, free: float, excluded: tuple[float, float]
 ) -> Explanation:
     """Random torque or force beyond what is allowed for: an impulse between every two scans.
@@ -242,11 +242,11 @@ def disturbed(
     return max(found, key=lambda f: f.log_evidence)
 
 
-def accelerated(
+def constant_acceleration(
     edges: Array, between: Array, white: Array, free: float, priors: ChangePriors, known: bool
 ) -> Explanation:
     """A constant torque or force: the same change of the velocity per second in every interval, as
-    in :func:`disturbed`.
+    in :func:`random_disturbance`.
 
     ``size`` holds the root densities of random disturbances that cause changes as large over the
     window.
