@@ -1,6 +1,7 @@
 """The minimum-time rendezvous: its properties, and solutions computed by other methods."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -352,3 +353,32 @@ def test_a_target_whose_reach_is_nearly_tangent_to_the_thrust_is_planned_or_refu
     plan = rendezvous(lambda t: motion(t + 0.3), r0, v0, PlanParams(a_max_mps2=0.02))
     assert not plan.found or plan.lower_bound_s <= plan.t_go_s < 60.0
     assert plan.status is not PlanStatus.INFEASIBLE
+
+
+@pytest.mark.parametrize("step", [0.25, 0.5, 2.0])
+def test_the_interpolation_error_is_that_of_cubic_pieces_of_a_quartic(step):
+    """Of a position c t^4, with the constant fourth derivative 24 c, the bound is reached."""
+    c = 0.003
+    goal = sample_goal(
+        lambda t: (
+            c * np.stack([t**4, 0 * t, 0 * t], 1),
+            c * np.stack([4 * t**3, 0 * t, 0 * t], 1),
+        ),
+        ORIGIN,
+        ORIGIN,
+        0.0,
+        0.0,
+        4.0,
+        step,
+    )
+    t = np.linspace(0.0, 4.0, 4001)
+    dr, dv = np.array([goal.at(float(x))[:2] for x in t])[:, :, 0].T
+    snap = 24.0 * c
+    unit = replace(goal, snap=snap)
+    assert np.abs(dr - c * t**4).max() == pytest.approx(
+        unit.interpolation_error(1.0, 0.0, 3.0), rel=1e-3
+    )
+    assert 3.0 * np.abs(dv - 4.0 * c * t**3).max() == pytest.approx(
+        unit.interpolation_error(0.0, 1.0, 3.0), rel=1e-3
+    )
+    assert goal.snap >= 0.9 * snap

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from oracles.residuals import summed
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import size as size_module
@@ -188,3 +189,21 @@ def test_a_box_larger_than_the_model_continues_beyond_its_edges():
         found = registrar.register(*scan_of(larger, seed, 0.002))
         assert found.status is not AlignStatus.ALIGNED
         assert "continues beyond the edges" in found.message
+
+
+def test_a_step_of_size_and_pose_is_a_motion_and_then_a_scaling_about_its_centre() -> None:
+    """Points p of a target 1 + delta times as large are p / (1 + delta) in the model's size."""
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        p, centre, d = rng.normal(size=(9, 3)), rng.normal(size=3), 0.1 * rng.normal(size=6)
+        delta, step = 0.1 * rng.normal(size=2)
+        q = rng.normal(size=4)
+        moved = Pose(q / np.linalg.norm(q), rng.normal(size=3))
+        before = moved.apply(p) / (1.0 + delta)
+        larger, after = size_module.joined(delta, moved, step, d, centre)
+        turn = geometry.matrix(geometry.exp(-d[:3]))
+        there = (before - centre) @ turn.T - d[3:]
+        np.testing.assert_allclose(
+            after.apply(p) / (1.0 + larger), centre + there / (1.0 + step), atol=1e-12
+        )
+        assert 1.0 + larger == pytest.approx((1.0 + delta) * (1.0 + step))
