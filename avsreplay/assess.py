@@ -244,6 +244,15 @@ class Setup:
         t = self.task.tolerance
         return np.array([t.position_m, t.speed_mps, t.angle_deg])
 
+    def touched(self, path: Array) -> bool | None:
+        """Return whether the end-effector touches the body outside the grasp; None where contact is
+        not checked.
+
+        Args:
+            path: (n, 3) from the grasp point in {C} [m], in the order of time.
+        """
+        return None if self.contact is None else bool(self.contact.touched(path[None])[0])
+
     def at_s(self, t_ns: int) -> float:
         """Return an instant in seconds after the first scan.
 
@@ -471,7 +480,7 @@ def _continued(
     before = np.zeros(len(flown), bool) if touched is None else np.resize(touched, len(flown))
     start_s = setup.at_s(belief.t_ns)
     ends = [start_s + each.at_s for each in flown]
-    hits = [each.touched or bool(hit) for each, hit in zip(flown, before, strict=True)]
+    hits = [bool(hit or setup.touched(each.path)) for each, hit in zip(flown, before, strict=True)]
     why = [_why_not(setup, *each) for each in zip(flown, ends, hits, strict=True)]
     found = _probability(np.array([not reason for reason in why]))
     reasons = Counter(reason for reason in why if reason).most_common(1)
@@ -520,6 +529,9 @@ def simulated(
         log: the flight so far, whose scans give interval and blackouts.
         state: the state of guidance at the belief; None if the robot is at its start.
         belief: the belief from which the targets are drawn.
+
+    Returns:
+        The ends of the flights, whose paths begin with that which was flown over the log.
     """
     rng = setup.rng(3)
     _, drawn = drawn_beliefs(belief, setup.flights, rng)
@@ -527,22 +539,12 @@ def simulated(
     if setup.contact is not None and state is not None:
         estimated = np.zeros((1, 6))
         before = _flown_past(setup, setup.contact, log, belief.t_ns, estimated)[0]
-    out: list[Ended] = []
+    out, thrust = list[Ended](), Disturbance(setup.thrust_noise_mps2, rng)
     for each in drawn:
         target = DrawnTarget(simulating(setup, log, belief), each, rng)
-        out.append(
-            closed_loop(
-                setup.guidance,
-                measured(setup, log, belief, target, state, rng),
-                target.scene,
-                belief.t_ns,
-                setup.thrust_noise_mps2,
-                rng,
-                setup.contact,
-                state,
-                before,
-            )
-        )
+        known = measured(setup, log, belief, target, state, rng)
+        ended = closed_loop(setup.guidance, known, target.scene, belief.t_ns, thrust, state)
+        out.append(replace(ended, path=np.concatenate([before, ended.path])))
     return out
 
 
@@ -788,15 +790,12 @@ def _in_fact(setup: Setup, log: FlightLog, state: GuidanceState, truth: Motion) 
 
 def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -> bool | None:
     """Whether the flown path touched the true target; None where this is not known."""
-    if setup.contact is None:
-        return None
     target = true_scene(truth)
     parts = [
         relative_path(target, leg.segment, setup.since_ns, begin_ns, stop_ns)
         for leg, begin_ns, stop_ns in _flown(log, end_ns)
     ]
-    y = np.concatenate([np.zeros((0, 3)), *parts])
-    return bool(setup.contact.touched(y[None])[0])
+    return setup.touched(np.concatenate([np.zeros((0, 3)), *parts]))
 
 
 def _probability(good: Any) -> dict[str, Any]:
