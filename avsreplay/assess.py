@@ -541,79 +541,14 @@ def simulated(
         before = _flown_past(setup, setup.contact, log, belief.t_ns, estimated)[0]
     out, thrust = list[Ended](), Disturbance(setup.thrust_noise_mps2, rng)
     for each in drawn:
-        target = DrawnTarget(simulating(setup, log, belief), each, rng)
+        target = Scene(setup.estimator.motion(each), setup.estimator.attitude(each))
         known = measured(setup, log, belief, target, state, rng)
-        ended = closed_loop(setup.guidance, known, target.scene, belief.t_ns, thrust, state)
+        ended = closed_loop(setup.guidance, known, target, belief.t_ns, thrust, state)
         out.append(replace(ended, path=np.concatenate([before, ended.path])))
     return out
 
 
-class DrawnTarget:
-    """A target that begins with the mean of a belief and moves under the random torque and force
-    of an estimator, which are drawn for one interval after the other.
-
-    Attributes:
-        estimator: predicts the motion, with its process noise.
-        scene: the target, by the time after its begin [s]; after the last interval it moves freely.
-    """
-
-    def __init__(self, estimator: Estimator, drawn: Belief, rng: np.random.Generator) -> None:
-        """Begin at an instant.
-
-        Args:
-            estimator: predicts the motion.
-            drawn: mean at the begin, about the grasp point in {A}.
-            rng: random generator.
-        """
-        self.estimator, self._rng = estimator, rng
-        self._begins = [_exact(drawn)]
-        self.scene = Scene(self._goal, self._attitude)
-
-    def advance(self, t_ns: int) -> tuple[Array, Array]:
-        """Move to the end of an interval.
-
-        Args:
-            t_ns: end of the interval [ns].
-
-        Returns:
-            Position (3,) of the grasp point in {A} [m] and attitude q_ac (4,) then.
-        """
-        last, estimator = self._begins[-1], self.estimator
-        predicted = estimator.predict(estimator.resumed(last), t_ns).belief
-        there = estimator.frame.belief_out(predicted)
-        self._begins.append(_exact(drawn_beliefs(there, 1, self._rng)[1][0]))
-        at = np.array([(t_ns - self._begins[0].t_ns) * 1e-9])
-        return self._goal(at)[0][0], self._attitude(at)[0]
-
-    def _goal(self, times: Array) -> tuple[Array, Array]:
-        position, velocity = np.empty((2, len(times), 3))
-        for belief, which, after in self._parts(times):
-            position[which], velocity[which] = self.estimator.motion(belief)(after)
-        return position, velocity
-
-    def _attitude(self, times: Array) -> Array:
-        out = np.empty((len(times), 4))
-        for belief, which, after in self._parts(times):
-            out[which] = self.estimator.attitude(belief)(after)
-        return out
-
-    def _parts(self, times: Array) -> Iterator[tuple[Belief, Flags, Array]]:
-        """Intervals with the instants in them and the times of these after their begin [s]."""
-        begins = np.array([(b.t_ns - self._begins[0].t_ns) * 1e-9 for b in self._begins])
-        intervals = np.maximum(np.searchsorted(begins, times, "right") - 1, 0)
-        for k in np.unique(intervals):
-            which = intervals == k
-            yield self._begins[k], which, times[which] - begins[k]
-
-
-def _exact(belief: Belief) -> Belief:
-    """A belief without errors."""
-    if isinstance(belief, DrivenBelief):
-        belief = replace(belief, cross=0.0 * belief.cross, P_u=0.0 * belief.P_u)
-    return replace(belief, P=0.0 * belief.P)
-
-
-def simulating(setup: Setup, log: FlightLog, belief: Belief) -> Estimator:
+def _simulating(setup: Setup, log: FlightLog, belief: Belief) -> Estimator:
     """Return the estimator of simulated flights, with the disturbances of the log.
 
     The noise is known here, and a fit to the poses of the flight would have none of the log.
@@ -639,7 +574,7 @@ def measured(
     setup: Setup,
     log: FlightLog,
     belief: Belief,
-    target: DrawnTarget,
+    target: Scene,
     state: GuidanceState | None,
     rng: np.random.Generator,
 ) -> Generator[PlannerInput, GuidanceState, None]:
@@ -651,11 +586,12 @@ def measured(
         setup: task, estimator, guidance and target.
         log: the flight so far.
         belief: the belief from which the filter goes on.
-        target: the target.
+        target: the target, with its attitude, by the time after the belief [s].
         state: the state of guidance at the belief; None if the robot is at its start.
         rng: random generator.
     """
-    estimator, held = target.estimator, log.convergence
+    assert target.attitude is not None
+    estimator, held = _simulating(setup, log, belief), log.convergence
     track, C = estimator.resumed(belief), log.noise
     if C is None:  # no pose was measured
         position, half = np.split(np.diag(estimator.params.R0), 2)
@@ -669,8 +605,9 @@ def measured(
         t_ns = belief.t_ns + since_ns
         prior, gamma = estimator.predict(track, t_ns), log.gammas[(offset + k) % len(log.gammas)]
         turn, move = np.split(root @ rng.standard_normal(6), 2)
-        position, q = target.advance(t_ns)
         if gamma:
+            at = np.array([since_ns * 1e-9])
+            (position,), (q,) = target.goal(at)[0], target.attitude(at)
             pose = Pose(
                 geometry.multiply(q, geometry.exp(turn)), position + geometry.matrix(q) @ move
             )
